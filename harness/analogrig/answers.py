@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
+"""Largest magnitude of a reported quantity."""
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """n consecutive samples; all arrays are (n,)."""

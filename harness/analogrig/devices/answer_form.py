@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers, RaisedAlarm
+from analogrig.answers import LARGEST_FLOAT32, Answers, RaisedAlarm
 from analogrig.catalogue import SteppedFlag
 from analogrig.config import suggest
 from analogrig.datasheet import MOST_THETA, Datasheet
-from analogrig.devices.templates import CHECKSUM, MOST_FLOAT32, TemplateField
+from analogrig.devices.templates import CHECKSUM, TemplateField
 from analogrig.errors import DeviceError
 from analogrig.run import LOST, UNARMED, Channel
 
@@ -136,7 +136,7 @@ class AnswerAssembler:
 
     def _check(self, values: NDArray[np.float64], samples: NDArray[np.int64]) -> None:
         """:raises DeviceError: a value is not finite."""
-        bad = ~(np.abs(values) <= MOST_FLOAT32)
+        bad = ~(np.abs(values) <= LARGEST_FLOAT32)
         if bad.any():
             row, at = (int(each[0]) for each in np.nonzero(bad))
             raise DeviceError(

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from analogrig.answers import LARGEST_FLOAT32
 from analogrig.config import suggest
 from analogrig.devices.can_dbc import CanDbcDevice, Request, Units, scale
 from analogrig.errors import ConfigurationError
@@ -21,10 +22,8 @@ from analogrig.run import Channel
 CLASSIC_BYTES = 8
 FD_BYTES = 64
 
-_LARGEST_FLOAT = {16: 65504.0, 32: 3.4028234e38, 64: math.inf}
+_LARGEST_FLOAT = {16: 65504.0, 32: LARGEST_FLOAT32, 64: math.inf}
 """Largest finite value of a float signal by its length in bits."""
-_LARGEST_ANSWER = _LARGEST_FLOAT[32]
-"""Largest magnitude of a quantity of a run, which is a float of 32 bits."""
 
 _CHANNELS = {"u": "force", "y": "displacement"}
 
@@ -174,7 +173,7 @@ class EcuMessages:
         for name, full in self._answers[message.name].items():
             if name in values:
                 wanted[full] = value = values[name]
-                if not abs(value) <= _LARGEST_ANSWER:  # true for NaN
+                if not abs(value) <= LARGEST_FLOAT32:  # true for NaN
                     return None
         counter = self._receive_counters.get(message.name)
         return Answer(message.name, wanted, None if counter is None else int(values.get(counter.signal.name, -1)))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+from analogrig.answers import LARGEST_FLOAT32, Answers, RaisedAlarm, ReportedDiagnosis, Samples
 from analogrig.catalogue import Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.run import UNARMED, UNREPORTED
@@ -24,8 +24,6 @@ _CURES = {name: f"datasheet.{name} = true" for name in _QUANTITIES} | {
     "theta": "datasheet.theta_n = number of elements",
     "diagnosis": "datasheet.diagnoses = true",
 }
-
-_MOST = float(np.finfo(np.float32).max)
 
 _MOST_SHOWN = 60
 
@@ -165,7 +163,7 @@ def _numbers(value: object, shape: tuple[int, ...], name: str) -> NDArray[np.flo
     if array.shape != shape or array.dtype.kind not in "iuf":
         wanted = f"{' x '.join(map(str, shape))} numbers, as the data sheet states" if shape else "a number"
         raise WrongAnswer(f"{name} must be {wanted}, not {_shown(value)}")
-    if not (np.abs(array) <= _MOST).all():
+    if not (np.abs(array) <= LARGEST_FLOAT32).all():
         raise WrongAnswer(f"{name} is {_shown(value)}: non-finite, or beyond float32")
     return array
 
@@ -186,7 +184,7 @@ def _diagnosis(value: object, index: int) -> ReportedDiagnosis:
         raise WrongAnswer(f"diagnosis: change must be one of {', '.join(_CHANGES)}, not {_shown(change)}")
     if isinstance(onset, bool) or not isinstance(onset, int | np.integer) or not 0 <= onset <= index:
         raise WrongAnswer(f"diagnosis: onset must be a sample from 0 to {index}, not {_shown(onset)}")
-    if isinstance(extent, bool) or not isinstance(extent, int | float | np.floating) or not 0.0 < extent <= _MOST:
+    if isinstance(extent, bool) or not isinstance(extent, int | float | np.floating) or not 0.0 < extent <= LARGEST_FLOAT32:
         raise WrongAnswer(f"diagnosis: extent must be a number above 0, not {_shown(extent)}")
     return ReportedDiagnosis(index, _CHANGES[change], int(onset), float(extent))
 

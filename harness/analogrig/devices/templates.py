@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 MOST_TEMPLATE = 4_000
 """Characters of a template."""
 
-MOST_FLOAT32 = float(np.finfo(np.float32).max)
-
 _TOKENS = re.compile(r"(\{\{|\}\})|\{(\w+):(\w+)\}|([^{}]+)|[{}]")
 
 _FIXED = frozenset({"f32"})
