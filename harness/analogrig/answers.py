@@ -9,7 +9,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-
 LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 """Largest magnitude of a reported quantity."""
 

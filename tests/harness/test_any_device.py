@@ -164,3 +164,11 @@ def test_device_without_settings_refuses_them_by_name() -> None:
 def test_wrong_data_sheet_names_the_figure(wrong: dict[str, object], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         dataclasses.replace(Datasheet(), **wrong)  # type: ignore[arg-type]
+
+
+def test_theta_without_a_model_is_said() -> None:
+    sheet = dataclasses.replace(STATED, theta_n=2)
+    run = dataclasses.replace(played(), theta=np.zeros((THESIS.samples, 2), np.float32))
+    described = {**run.conditions.dut, "datasheet": sheet.as_table()}
+    run = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, dut=described))
+    assert any("[datasheet.model]" in note for note in advice(run, judge(run)))

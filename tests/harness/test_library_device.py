@@ -18,6 +18,7 @@ import pytest
 from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
 from analogrig.answers import Answers, Samples
 from analogrig.bench import direct_bench
+from analogrig.catalogue import SteppedFlag
 from analogrig.cli import main
 from analogrig.datasheet import Datasheet
 from analogrig.devices import registry
@@ -572,3 +573,26 @@ def test_campaign_and_certificate_of_a_library(own: Path, tmp_path: Path, capsys
     command = ["certify", "--far", "1e-2", "--confidence", "0.9", "--dut", f"library:{own}", "--workers", "2"]
     assert main(command) == 0
     assert "CERTIFIED\n  0 alarms in 1760 samples" in capsys.readouterr().out
+
+
+REFUSING = """
+#include "analogrig_estimator.h"
+typedef struct { int unused; } refusing_t;
+static int init(refusing_t* self) { self->unused = 0; return 0; }
+static void step(refusing_t* self, const analogrig_in_t* in, analogrig_out_t* out) {
+    (void)self;
+    out->refused = in->y > 2000.0F;
+}
+ANALOGRIG_ESTIMATOR(refusing_t, init, step, "refusing", 0, 0);
+"""
+
+
+def test_sample_that_a_library_refuses_has_the_flag(tmp_path: Path) -> None:
+    source = tmp_path / "refusing.c"
+    source.write_text(REFUSING)
+    library = build(tmp_path / "refusing.so", source)
+    y, valid = np.array([1, 3000, 3000, 1], np.uint16), np.array([True, True, False, True])
+    with EstimatorLibrary(name="bob", library=str(library), in_process=True).connect() as device:
+        device.start()
+        (answers,) = device.play([Samples(0, y, y, valid)])
+    assert answers.flags.tolist() == [0, SteppedFlag.REFUSED, SteppedFlag.MISSING, 0]

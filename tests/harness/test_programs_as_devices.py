@@ -262,3 +262,41 @@ def test_binary_program_that_hangs_is_told_with_its_sample(tmp_path: Path) -> No
         pytest.raises(LinkTimeout, match=r"^device bob: no answer to sample 5 within 0\.1 s$"),
     ):
         play_impatiently(device, 5, 64)
+
+
+FIRMWARE = """\
+import sys
+out = lambda text: print(text, end="\\r\\n", flush=True)
+out("MYFW 0.3 of today")
+for k, line in enumerate(sys.stdin):
+    if line == "R\\n":
+        out("DONE")
+    elif {reboots} and k == 4:
+        out("MYFW 0.3 of today")
+    else:
+        out("0")
+"""
+"""A firmware whose lines end with a carriage return too."""
+
+
+@pytest.mark.parametrize("reboots", [False, True])
+def test_carriage_returns_are_ignored_and_the_banner_is_a_beginning(tmp_path: Path, *, reboots: bool) -> None:
+    script = tmp_path / "firmware.py"
+    script.write_text(FIRMWARE.format(reboots=reboots))
+    described = ProgramDevice(
+        name="bob",
+        arguments=(sys.executable, str(script)),
+        receive="{alarm:d}\n",
+        reset="R\n",
+        reset_answer="DONE",
+        banner="MYFW",
+    )
+    five = Samples(0, np.zeros(5, np.uint16), np.zeros(5, np.uint16), np.ones(5, np.bool_))
+    with described.connect() as device:
+        device.start()
+        if reboots:
+            with pytest.raises(AnalogrigError, match="was reset before the answer to sample"):
+                list(device.play([five]))
+        else:
+            assert sum(map(len, device.play([five]))) == 5
+            device.stop()

@@ -296,7 +296,7 @@ class EstimatorLibraryDevice(Device):
         if not valid.all():
             flags[~valid] = SteppedFlag.MISSING
         if records["refused"].any():
-            flags[valid & (records["refused"] != 0)] |= SteppedFlag.REFUSED
+            flags[valid & (records["refused"] != 0)] |= np.uint8(SteppedFlag.REFUSED)
         if sheet.armed:
             flags[records["armed"] == 0] |= UNARMED
         alarm = records["alarm"]

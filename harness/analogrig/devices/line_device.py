@@ -378,7 +378,7 @@ class LineDevice(TemplateDevice):
             received = self._wire.read(self._left_s(deadline_s))
         self._unanswered_bytes += len(received)
         *lines, self._tail = (self._tail + received).split(b"\n")
-        self._lines += lines
+        self._lines += [line.removesuffix(b"\r") for line in lines] if b"\r" in received else lines
         if len(self._tail) > MOST_LINE:
             raise self._error(f"sent {len(self._tail)} bytes without the end of a line {self._place}")
         if self._unanswered_bytes > MOST_UNANSWERED:
@@ -391,7 +391,6 @@ class LineDevice(TemplateDevice):
 
     def _accept(self, line: bytes) -> None:
         """Accept an answer, or another line."""
-        line = line.removesuffix(b"\r")
         try:
             words = self._reader.read(line)
         except ChecksumError:
@@ -419,7 +418,7 @@ class LineDevice(TemplateDevice):
         """
         if line == self._reset_answer and self._unanswered_resets > 0:
             self._unanswered_resets -= 1
-        elif line and line in (self._reset_answer, self._banner):
+        elif line and (line == self._reset_answer or (self._banner and line.startswith(self._banner))):
             raise self._error(f"was reset before the answer to sample {self._answered}: it sent {_brief(line)}")
         elif not line.startswith(self._ignored):
             self._counters["lines_other"] += 1

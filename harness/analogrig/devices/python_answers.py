@@ -184,7 +184,11 @@ def _diagnosis(value: object, index: int) -> ReportedDiagnosis:
         raise WrongAnswer(f"diagnosis: change must be one of {', '.join(_CHANGES)}, not {_shown(change)}")
     if isinstance(onset, bool) or not isinstance(onset, int | np.integer) or not 0 <= onset <= index:
         raise WrongAnswer(f"diagnosis: onset must be a sample from 0 to {index}, not {_shown(onset)}")
-    if isinstance(extent, bool) or not isinstance(extent, int | float | np.floating) or not 0.0 < extent <= LARGEST_FLOAT32:
+    if (
+        isinstance(extent, bool)
+        or not isinstance(extent, int | float | np.floating)
+        or not 0.0 < extent <= LARGEST_FLOAT32
+    ):
         raise WrongAnswer(f"diagnosis: extent must be a number above 0, not {_shown(extent)}")
     return ReportedDiagnosis(index, _CHANGES[change], int(onset), float(extent))
 

@@ -75,7 +75,10 @@ def _read(name: str) -> tuple[DeviceDescription, str]:
     kind = re.split("[:?]", name, maxsplit=1)[0]
     if kind in KINDS and name not in config.names("devices"):
         KINDS[kind].check_place(name, name[len(kind) :].partition("?")[0])
-        return KINDS[kind].from_name(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
+        try:
+            return KINDS[kind].from_name(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
+        except ValueError as error:  # of the description of another package
+            raise ConfigurationError(f"{name}: {error}") from error
     _check_not_compiled(name)
     path = config.locate("devices", name)
     description = from_table({"name": path.stem, **config.read_toml(path)}, str(path))

@@ -31,6 +31,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     return (
         *_statement(run),
         *_unjudged_quantities(verdict),
+        *_theta_without_a_model(run),
         *_assumed_settings(run),
         *_overloads(verdict),
         *_noise_setting(run),
@@ -47,6 +48,15 @@ def _unjudged_quantities(verdict: Verdict) -> Iterator[str]:
         yield f"not judged, because the device does not report them: {', '.join(verdict.not_judged)}"
     if verdict.cannot_tell:
         yield f"the device's protocol does not show: {', '.join(verdict.cannot_tell)}"
+
+
+def _theta_without_a_model(run: Run) -> Iterator[str]:
+    sheet = run.datasheet
+    if sheet.theta_n and sheet.model is None:
+        yield (
+            f"the {number_of(sheet.theta_n, 'element')} of theta are recorded, but their model is not known: state"
+            " na, nb and offset under [datasheet.model] to have M, B, K judged"
+        )
 
 
 def _statement(run: Run) -> Iterator[str]:
