@@ -29,6 +29,15 @@ class Samples:
     def __len__(self) -> int:
         return len(self.u)
 
+    def skipped_after(self, next_index: int) -> int:
+        """Number of samples from ``next_index`` to the first.
+
+        :raises ValueError: the first has been sent before.
+        """
+        if self.first < next_index:
+            raise ValueError(f"sample {self.first} comes again: the next one is {next_index}")
+        return self.first - next_index
+
 
 @dataclass(frozen=True)
 class RaisedAlarm:

@@ -390,6 +390,15 @@ def test_closed_bus_names_device_and_sample(file: Path) -> None:
             list(answers)
 
 
+def test_sample_that_comes_again_is_refused(file: Path) -> None:
+    changed(file, ("timeout_s = 5.0", "timeout_s = 30.0"))
+    codes = np.zeros(2, dtype=np.uint16)
+    with ScriptedEcu(str(file.parent), config()), open_dut(str(file)) as dut:
+        dut.start()
+        with pytest.raises(ValueError, match="^sample 1 comes again: the next one is 2$"):
+            list(dut.play([Samples(0, codes, codes, np.ones(2, bool)), Samples(1, codes, codes, np.ones(2, bool))]))
+
+
 def test_bus_off_is_named_in_the_time_out(file: Path) -> None:
     off = can.Message(arbitration_id=0x40, is_extended_id=False, is_error_frame=True, data=bytes(8))
     changed(file, ("timeout_s = 5.0", "timeout_s = 0.02"))

@@ -239,6 +239,9 @@ def test_faults_that_the_protocol_leaves_unnoticed_are_listed() -> None:
 
     assert len(cannot_tell()) == 5
     assert cannot_tell(**COMMON, **PROTOCOLS["checksum"]) == ("a sample received twice if both answers are the same",)
+    late = "an answer that is late by a whole cycle of its index"
+    assert late in cannot_tell(**COMMON, **PROTOCOLS["echo"], indices=256)
+    assert late not in cannot_tell(**COMMON, **PROTOCOLS["echo"])
     assert "a reset of the device during a record" not in cannot_tell(**PROTOCOLS["count"])
     assert (
         ProgramDevice(name="bob", arguments=("p",), reset="R\n", reset_answer="OK").known_datasheet().cannot_tell == ()

@@ -101,6 +101,11 @@ def test_skipped_samples_are_missing_ones() -> None:
     assert answers.statistic.tolist() == [7, 8]
 
 
+def test_sample_that_comes_again_is_refused() -> None:
+    with pytest.raises(ValueError, match="^sample 1 comes again: the next one is 2$"):
+        answered(made("Counting"), samples(2), samples(2, 1))
+
+
 def test_quantity_that_is_not_reported_is_absent() -> None:
     (answers,) = answered(made("Answering", answer=np.True_), samples(2))
     assert [alarm.index for alarm in answers.alarms] == [0, 1]

@@ -108,7 +108,7 @@ class EcuDevice(Device):
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         for block in blocks:
             samples = zip(block.u.tolist(), block.y.tolist(), block.valid.tolist(), strict=True)
-            self._skip(block.first)
+            self._skip(block)
             try:
                 for index, sample in enumerate(samples, block.first):
                     self._exchange(index, *sample)
@@ -118,12 +118,12 @@ class EcuDevice(Device):
                 raise
             yield self._take(len(block), block.first + len(block))
 
-    def _skip(self, until: int) -> None:
-        """Send the skipped samples before ``until`` as missing ones, and forget their answers."""
-        skipped = range(self._answers.next_index, until)
-        for index in skipped:
+    def _skip(self, block: Samples) -> None:
+        """Send the skipped samples before the block as missing ones, and forget their answers."""
+        skipped_n = block.skipped_after(self._answers.next_index)
+        for index in range(block.first - skipped_n, block.first):
             self._exchange(index, 0, 0, valid=False)
-        self._answers.rows.take(len(skipped), until)
+        self._answers.rows.take(skipped_n, block.first)
 
     def _exchange(self, index: int, u: int, y: int, valid: bool) -> None:  # noqa: FBT001
         """Send one sample, and take its answer.

@@ -232,9 +232,7 @@ class EstimatorLibraryDevice(Device):
             raise
 
     def _pieces(self, block: Samples) -> Iterator[_Piece]:
-        skipped_n = block.first - self._next_index
-        if skipped_n < 0:
-            raise ValueError(f"sample {block.first} comes again: the next one is {self._next_index}")
+        skipped_n = block.skipped_after(self._next_index)
         whole = _after_missing(skipped_n, block) if skipped_n else block
         if 0 < len(whole) <= SLOT_SAMPLES:
             yield _Piece(whole, skipped_n, is_last=True)

@@ -108,9 +108,7 @@ class TemplateDevice(Device):
     def _with_gaps(self, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, bool]]:
         """Blocks, with True for one that stands for skipped indices, which are missing samples."""
         for block in blocks:
-            skipped = block.first - self._next_index
-            if skipped < 0:
-                raise ValueError(f"sample {block.first} comes again: the next one is {self._next_index}")
+            skipped = block.skipped_after(self._next_index)
             if skipped:
                 nothing = np.zeros(skipped, np.uint16)
                 yield Samples(self._next_index, nothing, nothing, np.zeros(skipped, np.bool_)), True

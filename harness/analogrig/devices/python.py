@@ -119,7 +119,7 @@ class PythonDevice(Device):
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         rows, next_sample = Rows(self._datasheet), 0
         for block in blocks:
-            if skipped_n := block.first - next_sample:
+            if skipped_n := block.skipped_after(next_sample):
                 nothing = np.zeros(skipped_n, np.uint16)
                 skipped = Samples(next_sample, nothing, nothing, np.zeros(skipped_n, np.bool_))
                 rows.begin(skipped)

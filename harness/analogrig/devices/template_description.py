@@ -124,6 +124,8 @@ class TemplateDescription(AdaptedDescription):
             "a digit changed on the way to the device": self.loses_lines and not sent,
             "a digit changed on the way from the device": self.loses_lines and not received,
             "a sample received twice if both answers are the same": self.loses_lines and bool(self.echo),
+            "an answer that is late by a whole cycle of its index": self.loses_lines
+            and bool(self.echo and self.indices),
             "an answer that comes after the end of a record": not self.reset_answer,
             "a state left from before the record": self.loses_lines and not self.reset,
             "a lost reset line": self.loses_lines and bool(self.reset) and not self.reset_answer,
