@@ -215,7 +215,6 @@ LACKING_STATUS = {"samples_unanswered": 1}
         (PART, cut, UNREPORTED, LACKING_PART | {"frames_dropped": 1}),
         (STATUS, cut, LOST | MISSING, LACKING_STATUS | {"frames_dropped": 1}),
         (PART, garbled, UNREPORTED, LACKING_PART | {"frames_dropped": 1}),
-        (PART, not_a_number, UNREPORTED, LACKING_PART | {"frames_dropped": 1}),
         (PART, recounted, UNREPORTED, LACKING_PART | {"answers_late": 1}),
         (STATUS, recounted, LOST | MISSING, LACKING_STATUS | {"answers_late": 1}),
         (PART, twice, 0, {"answers_repeated": 1}),
@@ -242,6 +241,26 @@ def test_fault_of_one_frame_marks_its_sample_alone_live_and_in_a_log(
     logged = captured(tmp_path / "can.log", frames, file)
     assert_same(run, logged)
     assert counts(logged) == counted
+
+
+def test_number_that_is_not_finite_ends_the_run(file: Path, tmp_path: Path) -> None:
+    frames: list[can.Message] = []
+    run = played(file, listener=frames.append, answering=replacing(PART, not_a_number))
+    told = f"device ecu: EST_Par.V2 = nan for sample {AT}, which is not finite or too large for a float"
+    assert told in run.conditions.faults[0]
+    assert judge(run).outcome == "inconclusive"
+    assert told in captured(tmp_path / "can.log", frames, file).conditions.faults[0]
+
+
+def test_largest_float_is_an_estimate(file: Path) -> None:
+    largest = struct.pack("<f", np.finfo(np.float32).max)
+
+    def with_largest(frame: can.Message) -> tuple[can.Message, ...]:
+        return (with_data(frame, bytes((*frame.data[:2], *largest, *frame.data[6:]))),)
+
+    run = played(file, answering=replacing(PART, with_largest))
+    assert run.conditions.faults == ()
+    assert run.theta[AT, PART] == np.finfo(np.float32).max
 
 
 def test_two_answers_to_one_sample_end_the_run(file: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from analogrig.answers import RaisedAlarm
+from analogrig.answers import LARGEST_FLOAT32, RaisedAlarm
 from analogrig.catalogue import SteppedFlag
 from analogrig.devices.can_dbc import ReceivedSignals
 from analogrig.devices.ecu_messages import Answer, EcuMessages
@@ -73,13 +73,20 @@ class EcuAnswers:
     def add(self, answer: Answer) -> None:
         """Take a frame of the device.
 
-        :raises DeviceError: no sample awaits it, and nothing shows to which it belongs; or it contradicts another.
+        :raises DeviceError: no sample awaits it, and nothing shows to which it belongs; it contradicts another; or a
+            value is not finite.
         """
         key = (answer.message, *answer.values)
         index = self._index_of(answer)
         seen = self._seen if index == self._index else self._seen_before
         if index is None:
             return
+        for full, value in answer.values.items():
+            if not abs(value) <= LARGEST_FLOAT32:  # true for NaN
+                raise DeviceError(
+                    f"device {self._name}: {full} = {value:g} for sample {index},"
+                    " which is not finite or too large for a float"
+                )
         if self._is_open and index == self._index and key not in seen:
             seen[key] = answer.values
             self._values.update(answer.values)

@@ -172,9 +172,7 @@ class EcuMessages:
         wanted = {}
         for name, full in self._answers[message.name].items():
             if name in values:
-                wanted[full] = value = values[name]
-                if not abs(value) <= LARGEST_FLOAT32:  # true for NaN
-                    return None
+                wanted[full] = values[name]
         counter = self._receive_counters.get(message.name)
         return Answer(message.name, wanted, None if counter is None else int(values.get(counter.signal.name, -1)))
 
