@@ -296,7 +296,8 @@ def test_task_that_kills_every_worker_ends_the_campaign() -> None:
         ("host", ""),
         ("qemu-m4:own.elf", ""),
         ("can:virtual", ""),
-        ("serial:/dev/ttyACM0", "serial:/dev/ttyACM0"),
+        ("serial:/dev/ttyACM0", "port:/dev/ttyACM0"),
+        ("lines:/dev/ttyACM0", "port:/dev/ttyACM0"),
         ("can:socketcan/can0", "can:socketcan/can0"),
     ],
 )
@@ -523,7 +524,7 @@ def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsy
     allowed = [word for port in ports for word in ("--allow", port)]
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / "out.json"), *allowed]) == 3
     complaint = capsys.readouterr().err
-    assert "INCONCLUSIVE: no device can be had: cannot open /dev/absent" in complaint
+    assert "INCONCLUSIVE: no device can be had: device serial:/dev/absent: cannot open /dev/absent" in complaint
     assert complaint.count("\n") == 1
     assert not journal_of(tmp_path / "out.json").exists()
 
@@ -742,7 +743,7 @@ def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.
     planned(tmp_path, "devices = ['serial:/dev/absent']\n", ["/dev/absent"])
     options = ["--workers", "2", "--out", str(tmp_path / "out.json"), "--allow", "/dev/absent"]
     assert main(["campaign", str(tmp_path / "spec.toml"), *options]) == 2
-    assert "serial:/dev/absent is one device" in capsys.readouterr().err
+    assert "port:/dev/absent is one device" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("text", ["samples = 0", "samples = 2000000000"])

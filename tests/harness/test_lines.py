@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import time
 import tty
@@ -18,8 +19,10 @@ from analogrig.answers import Answers, Samples
 from analogrig.bench import Bench
 from analogrig.config import read_toml
 from analogrig.devices.lines import LinesDevice
+from analogrig.devices.port_description import PortDescription
 from analogrig.devices.program import ProgramDevice
 from analogrig.devices.registry import from_table, recorded, trusted
+from analogrig.devices.serial import SerialDevice
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.devices.templates import Reader, Writer
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
@@ -119,6 +122,17 @@ def test_silent_firmware_is_told_with_the_speed_of_the_line() -> None:
     assert str(raised.value) == "device bob: no answer to sample 0 within 0.05 s; the line was opened at 9600 baud"
     os.close(ours)
     os.close(theirs)
+
+
+@pytest.mark.parametrize("kind", [LinesDevice, SerialDevice])
+def test_server_that_is_not_there_is_told_with_the_cure(kind: type[PortDescription]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"socket://127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(LinkError) as raised:
+            kind(name="bob", url=url).open()
+    assert str(raised.value) == f"device bob: cannot open {url}: Connection refused; start the server, or correct url"
+    assert kind(name="bob", url=url).hint(url) == "the port may be serving another client"
 
 
 def test_line_that_matches_no_template_is_told_with_the_template() -> None:

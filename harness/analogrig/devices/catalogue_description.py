@@ -93,10 +93,6 @@ class CatalogueDescription(DeviceDescription):
         """
         return WireFaults.parse(self.wire_faults, self.fault_kinds()) if self.wire_faults else None
 
-    def hint(self, link_name: str) -> str:  # noqa: ARG002
-        """Advice for a device that does not answer on the link of that name; may be empty."""
-        return ""
-
     @property
     def estimator_library(self) -> Path:
         """Shared library with the device's estimator, to be run in this process."""

@@ -150,6 +150,10 @@ class DeviceDescription:
         """
         return self.connect()
 
+    def hint(self, link_name: str) -> str:  # noqa: ARG002
+        """Advice for a device that has never answered on the link of that name; may be empty."""
+        return ""
+
     def fault_kinds(self) -> Collection[str]:
         """Kinds of faults that its line can have; none without the capability ``faults``."""
         return ()

@@ -23,6 +23,7 @@ from analogrig.devices.device import Device
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.devices.templates import ChecksumError
 from analogrig.errors import DeviceError, LinkClosed, LinkError, LinkTimeout, TimeLimitReached
+from analogrig.protocol.exchange import MOST_TIMEOUTS
 from analogrig.protocol.pace import Pace
 from analogrig.run import Channel
 
@@ -33,8 +34,6 @@ MOST_UNANSWERED = 1 << 20
 
 _MOST_SILENT = 2
 """Time-outs in a row after which the device counts as silent."""
-_MOST_TIMEOUTS = 10
-"""Time-outs in a record."""
 _AGAIN_S = 0.25
 """Time after which the reset line is repeated: a board that starts when its port is opened misses the first."""
 _QUIET_S = 0.1
@@ -493,7 +492,7 @@ class LineDevice(TemplateDevice):
         """
         self._silent += 1
         self._timeouts += 1
-        if not self._description.loses_lines or self._silent >= _MOST_SILENT or self._timeouts > _MOST_TIMEOUTS:
+        if not self._description.loses_lines or self._silent >= _MOST_SILENT or self._timeouts > MOST_TIMEOUTS:
             raise self._silence(f"no answer to sample {self._answered - self._lost_since}")
         while self._pending:
             self._lose()
@@ -507,7 +506,7 @@ class LineDevice(TemplateDevice):
             return LinkTimeout(f"{text}; {problem}; correct receive in the device file")
         if self._tail or self._other:
             text += f"; its last line was {_brief(self._tail or self._other)}"
-        hint = self._description.hint()
+        hint = self._description.hint(self.link_name)
         return LinkTimeout(f"{text}; {hint}" if hint and not self._has_answered else text)
 
     def _accept_rest(self) -> None:

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
+from analogrig.devices.port_description import PortDescription
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.errors import ConfigurationError
-from analogrig.links.wire import DEFAULT_BAUD, PortWire, Wire
-from analogrig.trust import Thing, absolute_port
+from analogrig.links.wire import DEFAULT_BAUD
 
 MOST_BAUD = 100_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinesDevice(TemplateDescription):
+class LinesDevice(PortDescription, TemplateDescription):
     """A firmware that speaks lines of text at a serial port, or at any URL of pyserial."""
 
     kind: ClassVar[str] = "lines"
     usage: ClassVar[str] = "lines:URL[?send=...&receive=...]"
     summary: ClassVar[str] = "firmware that speaks lines of text at a serial port; its templates are in a device file"
     loses_lines: ClassVar[bool] = True
-    url: str
     baud: int = DEFAULT_BAUD
 
     def __post_init__(self) -> None:
@@ -42,20 +39,3 @@ class LinesDevice(TemplateDescription):
                 f"{name}: no port: use {cls.kind}:/dev/ttyACM0, or a device file with its templates"
             )
         return {"url": place}
-
-    def wire(self) -> Wire:
-        return PortWire(self.url, self.baud)
-
-    def hint(self) -> str:
-        return f"the line was opened at {self.baud} baud"
-
-    @property
-    def things(self) -> tuple[Thing, ...]:
-        return (Thing("serial port", self.url, "the device opens the serial port"),)
-
-    def placed(self, folder: Path) -> Self:
-        return dataclasses.replace(self, url=absolute_port(self.url, folder))
-
-    @property
-    def only_one(self) -> str:
-        return f"{self.kind}:{self.url}"

@@ -100,7 +100,7 @@ class ProgramDevice(TemplateDescription):
         read_fd, write_fd = ends.ours
         return ChildWire(child, DescriptorWire(read_fd, "pty" if self.pty else "pipe", write_fd=write_fd))
 
-    def hint(self) -> str:
+    def hint(self, link_name: str) -> str:  # noqa: ARG002
         return "" if self.pty else _BUFFERED
 
     @property

@@ -116,5 +116,5 @@ class RecordDevice(TemplateDevice):
         text = (
             f"device {self.name}: no answer to sample {self._answered} within {self._description.timeout_s:g} s{part}"
         )
-        hint = self._description.hint()
+        hint = self._description.hint(self.link_name)
         return LinkTimeout(f"{text}; {hint}" if hint and not self._answered else text)

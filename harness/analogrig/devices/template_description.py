@@ -140,10 +140,6 @@ class TemplateDescription(AdaptedDescription):
         :raises LinkError: it cannot be reached.
         """
 
-    @abstractmethod
-    def hint(self) -> str:
-        """Likely cause if the device has never answered."""
-
     def open(self) -> Device:
         from analogrig.devices.line_device import LineDevice
 

@@ -189,4 +189,8 @@ def _send_at_once(fd: int) -> None:
 
 def _reason(error: OSError) -> str:
     """Message of the operating system, without the text that pyserial adds."""
-    return os.strerror(error.errno) if error.errno else str(error)
+    if error.errno is None and isinstance(error.__context__, OSError):
+        error = error.__context__  # a handler of URLs hides it
+    if error.errno is not None and error.errno > 0:
+        return os.strerror(error.errno)
+    return error.strerror or str(error)
