@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
 import pkgutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Generic, TypeVar
 
 from analogrig.errors import ConfigurationError
@@ -63,8 +64,7 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
     @functools.cached_property
     def _points(self) -> tuple[importlib.metadata.EntryPoint, ...]:
         """Entry points of other packages in a fixed order."""
-        found = importlib.metadata.entry_points(group=self._group)
-        return tuple(sorted(found, key=lambda point: (point.name, point.value)))
+        return tuple(sorted(_entry_points(self._group), key=lambda point: (point.name, point.value)))
 
     @functools.cached_property
     def _added(self) -> Mapping[str, importlib.metadata.EntryPoint]:
@@ -88,3 +88,14 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
             if str(hint).startswith("ClassVar") and not hasattr(loaded, name):
                 raise ConfigurationError(f"{where} has no {name}")
         return loaded
+
+
+def _entry_points(group: str) -> Iterable[importlib.metadata.EntryPoint]:
+    """Entry points of all packages but those that state them wrongly."""
+    with contextlib.suppress(Exception):
+        return importlib.metadata.entry_points(group=group)
+    found: list[importlib.metadata.EntryPoint] = []
+    for package in importlib.metadata.distributions():
+        with contextlib.suppress(Exception):
+            found += package.entry_points.select(group=group)
+    return found

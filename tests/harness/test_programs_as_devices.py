@@ -300,3 +300,26 @@ def test_carriage_returns_are_ignored_and_the_banner_is_a_beginning(tmp_path: Pa
         else:
             assert sum(map(len, device.play([five]))) == 5
             device.stop()
+
+
+TWICE = """\
+import sys
+for k, line in enumerate(sys.stdin):
+    print("0\\n0" if k == 2 else "0", flush=k != 5)
+"""
+
+
+def test_answer_that_comes_twice_is_not_the_answer_to_the_next_sample(tmp_path: Path) -> None:
+    script = tmp_path / "twice.py"
+    script.write_text(TWICE)
+    ten = Samples(0, np.zeros(10, np.uint16), np.zeros(10, np.uint16), np.ones(10, np.bool_))
+    described = ProgramDevice(name="bob", arguments=(sys.executable, str(script)), receive="{alarm:d}\n")
+    with described.connect() as device:
+        device.start()
+        with pytest.raises(AnalogrigError, match="sent more answers than samples, the first after sample 2"):
+            list(device.play([ten]))
+
+
+def test_what_is_sent_must_hold_a_signal() -> None:
+    with pytest.raises(ValueError, match="^send must hold"):
+        ProgramDevice(name="bob", arguments=("p",), send="\n", receive="{alarm:d}\n")

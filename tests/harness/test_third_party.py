@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from analogrig.devices.description import DeviceDescription
 from analogrig.devices.registry import KINDS
+from analogrig.kinds import Kinds
 from analogrig.run import Run
 
 PAGE = Path(__file__).parents[2] / "harness/docs/howto/add-a-kind-of-device.md"
@@ -148,3 +150,17 @@ def test_broken_packages_are_listed_and_break_nothing_else(site: Path, folder: P
 
 def test_every_kind_states_what_a_list_shows() -> None:
     assert all(cls.kind == kind and cls.usage and cls.summary for kind, cls in KINDS.items())
+
+
+def test_package_that_states_its_entry_points_wrongly_harms_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path / "good", "good", devices={"fine": "pathlib:Path"})
+    folder = tmp_path / "bad" / "bad-1.0.dist-info"
+    folder.mkdir(parents=True)
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: bad\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[analogrig.devices]\nfoo\n")
+    for name in ("bad", "good"):
+        monkeypatch.syspath_prepend(tmp_path / name)
+    kinds = Kinds(DeviceDescription, "analogrig.devices", {})
+    assert "fine" in list(kinds)

@@ -269,8 +269,10 @@ class EcuMessages:
         """
         values: dict[str, float] = {}
         for signal in message.signals:
-            start = signal.raw_initial
-            values[signal.name] = float(start or 0.0) if signal.is_float else int(start or 0)
+            start = signal.raw_initial or 0
+            if not math.isfinite(start):
+                raise self._error(where, f"the initial value of {message.name}.{signal.name} is {start}")
+            values[signal.name] = float(start) if signal.is_float else int(start)
         for name, value in constant.items():
             values[name] = self._raw(where, f"{message.name}.{name}", message.get_signal_by_name(name), value)
         for signal in (*carriers, *(message.get_signal_by_name(name) for name in constant)):
@@ -486,13 +488,13 @@ def _modulus(found: _Found) -> int:
     """Number of values of a counter, which runs from 0 to its maximum in the DBC or to that of its bits."""
     signal = found.signal
     maximum = _integer_range(signal)[1]
-    return 1 + (maximum if signal.maximum is None else min(maximum, round(_to_raw(signal, float(signal.maximum)))))
+    return 1 + (maximum if signal.maximum is None else round(min(maximum, _to_raw(signal, float(signal.maximum)))))
 
 
 def _to_raw(signal: Any, value: float) -> float:
     """Value before the DBC's scaling; a whole number unless the signal is a float."""
     raw = (value - signal.offset) / signal.scale
-    return float(raw) if signal.is_float else round(raw)
+    return float(raw) if signal.is_float or not math.isfinite(raw) else round(raw)
 
 
 def _frame_bytes(n: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import enum
+import fcntl
 import math
 import mmap
 import os
@@ -159,6 +160,7 @@ class LibraryHost(ABC):
         size = SLOTS * (SAMPLES_BYTES + RECORDS_BYTES) + mmap.PAGESIZE
         if fd >= 0:
             os.ftruncate(fd, size)
+            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)  # by the library: SIGBUS here
         return mmap.mmap(fd, size)
 
     def post(self, u: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> None:
@@ -272,7 +274,7 @@ class ChildHost(LibraryHost):
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._readable = select.poll()
         self._readable.register(self._socket, select.POLLIN)
-        with theirs, os.fdopen(os.memfd_create("analogrig-library")) as shared:
+        with theirs, os.fdopen(os.memfd_create("analogrig-library", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)) as shared:
             memory = self.memory(shared.fileno())
             fds = (theirs.fileno(), shared.fileno())
             words = [f"{name}={float(value).hex()}" for name, value in settings.items()]

@@ -308,7 +308,7 @@ class LineDevice(TemplateDevice):
         while at < n:
             if len(pending) >= window:
                 self._collect(window // 2)
-            elif self._lines:
+            if self._lines:  # before the next sample is sent: it is an answer too many, or another line
                 self._accept(self._lines.popleft())
                 continue
             batch, size = [], 0

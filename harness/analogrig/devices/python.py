@@ -32,7 +32,7 @@ from analogrig.trust import Thing
 
 _FACTORY = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 
-_FAILURES = (Exception, SystemExit)
+_FAILURES = (Exception, SystemExit, GeneratorExit)
 """Errors of foreign code. Ctrl-C is not among them."""
 
 

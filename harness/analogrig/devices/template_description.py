@@ -83,6 +83,8 @@ class TemplateDescription(AdaptedDescription):
         received = [field.name for field in self.reader().fields]
         if self.echo and not (INDEX in sent and INDEX in received):
             raise ValueError("echo needs {index:d} in send and in receive")
+        if not {"u", "y"} & set(sent):
+            raise ValueError("send must hold {u:...} or {y:...}: the device would learn nothing of the samples")
         if self.window > 1 and self.loses_lines and not self.echo:
             raise ValueError('window: more than 1 sample in flight needs echo = "index"')
 
@@ -127,6 +129,7 @@ class TemplateDescription(AdaptedDescription):
             "an answer that is late by a whole cycle of its index": self.loses_lines
             and bool(self.echo and self.indices),
             "an answer that comes after the end of a record": not self.reset_answer,
+            "an answer lost, if another comes twice": self.window > 1 and not self.echo,
             "a state left from before the record": self.loses_lines and not self.reset,
             "a lost reset line": self.loses_lines and bool(self.reset) and not self.reset_answer,
             "a reset of the device during a record": self.loses_lines and not (self.banner or has_count),
