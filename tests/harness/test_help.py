@@ -76,6 +76,11 @@ def test_every_option_of_a_command_has_a_help_text_of_one_phrase(name: str) -> N
         assert not action.help.endswith("."), action.help
 
 
+def test_device_is_explained_by_the_list_of_all_kinds() -> None:
+    (dut,) = (action for action in commands()["run"]._actions if action.dest == "dut")
+    assert "`analogrig list devices` shows the kinds" in str(dut.help)
+
+
 def test_examples_are_shown_as_written(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main(["run", "--help"])

@@ -126,8 +126,8 @@ def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = 
         "--dut",
         default=default,
         metavar=DUT,
-        help="shipped name, .toml file, inproc[:LIBRARY], qemu-m3, qemu-m4, qemu-m7, qemu-f405[:ELF],"
-        f" serial:URL, or can:INTERFACE[/CHANNEL][?KEY=VALUE&...] (default: {shown})",
+        help="kind with its place, shipped name or .toml file; `analogrig list devices` shows the kinds"
+        f" (default: {shown})",
     )
     command.add_argument(
         "--exchange",
