@@ -305,7 +305,7 @@ def test_carriage_returns_are_ignored_and_the_banner_is_a_beginning(tmp_path: Pa
 TWICE = """\
 import sys
 for k, line in enumerate(sys.stdin):
-    print("0\\n0" if k == 2 else "0", flush=True)
+    print("OK" if line == "R\\n" else "0\\n0" if k == 5 else "0", flush=True)
 """
 
 
@@ -313,7 +313,13 @@ def test_answer_that_comes_twice_is_not_the_answer_to_the_next_sample(tmp_path: 
     script = tmp_path / "twice.py"
     script.write_text(TWICE)
     ten = Samples(0, np.zeros(10, np.uint16), np.zeros(10, np.uint16), np.ones(10, np.bool_))
-    described = ProgramDevice(name="bob", arguments=(sys.executable, str(script)), receive="{alarm:d}\n")
+    described = ProgramDevice(
+        name="bob",
+        arguments=(sys.executable, str(script)),
+        receive="{alarm:d}\n",
+        reset="R\n",
+        reset_answer="OK",
+    )
     with described.connect() as device:
         device.start()
         with pytest.raises(AnalogrigError, match="sent more answers than samples, the first after sample"):
