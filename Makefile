@@ -4,7 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BUILD ?= build
-JOBS ?= 2
+JOBS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n > 4 ? 4 : n)))
 ARGS ?=
 PYTEST_ARGS ?=
 FUZZ_S ?= 60
