@@ -135,7 +135,7 @@ class Datasheet:
             ceiling=None if trigger == "none" or ceiling is None else float(ceiling),
             is_ceiling_log_arl0=trigger == "cusum",
             noise_variance=settings.get("noise_variance"),
-            diagnoses=settings.get("isolation", False),
+            diagnoses=settings.get("isolation", True),
         )
 
     @classmethod

@@ -200,6 +200,7 @@ def test_start_loads_only_the_modules_of_the_plugin() -> None:
         "analogrig",
         "analogrig.rigs",
         "analogrig.testing",
+        "analogrig.lazy",
         "analogrig.testing.profiles",
     }
 
