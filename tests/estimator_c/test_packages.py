@@ -179,7 +179,7 @@ def compiles(compiler: str, flags: tuple[str, ...], folder: Path) -> None:
 @pytest.mark.tools("arm-none-eabi-gcc")
 @pytest.mark.parametrize("core", CORTEX)
 def test_no_warning_on_any_cortex_m(core: str, tmp_path: Path) -> None:
-    compiles("arm-none-eabi-gcc", (*CORTEX[core], "-O2"), tmp_path)
+    compiles("arm-none-eabi-gcc", (*CORTEX[core], "-Os"), tmp_path)
 
 
 @pytest.mark.tools("arm-none-eabi-gcc")

@@ -26,7 +26,8 @@ def test_own_estimator_is_judged_as_the_page_states(
     script = "".join(blocks("sh")).replace("make test", "true")  # test_new.py runs these tests
     done = subprocess.run(
         ["sh", "-c", f"set -e\n{script}\nmake estimator.so CFLAGS='-O2 -Wall -Wextra -Werror'"],
-        cwd=tmp_path, env={**os.environ, "PATH": path, "MAKEFLAGS": ""}, capture_output=True, text=True, check=False,
+        cwd=tmp_path, env={**os.environ, "PATH": path, "MAKEFLAGS": "", "PYTHON": sys.executable},
+        capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     monkeypatch.chdir(tmp_path / "my_estimator")
