@@ -18,6 +18,7 @@ engine_new(int states, int inputs, int kinks, int outputs, double sample_period_
     if (self == NULL) {
         return NULL;
     }
+    self->kernels           = kernels_find();
     self->states            = states;
     self->inputs            = inputs;
     self->kinks             = kinks;
@@ -32,16 +33,16 @@ engine_new(int states, int inputs, int kinks, int outputs, double sample_period_
 void engine_restart(engine_t* const self) {
     self->has_system = false;
     self->now        = 0;
-    self->elapsed    = 0;
     self->counts     = (engine_counts_t){ 0 };
-    self->quiet      = false;
-    self->here       = &self->points[0];
-    self->there      = &self->points[1];
-    self->middle     = &self->points[2];
-    self->before     = &self->points[3];
-    memset(self->points, 0, sizeof self->points);
-    for (int i = 0; i < 4; i++) {
-        self->points[i].z[self->columns - 1] = 1.0;
+    self->is_slow    = false;
+    self->w          = self->arguments[0];
+    self->w_before   = self->arguments[1];
+    self->w_there    = self->arguments[2];
+    memset(self->z, 0, sizeof self->z);
+    self->z[self->columns - 1] = 1.0;
+    for (int k = 0; k < PADDED(ENGINE_MAX_KINKS); k++) {
+        self->lower[k] = -(double)INFINITY;
+        self->upper[k] = (double)INFINITY;
     }
     for (int k = 0; k < ENGINE_MAX_KINKS; k++) {
         self->outside[k] = NEVER;
@@ -54,9 +55,8 @@ void engine_free(engine_t* const self) {
         return;
     }
     for (int i = 0; i < MODES; i++) {
-        free(self->store[i].ladder);
-        free(self->store[i].readings);
-        free(self->store[i].slow);
+        free(self->store[i].block);
+        free(self->store[i].slow.block);
     }
     free(self);
 }
@@ -106,10 +106,10 @@ engine_status_t engine_set_system(engine_t* const self, const engine_system_t* s
 }
 
 void engine_get_state(const engine_t* const self, double* x) {
-    if (self->quiet) {
+    if (self->is_slow) {
         quiet_get_state(self, x);
     } else {
-        memcpy(x, self->here->z, (size_t)self->states * sizeof x[0]);
+        memcpy(x, self->z, (size_t)self->states * sizeof x[0]);
     }
 }
 
@@ -117,7 +117,7 @@ engine_status_t engine_set_state(engine_t* const self, const double* x) {
     if (!self->has_system) {
         return ENGINE_NO_SYSTEM;
     }
-    memcpy(self->here->z, x, (size_t)self->states * sizeof x[0]);
+    memcpy(self->z, x, (size_t)self->states * sizeof x[0]);
     return mode_enter(self);
 }
 
@@ -126,12 +126,9 @@ engine_status_t engine_set_state(engine_t* const self, const double* x) {
 static engine_status_t advance(engine_t* const self, int64_t tick) {
     engine_status_t status = ENGINE_OK;
     while (status == ENGINE_OK && self->now < tick) {
-        if (tick - self->now >= ENGINE_TICKS_PER_SAMPLE && quiet_holds(self)) {
-            quiet_step(self);
-            continue;
+        if (!quiet_advance(self, tick)) {
+            status = events_advance(self, tick);
         }
-        quiet_leave(self);
-        status = events_step(self, tick - self->now);
     }
     return status;
 }
@@ -143,7 +140,7 @@ static engine_status_t take_edge(engine_t* const self, int64_t tick, int32_t inp
         return ENGINE_EDGE;
     }
     const int    column = self->states + (int)input;
-    const double before = self->here->z[column];
+    const double before = self->z[column];
     if (before >= level && before <= level) {
         return ENGINE_OK;
     }
@@ -152,16 +149,14 @@ static engine_status_t take_edge(engine_t* const self, int64_t tick, int32_t inp
         return status;
     }
     quiet_leave(self);
-    for (int i = 0; i < 4; i++) {
-        self->points[i].z[column] = level;
-    }
+    self->z[column] = level;
     return mode_enter(self);
 }
 
 static bool is_finite(const engine_t* const self) {
     bool finite = true;
     for (int i = 0; i < self->states; i++) {
-        finite = finite && isfinite(self->here->z[i]);
+        finite = finite && isfinite(self->z[i]);
     }
     return finite;
 }
@@ -169,10 +164,10 @@ static bool is_finite(const engine_t* const self) {
 static void record_sample(const engine_t* const self, double* y) {
     double  padded[PADDED(ENGINE_MAX_OUTPUTS)];
     double* out = self->outputs % PANEL == 0 ? y : padded;
-    if (self->quiet) {
+    if (self->is_slow) {
         quiet_read(self, out);
     } else {
-        panels_multiply(self->outputs, self->columns, self->y_panels, self->here->z, out);
+        self->kernels->multiply(self->outputs, self->columns, self->y_panels, self->z, out);
     }
     if (out != y) {
         memcpy(y, padded, (size_t)self->outputs * sizeof y[0]);
@@ -181,10 +176,11 @@ static void record_sample(const engine_t* const self, double* y) {
 
 /// Record the samples of a quiet stretch that come before a tick. Return their number.
 static int64_t run_quiet(engine_t* const self, int64_t before, double* y) {
-    const int64_t samples = self->quiet ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
+    const bool    quiet   = self->is_slow && self->clear == NO_END;
+    const int64_t samples = quiet ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
     int64_t       k       = 0;
     while (k < samples) {
-        if (self->slow_age == LEAP && self->outputs % PANEL == 0 && samples - k >= LEAP) {
+        if (self->slow_age == LEAP - 1 && self->outputs % PANEL == 0 && samples - k >= LEAP) {
             quiet_leap(self, &y[k * self->outputs]);
             k += LEAP;
         } else {

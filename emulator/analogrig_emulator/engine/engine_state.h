@@ -7,6 +7,7 @@
 ///     kinks.c     arguments w of the kinks, and the circuit with the kinks substituted
 ///     ladder.c    matrix exponentials
 ///     matrices.c  panels, products, linear equations
+///     kernels.c   inner loops, from lanes.h
 ///     noise.c     noise of a linear circuit, independent of the rest
 
 #ifndef ENGINE_STATE_H
@@ -19,13 +20,12 @@
 #include <stddef.h>
 
 #define TOP_LEVEL (ENGINE_LEVELS - 1)
-#define NO_LEVEL (-1)
 #define NEVER INT64_C(-1)
+#define NO_END INT64_MAX
 #define MAX_COLUMNS (ENGINE_MAX_STATES + ENGINE_MAX_INPUTS + 1)
 #define MAX_SQUARE (ENGINE_MAX_STATES * ENGINE_MAX_STATES)
 
-/// Matrices of the inner loop are stored in panels of four rows, each panel column by column: the compiler then
-/// computes four sums at once.
+/// Matrices of the inner loop are stored in panels of four rows, each panel column by column.
 #define PANEL 4
 #define PANELS(rows) (((rows) + PANEL - 1) / PANEL)
 #define PANEL_ELEMENTS(rows, columns) (PANELS(rows) * PANEL * (columns))
@@ -42,40 +42,81 @@
 /// processor can overlap them.
 #define LEAP 4
 
+/// Terms of the Taylor series of the exponential over the shortest step of a mode.
+#define TERMS 14
+
+/// Level of the shortest step near a bound that is not crossed: 1/64 of a sample period, with a look at its middle.
+/// Anything faster was set off by an event just before, and after an event the steps grow from the shortest one.
+#define NEAR_LEVEL (TOP_LEVEL - 6)
+
 /// The pieces of phi.
 enum { PIECE_LOW = 0, PIECE_MIDDLE = 1, PIECE_HIGH = 2 };
 
-/// The slow part of a mode, s = x[row]. From one sample period after the last event on, x is a function of s, u and 1.
-/// Matrices are panelled, over [s u 1]; those named rest are over [u 1].
+/// The slow part of a mode, s = x[row]. 2^least_level ticks after the last event and later, x is a function of s, u and 1.
+/// Matrices are panelled, over [s u 1]; those named rest are over [u 1]. They lie in one block.
 typedef struct {
-    int    rank;
-    bool   certain;  // s comes to rest, and energy bounds how far w strays until then
-    int    row[ENGINE_MAX_STATES];
-    double change[PANEL_ELEMENTS(ENGINE_MAX_STATES, MAX_COLUMNS)];           // of s in one sample period
-    double leap[PANEL_ELEMENTS(ENGINE_MAX_STATES, MAX_COLUMNS)];             // of s in LEAP sample periods
-    double state[PANEL_ELEMENTS(ENGINE_MAX_STATES, MAX_COLUMNS)];            // x
-    double y[LEAP * PANEL_ELEMENTS(ENGINE_MAX_OUTPUTS, MAX_COLUMNS)];        // y after 1, 2, ... LEAP sample periods
-    double rest[PANEL_ELEMENTS(ENGINE_MAX_STATES, ENGINE_MAX_INPUTS + 1)];   // s at rest
-    double rest_w[PANEL_ELEMENTS(ENGINE_MAX_KINKS, ENGINE_MAX_INPUTS + 1)];  // w at rest
-    double energy[MAX_SQUARE];       // Q: e'Q e never grows, with e the distance of s from rest
-    double reach[ENGINE_MAX_KINKS];  // (w - rest_w)^2 <= reach e'Q e
+    double* block;
+    int     rank;
+    int     least_level;
+    bool    certain;  // s comes to rest, and energy bounds how far w strays until then
+    int     row[ENGINE_MAX_STATES];
+    double* change;  // of s in one sample period
+    double* leap;    // of s in LEAP sample periods
+    double* ladder;  // changes of s in 2^level ticks, for every level
+    double* state;   // x
+    double* first;   // s 2^least_level ticks after an event, over the z of that event
+    double* w;
+    double* y;       // y now and after 1, 2, ... LEAP - 1 sample periods
+    double* rest;    // s at rest
+    double* rest_w;  // w at rest
+    double* energy;  // Q: e'Q e never grows, with e the distance of s from rest
+    double* reach;   // (w - rest_w)^2 <= reach e'Q e, for each kink
 } slow_t;
 
+/// A mode and its matrices, in one block. base: level of the shortest step, of h = 2^base ticks. |A h| is so small that
+/// TERMS terms give the exponential of any part of h, unless `stiff`: then base is 0.
 typedef struct {
     unsigned char piece[ENGINE_MAX_KINKS];
-    double*       ladder;    // ENGINE_LEVELS panelled matrices exp([A B c] 2^level ticks) - I, rows of the states only
-    double*       readings;  // panelled w and y over z; NULL unless phi feeds one of them
-    slow_t*       slow;
-    bool          has_slow;
+    int           base;
+    bool          stiff;
+    double*       block;
+    int           capacity;  // of the block
+    double* ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels from base, rows of the states only
+    double* looks;     // panelled w over the z of 2^level ticks before, for the same levels
+    double* terms;     // panelled terms ([A B c] h)^k / k! of the series for k = 1 .. TERMS, below one another
+    double* readings;  // panelled w and y over z; used if phi feeds one of them
+    slow_t  slow;
+    bool    has_slow;
 } mode_t;
 
-/// z = [x u 1] and the arguments w of the kinks there.
+/// The end of a step with respect to the bounds of the present mode. A step inside all bounds is CLEAR if w could not have
+/// left them on the way, even straying beyond both ends by the larger of two amounts: its change in this step, and its change
+/// at the speed of the step before. At the top of a peak the first alone may be zero.
+typedef enum { CLEAR, NEAR, CROSSED } judgement_t;
+
+/// The inner loops. Memory must not overlap.
 typedef struct {
-    double z[MAX_COLUMNS];
-    double w[PADDED(ENGINE_MAX_KINKS)];
-} point_t;
+    /// out = matrix z. out needs room for whole panels.
+    void (*multiply)(int rows, int columns, const double* panels, const double* z, double* out);
+
+    /// out = left[:, :n] right; rows of all are `stride` long, which is a multiple of PANEL.
+    void (*compose)(int rows, int n, int stride, const double* left, const double* right, double* out);
+
+    /// z += the sum of part^k terms[k - 1] for k = 1 .. terms; rows is a multiple of PANEL.
+    void (*sum)(int rows, int stride, int terms, const double* term, double part, double* z);
+
+    /// Set w_there = matrix z, and judge it as the end of a step. growth: its length over that of the step before; 0 if
+    /// there is none.
+    judgement_t (*look)(engine_t* self, int columns, const double* panels, const double* z, double growth);
+
+    /// Look from the origin at ever later instants until `clear` is at a tick or beyond, or there is no further look. Stop at
+    /// a step that is not CLEAR.
+    judgement_t (*look_on)(engine_t* self, int64_t tick);
+} kernels_t;
 
 struct engine {
+    const kernels_t* kernels;
+
     int     states, inputs, kinks, outputs, columns;
     double  tick_s;
     int64_t events_per_sample;
@@ -93,22 +134,27 @@ struct engine {
     double        cde_panels[PANEL_ELEMENTS(ENGINE_MAX_KINKS, MAX_COLUMNS)];
     double        lmn_panels[PANEL_ELEMENTS(ENGINE_MAX_OUTPUTS, MAX_COLUMNS)];
 
-    int64_t  now;      // tick
-    int64_t  elapsed;  // ticks since the last event, edge or new circuit; at most one sample period
-    int64_t  events_left;
-    point_t  points[4];
-    point_t *before, *here, *there, *middle;
-    int      level_before;  // level of the step from before to here; NO_LEVEL if w has a kink here
+    int64_t now;
+    double  z[PADDED(MAX_COLUMNS)];  // [x u 1] now; without x in a stretch of slow states
+    int64_t origin;                  // tick of the last event, edge or new circuit
+    double  origin_z[PADDED(MAX_COLUMNS)];
+    int64_t clear;                   // no event comes up to this tick; NO_END in a quiet stretch
+    int64_t stride;                  // ticks from w_before to w; 0 if w has a kink between
+    int     look;                    // level of the next look from the origin; above TOP_LEVEL if there is none
+    double *w, *w_before, *w_there;  // arguments of the kinks: at `clear`, a stride earlier, at the end of a step
+    double  arguments[3][PADDED(ENGINE_MAX_KINKS)];
+    int64_t events_left;
 
     unsigned char piece[ENGINE_MAX_KINKS];
-    double        lower[ENGINE_MAX_KINKS], upper[ENGINE_MAX_KINKS];  // bounds of w in the present mode
+    double        lower[PADDED(ENGINE_MAX_KINKS)], upper[PADDED(ENGINE_MAX_KINKS)];  // bounds of w in the present mode
     mode_t*       mode;
     const double *w_panels, *y_panels;  // of the present mode
-    bool          quiet;                // slow_z holds the state, and no event comes before the next edge
-    bool          has_limit;
-    double        energy_limit;         // no event comes while e'Q e is below it; negative if there is no such limit
+    bool          is_slow;              // slow_z holds the state, and z does not
     double        slow_z[MAX_COLUMNS];  // [s u 1], slow_age samples ago
     int           slow_age;
+    bool          has_limit;                        // rest and energy_limit are those of the present mode and inputs
+    double        rest[PADDED(ENGINE_MAX_STATES)];  // of the slow states
+    double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
     mode_t        store[MODES];
     int           stored, oldest;
 
@@ -119,28 +165,34 @@ struct engine {
     engine_counts_t counts;
 };
 
-/// out = matrix z. out needs room for whole panels. In the header so that the inner loops can inline it.
-static inline void panels_multiply(int rows, int columns, const double* panels, const double* z, double* out) {
-    for (int i = 0; i < rows; i += PANEL) {
-        double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
-        for (int j = 0; j < columns; j++) {
-            const double zj = z[j];
-            s0 += panels[0] * zj;
-            s1 += panels[1] * zj;
-            s2 += panels[2] * zj;
-            s3 += panels[3] * zj;
-            panels += PANEL;
-        }
-        out[i]     = s0;
-        out[i + 1] = s1;
-        out[i + 2] = s2;
-        out[i + 3] = s3;
-    }
+/// Accept the end of a step from `clear`: no event comes before it.
+static inline void step_accept(engine_t* self, int64_t ticks) {
+    double* oldest = self->w_before;
+    self->w_before = self->w;
+    self->w        = self->w_there;
+    self->w_there  = oldest;
+    self->stride   = ticks;
+    self->clear += ticks;
 }
 
-/// Update w of a point from its z. In the header for the same reason.
-static inline void measure_kinks(const engine_t* self, point_t* point) {
-    panels_multiply(self->kinks, self->columns, self->w_panels, point->z, point->w);
+/// The piece in which w is. A bound belongs to the middle piece.
+static inline unsigned char kink_piece(const engine_kink_t* kink, double w) {
+    return w < kink->lower ? PIECE_LOW : w > kink->upper ? PIECE_HIGH : PIECE_MIDDLE;
+}
+
+/// Bounds of w in a piece.
+static inline double kink_lower_bound(const engine_kink_t* kink, unsigned char piece) {
+    return piece == PIECE_LOW ? -(double)INFINITY : piece == PIECE_MIDDLE ? kink->lower : kink->upper;
+}
+
+static inline double kink_upper_bound(const engine_kink_t* kink, unsigned char piece) {
+    return piece == PIECE_LOW ? kink->lower : piece == PIECE_MIDDLE ? kink->upper : (double)INFINITY;
+}
+
+static inline void copy_z(const engine_t* self, const double* from, double* to) {
+    for (int j = 0; j < self->columns; j++) {
+        to[j] = from[j];
+    }
 }
 
 // The functions below are shared by the chapters, but not exported by the library.
@@ -150,11 +202,14 @@ static inline void measure_kinks(const engine_t* self, point_t* point) {
 
 // ---------------------------------------------        MATRICES        ---------------------------------------------
 
+/// The inner loops for this processor.
+const kernels_t* kernels_find(void);
+
 /// Cut a row-major matrix into panels. Rows beyond the last are zero.
 void panels_pack(int rows, int columns, int stride, const double* matrix, double* panels);
 
 /// Copy panels into a row-major matrix.
-void panels_unpack(int rows, int columns, const double* panels, double* matrix);
+void panels_unpack(int rows, int columns, int stride, const double* panels, double* matrix);
 
 /// Largest absolute row sum of the first n columns.
 double matrix_norm(int n, int stride, const double* a);
@@ -167,8 +222,21 @@ bool matrix_is_positive(int n, double* a);
 
 // ---------------------------------------------         MODES          ---------------------------------------------
 
-/// Compute the ladder of dx/dt = a [x u 1], with a padded to whole panels. Return ENGINE_TOO_STIFF if a is too large.
-engine_status_t ladder_build(const engine_t* self, double* a, double* ladder);
+/// Level of the shortest step of dx/dt = a [x u 1], with a padded to whole panels, and whether it is `stiff`. Return
+/// ENGINE_TOO_STIFF if a is too large.
+engine_status_t ladder_plan(const engine_t* self, const double* a, int* base, bool* stiff);
+
+/// Compute ladder, looks and terms of a mode. Overwrites a.
+void ladder_build(const engine_t* self, mode_t* mode, const double* w_panels, double* a);
+
+/// Advance z by a number of ticks of the present mode, at most one sample period.
+void ladder_move(engine_t* self, int64_t ticks, double* z);
+
+/// The terms of the series at z: TERMS rows of states, padded to whole panels.
+void ladder_expand(const engine_t* self, const double* z, double* terms);
+
+/// Advance z by a number of ticks within a shortest step, forwards or backwards, by the terms at z.
+void ladder_sum(const engine_t* self, const double* terms, int64_t ticks, double* z);
 
 /// Update the list of kinks that feed a w, and whether any feeds a w or y.
 void kinks_list_feeding(engine_t* self);
@@ -176,7 +244,7 @@ void kinks_list_feeding(engine_t* self);
 /// True iff w = r + P phi(w) has exactly one solution for every r.
 bool kinks_are_unique(const engine_t* self);
 
-/// Set here->w from here->z alone. Return ENGINE_NOT_FINITE or ENGINE_NOT_UNIQUE if there is no such w.
+/// Set w from z alone. Return ENGINE_NOT_FINITE or ENGINE_NOT_UNIQUE if there is no such w.
 engine_status_t kinks_solve(engine_t* self);
 
 /// a = [A B c] + G phi'(w) in the given pieces, with rows padded to whole panels.
@@ -184,13 +252,6 @@ void kinks_build_map(const engine_t* self, const unsigned char* piece, double* a
 
 /// Panelled w, followed by panelled y, over z in the given pieces.
 void kinks_build_readings(const engine_t* self, const unsigned char* piece, double* readings);
-
-/// Bounds of w in a piece.
-double kink_lower_bound(const engine_kink_t* kink, unsigned char piece);
-double kink_upper_bound(const engine_kink_t* kink, unsigned char piece);
-
-/// The piece in which w is. A bound belongs to the middle piece.
-unsigned char kink_piece(const engine_kink_t* kink, double w);
 
 /// Make the mode of the present z the mode of the engine. The steps that follow grow from one tick again.
 engine_status_t mode_enter(engine_t* self);
@@ -200,26 +261,40 @@ int64_t mode_overdue_tick(const engine_t* self, int kink);
 
 // ---------------------------------------------         STEPS          ---------------------------------------------
 
-/// Take one step of at most this many ticks, and enter the mode beyond if an event ends it.
-engine_status_t events_step(engine_t* self, int64_t ticks);
+/// Advance to a tick, or to an event before it, and enter the mode beyond.
+engine_status_t events_advance(engine_t* self, int64_t tick);
 
-/// True iff no event can come before the next edge. Begins a quiet stretch if so: the slow states alone are then
-/// stepped. Decided at sample instants only.
-bool quiet_holds(engine_t* self);
+/// Look from the origin at ever later instants until no event comes up to a tick. Return false if steps have to go on from
+/// `clear`.
+bool events_look_until(engine_t* self, int64_t tick);
 
-/// Advance a quiet stretch by one sample period.
+/// Advance `clear` to a tick, at which w is panels z. Return false if w could have left its bounds on the way.
+bool events_extend(engine_t* self, int64_t tick, int columns, const double* panels, const double* z);
+
+/// Go on with steps from z and the present instant.
+void events_resume(engine_t* self);
+
+/// Advance the slow states towards a tick. Return false if they do not suffice: z holds the state then, and `now` may lie
+/// before the tick.
+bool quiet_advance(engine_t* self, int64_t tick);
+
+/// Advance from the origin to a sample instant up to which no event comes, by the slow states alone. Return false if they do
+/// not suffice.
+bool quiet_begin(engine_t* self, int64_t tick);
+
+/// Advance by one sample period in a stretch of slow states.
 void quiet_step(engine_t* self);
 
-/// Advance a quiet stretch by LEAP samples and record them, with the bits of LEAP single steps.
+/// Advance by LEAP samples and record them, with the bits of LEAP single steps.
 void quiet_leap(engine_t* self, double* y);
 
-/// y of the present sample of a quiet stretch. y needs room for whole panels.
+/// y of the present sample in a stretch of slow states. y needs room for whole panels.
 void quiet_read(const engine_t* self, double* y);
 
-/// x in a quiet stretch.
+/// x in a stretch of slow states.
 void quiet_get_state(const engine_t* self, double* x);
 
-/// End a quiet stretch, if there is one: here holds the state again.
+/// End a stretch of slow states, if there is one: z holds the state again.
 void quiet_leave(engine_t* self);
 
 #ifdef __GNUC__

@@ -8,20 +8,6 @@
 /// Pieces that the walk of solve_coupled() may cross.
 #define MAX_CROSSINGS (16 * ENGINE_MAX_KINKS)
 
-// ---------------------------------------------         PIECES         ---------------------------------------------
-
-unsigned char kink_piece(const engine_kink_t* kink, double w) {
-    return w < kink->lower ? PIECE_LOW : w > kink->upper ? PIECE_HIGH : PIECE_MIDDLE;
-}
-
-double kink_lower_bound(const engine_kink_t* kink, unsigned char piece) {
-    return piece == PIECE_LOW ? -(double)INFINITY : piece == PIECE_MIDDLE ? kink->lower : kink->upper;
-}
-
-double kink_upper_bound(const engine_kink_t* kink, unsigned char piece) {
-    return piece == PIECE_LOW ? kink->lower : piece == PIECE_MIDDLE ? kink->upper : (double)INFINITY;
-}
-
 // ---------------------------------------------      SUBSTITUTION      ---------------------------------------------
 
 /// a = I - P diag(slopes) in the given pieces, restricted to the kinks listed.
@@ -161,9 +147,9 @@ static bool solve_coupled(const engine_t* const self, const double* wanted, unsi
 }
 
 engine_status_t kinks_solve(engine_t* const self) {
-    double* w = self->here->w;
+    double* w = self->w;
     double  coupled_w[ENGINE_MAX_KINKS];
-    panels_multiply(self->kinks, self->columns, self->cde_panels, self->here->z, w);
+    self->kernels->multiply(self->kinks, self->columns, self->cde_panels, self->z, w);
     for (int k = 0; k < self->kinks; k++) {
         if (!isfinite(w[k])) {
             return ENGINE_NOT_FINITE;

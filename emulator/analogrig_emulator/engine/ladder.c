@@ -1,86 +1,114 @@
-/// Ladders: F = exp([A B c] 2^level ticks) - I for every level. As differences from I, slow states lose no digits.
+/// Matrices of a mode. Ladder: F = exp([A B c] 2^level ticks) - I; as differences from I, slow states lose no digits. Looks:
+/// the arguments of the kinks that many ticks later. Terms: the Taylor series over the shortest of these steps.
 
 #include "engine_state.h"
 
 #include <string.h>
 
-/// Taylor series of the exponential: 10 terms of |A t| <= 1/16 leave 1e-21.
-#define TAYLOR_TERMS 10
-#define TAYLOR_NORM 0.0625
+/// TERMS terms of |A t| <= 1/2 leave 1e-16 of the first one.
+#define TAYLOR_NORM 0.5
 #define MAX_HALVINGS 40
-#define SERIES_END 1e-24
 
-/// out = left[:, :n] right, with left and right n x stride: the product of two affine maps without their
-/// constant rows.
-static void compose(int n, int stride, const double* left, const double* right, double* out) {
-    for (int i = 0; i < n; i++) {
-        for (int j = 0; j < stride; j += PANEL) {
-            double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
-            for (int k = 0; k < n; k++) {
-                const double  factor  = left[i * stride + k];
-                const double* element = &right[k * stride + j];
-                s0 += factor * element[0];
-                s1 += factor * element[1];
-                s2 += factor * element[2];
-                s3 += factor * element[3];
-            }
-            out[i * stride + j]     = s0;
-            out[i * stride + j + 1] = s1;
-            out[i * stride + j + 2] = s2;
-            out[i * stride + j + 3] = s3;
-        }
-    }
-}
+/// The longest of the shortest steps: its middle is looked at as well.
+#define MAX_BASE (NEAR_LEVEL - 1)
 
 /// f = exp(2 t) - I from f = exp(t) - I, as 2 f + f f.
-static void square(int n, int stride, double* f) {
+static void square(const engine_t* const self, int n, int stride, double* f) {
     double ff[MAX_ELEMENTS];
-    compose(n, stride, f, f, ff);
+    self->kernels->compose(n, n, stride, f, f, ff);
     for (int i = 0; i < n * stride; i++) {
         f[i] = 2.0 * f[i] + ff[i];
     }
 }
 
-/// f = exp(a) - I by its Taylor series. `rate` is the norm of a, at most TAYLOR_NORM.
-static void taylor(int n, int stride, double rate, const double* a, double* f) {
-    double term[MAX_ELEMENTS];
-    double next[MAX_ELEMENTS];
+engine_status_t ladder_plan(const engine_t* const self, const double* a, int* base, bool* stiff) {
+    const double rate = matrix_norm(self->states, PADDED(self->columns), a) * self->tick_s;
+    *base             = 0;
+    *stiff            = !(rate <= TAYLOR_NORM);
+    while (*base < MAX_BASE && rate * (double)(INT64_C(2) << *base) <= TAYLOR_NORM) {
+        ++*base;
+    }
+    return rate <= TAYLOR_NORM * (double)(INT64_C(1) << MAX_HALVINGS) ? ENGINE_OK : ENGINE_TOO_STIFF;
+}
+
+/// f = exp(a) - I, with the terms of its series packed one below the other.
+static void sum_terms(const engine_t* const self, const double* a, double* terms, double* f) {
+    const int n = self->states, columns = self->columns, stride = PADDED(columns);
+    double    term[MAX_ELEMENTS];
+    double    next[MAX_ELEMENTS];
     memcpy(term, a, (size_t)(n * stride) * sizeof term[0]);
     memcpy(f, a, (size_t)(n * stride) * sizeof f[0]);
-    double size = 1.0;
-    for (int k = 2; k <= TAYLOR_TERMS && size > SERIES_END; k++) {
-        size *= rate / (double)k;
-        compose(n, stride, a, term, next);
+    panels_pack(n, columns, stride, term, terms);
+    for (int k = 2; k <= TERMS; k++) {
+        self->kernels->compose(n, n, stride, a, term, next);
         for (int i = 0; i < n * stride; i++) {
             term[i] = next[i] / (double)k;
             f[i] += term[i];
         }
+        panels_pack(n, columns, stride, term, &terms[(k - 1) * PANEL_ELEMENTS(n, columns)]);
     }
 }
 
-engine_status_t ladder_build(const engine_t* const self, double* a, double* ladder) {
-    const int n = self->states, columns = self->columns, stride = PADDED(columns);
-    double    f[MAX_ELEMENTS];
-    double    step_s   = self->tick_s;
+void ladder_build(const engine_t* const self, mode_t* mode, const double* w_panels, double* a) {
+    const int n = self->states, q = self->kinks, columns = self->columns, stride = PADDED(columns);
+    double    f[MAX_ELEMENTS], w[ENGINE_MAX_KINKS * MAX_STRIDE], later[ENGINE_MAX_KINKS * MAX_STRIDE];
+    double    step_s   = self->tick_s * (double)(INT64_C(1) << mode->base);
     int       halvings = 0;
-
-    const double rate = matrix_norm(n, stride, a);
-    while (!(rate * step_s <= TAYLOR_NORM)) {
-        if (++halvings > MAX_HALVINGS) {
-            return ENGINE_TOO_STIFF;
-        }
+    while (mode->stiff && matrix_norm(n, stride, a) * step_s > TAYLOR_NORM) {
         step_s *= 0.5;
+        halvings++;
     }
     for (int i = 0; i < n * stride; i++) {
         a[i] *= step_s;
     }
-    taylor(n, stride, rate * step_s, a, f);
+    sum_terms(self, a, mode->terms, f);
     while (halvings-- > 0) {
-        square(n, stride, f);
+        square(self, n, stride, f);
     }
-    for (int level = 0; level < ENGINE_LEVELS; level++) {
-        panels_pack(n, columns, stride, f, &ladder[level * PANEL_ELEMENTS(n, columns)]);
-        square(n, stride, f);
+    memset(w, 0, (size_t)(q * stride) * sizeof w[0]);
+    panels_unpack(q, columns, stride, w_panels, w);
+    for (int level = mode->base; level < ENGINE_LEVELS; level++) {
+        panels_pack(n, columns, stride, f, &mode->ladder[(level - mode->base) * PANEL_ELEMENTS(n, columns)]);
+        self->kernels->compose(q, n, stride, w, f, later);
+        for (int i = 0; i < q * stride; i++) {
+            later[i] += w[i];
+        }
+        panels_pack(q, columns, stride, later, &mode->looks[(level - mode->base) * PANEL_ELEMENTS(q, columns)]);
+        square(self, n, stride, f);
     }
-    return ENGINE_OK;
+}
+
+void ladder_expand(const engine_t* const self, const double* z, double* terms) {
+    self->kernels->multiply(TERMS * PADDED(self->states), self->columns, self->mode->terms, z, terms);
+}
+
+void ladder_sum(const engine_t* const self, const double* terms, int64_t ticks, double* z) {
+    const double part = (double)ticks / (double)(INT64_C(1) << self->mode->base);
+    const int    rows = PADDED(self->states);
+    double       x[PADDED(ENGINE_MAX_STATES)];
+    memcpy(x, z, (size_t)self->states * sizeof x[0]);
+    self->kernels->sum(rows, rows, TERMS, terms, part, x);
+    memcpy(z, x, (size_t)self->states * sizeof x[0]);
+}
+
+void ladder_move(engine_t* const self, int64_t ticks, double* z) {
+    const int     base = self->mode->base, elements = PANEL_ELEMENTS(self->states, self->columns);
+    const int64_t rest = ticks & ((INT64_C(1) << base) - 1);
+    for (int level = base; ticks >> level != 0; level++) {
+        if ((ticks >> level & 1) != 0) {
+            double change[PADDED(ENGINE_MAX_STATES)];
+            self->kernels->multiply(self->states, self->columns, &self->mode->ladder[(level - base) * elements], z,
+                                    change);
+            for (int i = 0; i < self->states; i++) {
+                z[i] += change[i];
+            }
+            self->counts.steps++;
+        }
+    }
+    if (rest != 0) {
+        double terms[TERMS * PADDED(ENGINE_MAX_STATES)];
+        ladder_expand(self, z, terms);
+        ladder_sum(self, terms, rest, z);
+        self->counts.steps++;
+    }
 }

@@ -56,12 +56,15 @@ def load() -> ctypes.CDLL:
     paths = sorted(_HERE.glob("_engine*.so"))
     if not paths:
         raise EngineError(f"the circuit engine is not built in {_HERE}: run `pip install -e .`, or `{_BUILD}`")
+    return load_from(paths[0])
+
+
+def load_from(path: Path) -> ctypes.CDLL:
+    """The library of this file, with its prototypes declared. Raises EngineError with the build command."""
     try:
-        library = ctypes.CDLL(str(paths[0]))
+        library = ctypes.CDLL(str(path))
     except OSError as cause:
-        raise EngineError(
-            f"the circuit engine {paths[0]} does not load ({cause}): rebuild it with `{_BUILD}`"
-        ) from cause
+        raise EngineError(f"the circuit engine {path} does not load ({cause}): rebuild it with `{_BUILD}`") from cause
     for name, result, arguments in _PROTOTYPES:
         function = getattr(library, name)
         function.restype = result

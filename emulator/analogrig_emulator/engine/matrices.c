@@ -11,10 +11,10 @@ void panels_pack(int rows, int columns, int stride, const double* matrix, double
     }
 }
 
-void panels_unpack(int rows, int columns, const double* panels, double* matrix) {
+void panels_unpack(int rows, int columns, int stride, const double* panels, double* matrix) {
     for (int i = 0; i < rows; i++) {
         for (int j = 0; j < columns; j++) {
-            matrix[i * columns + j] = panels[((i / PANEL) * columns + j) * PANEL + i % PANEL];
+            matrix[i * stride + j] = panels[((i / PANEL) * columns + j) * PANEL + i % PANEL];
         }
     }
 }

@@ -30,34 +30,43 @@ static mode_t* find_mode(engine_t* const self) {
     return NULL;
 }
 
-static bool allocate(double** elements, int count) {
-    if (*elements == NULL) {
-        *elements = malloc((size_t)count * sizeof(double));
+/// Make room for the matrices of a mode whose shortest step has level `base`.
+static bool allocate(const engine_t* const self, mode_t* mode) {
+    const int n = PANEL_ELEMENTS(self->states, self->columns), q = PANEL_ELEMENTS(self->kinks, self->columns);
+    const int levels = ENGINE_LEVELS - mode->base;
+    const int needed = (levels + TERMS) * n + (levels + 1) * q + PANEL_ELEMENTS(self->outputs, self->columns);
+    if (mode->capacity < needed) {
+        free(mode->block);
+        mode->block    = malloc((size_t)needed * sizeof(double));
+        mode->capacity = mode->block == NULL ? 0 : needed;
     }
-    return *elements != NULL;
+    mode->ladder   = mode->block;
+    mode->terms    = mode->ladder + levels * n;
+    mode->looks    = mode->terms + TERMS * n;
+    mode->readings = mode->looks + levels * q;
+    return mode->block != NULL;
 }
 
 /// Build the present mode in the place of the oldest of the store.
 static engine_status_t build_mode(engine_t* const self) {
-    double    a[MAX_ELEMENTS];
-    mode_t*   slot     = &self->store[self->oldest];
-    const int columns  = self->columns;
-    const int readings = PANEL_ELEMENTS(self->kinks, columns) + PANEL_ELEMENTS(self->outputs, columns);
-    if (!allocate(&slot->ladder, ENGINE_LEVELS * PANEL_ELEMENTS(self->states, columns)) ||
-        (self->feeds && !allocate(&slot->readings, readings))) {
-        return ENGINE_NO_MEMORY;
+    double        a[MAX_ELEMENTS];
+    mode_t* const mode = &self->store[self->oldest];
+    kinks_build_map(self, self->piece, a);
+    const engine_status_t status = ladder_plan(self, a, &mode->base, &mode->stiff);
+    if (status != ENGINE_OK || !allocate(self, mode)) {
+        return status != ENGINE_OK ? status : ENGINE_NO_MEMORY;
     }
-    memcpy(slot->piece, self->piece, (size_t)self->kinks);
-    slot->has_slow = false;
+    memcpy(mode->piece, self->piece, (size_t)self->kinks);
+    mode->has_slow = false;
     self->oldest   = (self->oldest + 1) % MODES;
     self->stored   = self->stored < MODES ? self->stored + 1 : MODES;
-    self->mode     = slot;
+    self->mode     = mode;
     self->counts.modes_built++;
     if (self->feeds) {
-        kinks_build_readings(self, slot->piece, slot->readings);
+        kinks_build_readings(self, mode->piece, mode->readings);
     }
-    kinks_build_map(self, slot->piece, a);
-    return ladder_build(self, a, slot->ladder);
+    ladder_build(self, mode, self->feeds ? mode->readings : self->cde_panels, a);
+    return ENGINE_OK;
 }
 
 engine_status_t mode_enter(engine_t* const self) {
@@ -66,23 +75,29 @@ engine_status_t mode_enter(engine_t* const self) {
         return status;
     }
     for (int k = 0; k < self->kinks; k++) {
-        self->piece[k] = kink_piece(&self->kink[k], self->here->w[k]);
+        self->piece[k] = kink_piece(&self->kink[k], self->w[k]);
         self->lower[k] = kink_lower_bound(&self->kink[k], self->piece[k]);
         self->upper[k] = kink_upper_bound(&self->kink[k], self->piece[k]);
         watch_kink(self, k);
     }
-    self->elapsed      = 0;
-    self->level_before = NO_LEVEL;
-    self->quiet        = false;
-    self->has_limit    = false;
-    self->mode         = find_mode(self);
+    self->mode = find_mode(self);
     if (self->mode == NULL) {
         status = build_mode(self);
     }
-    if (status == ENGINE_OK && self->feeds) {
+    if (status != ENGINE_OK) {
+        return status;
+    }
+    if (self->feeds) {
         self->w_panels = self->mode->readings;
         self->y_panels = &self->mode->readings[PANEL_ELEMENTS(self->kinks, self->columns)];
-        measure_kinks(self, self->here);
+        self->kernels->multiply(self->kinks, self->columns, self->w_panels, self->z, self->w);
     }
-    return status;
+    copy_z(self, self->z, self->origin_z);
+    self->origin    = self->now;
+    self->clear     = self->kinks > 0 ? self->now : NO_END;
+    self->stride    = 0;
+    self->look      = self->mode->base;
+    self->is_slow   = false;
+    self->has_limit = false;
+    return ENGINE_OK;
 }

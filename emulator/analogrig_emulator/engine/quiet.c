@@ -1,5 +1,6 @@
-/// Quiet stretches. One sample period after the last event the fast states are functions of the slow ones. Where a
-/// Lyapunov function proves that no kink is reached before the next edge, the slow states alone are stepped.
+/// Stretches of slow states. Soon after the last event the fast states are functions of the slow ones, and these alone are
+/// stepped, from sample to sample. Where a Lyapunov function proves that no kink is reached before the next edge, the
+/// stretch is quiet and nothing is judged any more.
 
 #include "engine_state.h"
 
@@ -18,6 +19,9 @@
 #define CERTAINTY (1.0 - 1e-9)
 
 #define LEAP_DOUBLINGS 2
+
+/// Terms of the series for the change of the slow states in a tick, which is below 1e-5 of them.
+#define TICK_TERMS 4
 
 // ---------------------------------------------      SLOW STATES       ---------------------------------------------
 
@@ -223,6 +227,56 @@ static bool find_reach(int rank, int width, int kinks, const double* w, const do
     return true;
 }
 
+/// later = row (I + change): rows over [s u 1], one sample period later.
+static void advance_rows(int rank, int width, int rows, const double* change, const double* row, double* later) {
+    for (int i = 0; i < rows; i++) {
+        for (int j = 0; j < width; j++) {
+            double sum = row[i * width + j];
+            for (int k = 0; k < rank; k++) {
+                sum += row[i * width + k] * change[k * width + j];
+            }
+            later[i * width + j] = sum;
+        }
+    }
+}
+
+/// change = its double: of twice the time.
+static void double_change(int rank, int width, double* change) {
+    double later[ENGINE_MAX_STATES * MAX_COLUMNS];
+    advance_rows(rank, width, rank, change, change, later);
+    for (int i = 0; i < rank * width; i++) {
+        change[i] += later[i];
+    }
+}
+
+/// The changes of the slow states in 2^level ticks, from their flow per second.
+static void build_slow_ladder(const engine_t* const self, slow_t* slow, const double* flow) {
+    const int rank = slow->rank, width = rank + self->columns - self->states, count = rank * width;
+    double    change[ENGINE_MAX_STATES * MAX_COLUMNS], term[ENGINE_MAX_STATES * MAX_COLUMNS];
+    double    next[ENGINE_MAX_STATES * MAX_COLUMNS];
+    for (int i = 0; i < count; i++) {
+        term[i] = change[i] = flow[i] * self->tick_s;
+    }
+    for (int k = 2; k <= TICK_TERMS; k++) {
+        for (int i = 0; i < rank; i++) {
+            for (int j = 0; j < width; j++) {
+                next[i * width + j] = 0.0;
+                for (int l = 0; l < rank; l++) {
+                    next[i * width + j] += flow[i * width + l] * (self->tick_s / (double)k) * term[l * width + j];
+                }
+            }
+        }
+        memcpy(term, next, (size_t)count * sizeof term[0]);
+        for (int i = 0; i < count; i++) {
+            change[i] += term[i];
+        }
+    }
+    for (int level = 0; level < ENGINE_LEVELS; level++) {
+        panels_pack(rank, width, width, change, &slow->ladder[level * PANEL_ELEMENTS(rank, width)]);
+        double_change(rank, width, change);
+    }
+}
+
 /// Compute rest, energy and reach of the slow states. Return false if s does not provably come to rest.
 static bool
 certify_slow(const engine_t* const self, slow_t* slow, const double* map, const double* w, const double* change) {
@@ -231,6 +285,7 @@ certify_slow(const engine_t* const self, slow_t* slow, const double* map, const 
     double    rest[ENGINE_MAX_STATES * (ENGINE_MAX_INPUTS + 1)], rest_w[ENGINE_MAX_KINKS * (ENGINE_MAX_INPUTS + 1)];
     kinks_build_map(self, self->mode->piece, a);
     restrict_slow_rows(self, slow, a, PADDED(self->columns), map, flow);
+    build_slow_ladder(self, slow, flow);
     for (int i = 0; i < rank; i++) {
         memcpy(&rate[i * rank], &flow[i * width], (size_t)rank * sizeof rate[0]);
     }
@@ -253,16 +308,34 @@ certify_slow(const engine_t* const self, slow_t* slow, const double* map, const 
 
 // ---------------------------------------------      CONSTRUCTION      ---------------------------------------------
 
-/// later = row (I + change): rows over [s u 1], one sample period later.
-static void advance_rows(int rank, int width, int rows, const double* change, const double* row, double* later) {
-    for (int i = 0; i < rows; i++) {
-        for (int j = 0; j < width; j++) {
-            double sum = row[i * width + j];
-            for (int k = 0; k < rank; k++) {
-                sum += row[i * width + k] * change[k * width + j];
-            }
-            later[i * width + j] = sum;
+/// Find the level of the shortest time after which the state no longer depends on the fast states, and the slow rows then.
+static void find_first(const engine_t* const self, slow_t* slow, const double* map) {
+    const int n = self->states, columns = self->columns, width = slow->rank + columns - n, base = self->mode->base;
+    double    f[ENGINE_MAX_STATES * MAX_COLUMNS], rows[ENGINE_MAX_STATES * MAX_COLUMNS];
+    for (int level = TOP_LEVEL; level >= base; level--) {
+        double largest = 0.0, error = 0.0;
+        panels_unpack(n, columns, columns, &self->mode->ladder[(level - base) * PANEL_ELEMENTS(n, columns)], f);
+        for (int i = 0; i < n; i++) {
+            f[i * columns + i] += 1.0;
         }
+        for (int i = 0; i < n; i++) {
+            for (int j = 0; j < n; j++) {
+                double left = f[i * columns + j];
+                for (int k = 0; k < slow->rank; k++) {
+                    left -= map[i * width + k] * f[slow->row[k] * columns + j];
+                }
+                error   = fabs(left) > error ? fabs(left) : error;
+                largest = fabs(f[i * columns + j]) > largest ? fabs(f[i * columns + j]) : largest;
+            }
+        }
+        if (level < TOP_LEVEL && error > FORGOTTEN * largest) {
+            return;
+        }
+        for (int i = 0; i < slow->rank; i++) {
+            memcpy(&rows[i * columns], &f[slow->row[i] * columns], (size_t)columns * sizeof rows[0]);
+        }
+        panels_pack(slow->rank, columns, columns, rows, slow->first);
+        slow->least_level = level;
     }
 }
 
@@ -274,168 +347,277 @@ static void build_slow(const engine_t* const self, slow_t* slow) {
     double    rows[ENGINE_MAX_OUTPUTS * MAX_COLUMNS], y[ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
     double    later[ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
     double    w[ENGINE_MAX_KINKS * MAX_COLUMNS];
-    panels_unpack(n, columns, &self->mode->ladder[TOP_LEVEL * PANEL_ELEMENTS(n, columns)], f);
+    const int top = (TOP_LEVEL - self->mode->base) * PANEL_ELEMENTS(n, columns);
+    panels_unpack(n, columns, columns, &self->mode->ladder[top], f);
     slow->certain = false;
     if (!build_slow_map(self, slow, f, map)) {
         return;
     }
     const int rank = slow->rank, width = rank + columns - n;
+    find_first(self, slow, map);
     restrict_slow_rows(self, slow, f, columns, map, change);
     panels_pack(rank, width, width, change, slow->change);
     panels_pack(n, width, width, map, slow->state);
-    panels_unpack(p, columns, self->y_panels, rows);
+    panels_unpack(p, columns, columns, self->y_panels, rows);
     restrict_to_slow(self, rank, p, rows, columns, map, y);
     for (int i = 0; i < LEAP; i++) {
+        panels_pack(p, width, width, y, &slow->y[i * PANEL_ELEMENTS(p, width)]);
         advance_rows(rank, width, p, change, y, later);
-        panels_pack(p, width, width, later, &slow->y[i * PANEL_ELEMENTS(p, width)]);
         memcpy(y, later, (size_t)(p * width) * sizeof y[0]);
     }
-    panels_unpack(q, columns, self->w_panels, rows);
+    panels_unpack(q, columns, columns, self->w_panels, rows);
     restrict_to_slow(self, rank, q, rows, columns, map, w);
+    panels_pack(q, width, width, w, slow->w);
     slow->certain = certify_slow(self, slow, map, w, change);
     for (int i = 0; i < LEAP_DOUBLINGS; i++) {
-        memcpy(later, change, (size_t)(rank * width) * sizeof later[0]);
-        advance_rows(rank, width, rank, later, later, change);
-        for (int k = 0; k < rank * width; k++) {
-            change[k] += later[k];
-        }
+        double_change(rank, width, change);
     }
     panels_pack(rank, width, width, change, slow->leap);
+}
+
+/// Make room for the slow part of a mode. Return false if memory is short.
+static bool allocate(const engine_t* const self, slow_t* slow) {
+    const int n = self->states, columns = self->columns, constants = columns - n;
+    const int of_states = PANEL_ELEMENTS(n, columns), of_kinks = PANEL_ELEMENTS(self->kinks, columns);
+    const int of_outputs = LEAP * PANEL_ELEMENTS(self->outputs, columns);
+    const int of_rest = PANEL_ELEMENTS(n, constants), of_rest_w = PANEL_ELEMENTS(self->kinks, constants);
+    const int count = (ENGINE_LEVELS + 4) * of_states + of_kinks + of_outputs + of_rest + of_rest_w + n * n;
+    if (slow->block == NULL) {
+        slow->block = malloc((size_t)(count + self->kinks) * sizeof(double));
+    }
+    slow->change = slow->block;
+    slow->leap   = slow->change + of_states;
+    slow->state  = slow->leap + of_states;
+    slow->first  = slow->state + of_states;
+    slow->ladder = slow->first + of_states;
+    slow->w      = slow->ladder + ENGINE_LEVELS * of_states;
+    slow->y      = slow->w + of_kinks;
+    slow->rest   = slow->y + of_outputs;
+    slow->rest_w = slow->rest + of_rest;
+    slow->energy = slow->rest_w + of_rest_w;
+    slow->reach  = slow->energy + n * n;
+    return slow->block != NULL;
 }
 
 /// The slow part of the present mode, built on first use. NULL if it is not certain or memory is short: the engine then
 /// steps all states.
 static const slow_t* find_slow(engine_t* const self) {
-    mode_t* mode = self->mode;
-    if (!mode->has_slow) {
-        if (mode->slow == NULL) {
-            mode->slow = malloc(sizeof *mode->slow);
-        }
-        if (mode->slow == NULL) {
+    slow_t* slow = &self->mode->slow;
+    if (!self->mode->has_slow) {
+        if (!allocate(self, slow)) {
             return NULL;
         }
-        build_slow(self, mode->slow);
-        mode->has_slow = true;
+        build_slow(self, slow);
+        self->mode->has_slow = true;
     }
-    return mode->slow->certain ? mode->slow : NULL;
+    return slow->certain ? slow : NULL;
 }
 
-// ---------------------------------------------       STRETCHES        ---------------------------------------------
+// ---------------------------------------------        CERTAINTY       ---------------------------------------------
 
-/// The energy below which no w can reach a bound; negative if some w is beyond a bound at rest.
-static double find_limit(const engine_t* const self, const slow_t* slow) {
-    double rest_w[PADDED(ENGINE_MAX_KINKS)];
-    double limit = (double)INFINITY;
-    panels_multiply(self->kinks, self->columns - self->states, slow->rest_w, &self->here->z[self->states], rest_w);
+/// Compute where s rests with the present inputs, and the energy below which no w can reach a bound; negative if some w is
+/// beyond a bound at rest.
+static void find_limit(engine_t* const self, const slow_t* slow) {
+    const int     constants = self->columns - self->states;
+    const double* inputs    = &self->z[self->states];
+    double        rest_w[PADDED(ENGINE_MAX_KINKS)];
+    double        limit = (double)INFINITY;
+    self->kernels->multiply(slow->rank, constants, slow->rest, inputs, self->rest);
+    self->kernels->multiply(self->kinks, constants, slow->rest_w, inputs, rest_w);
     for (int k = 0; k < self->kinks; k++) {
         const double above = self->upper[k] - rest_w[k], below = rest_w[k] - self->lower[k];
         const double gap = CERTAINTY * (above < below ? above : below);
         if (!(gap > 0.0)) {
-            return -1.0;
+            limit = -1.0;
+            break;
         }
         if (gap * gap < limit * slow->reach[k]) {
             limit = gap * gap / slow->reach[k];
         }
     }
-    return limit;
+    self->energy_limit = limit;
+    self->has_limit    = true;
 }
 
-/// e'Q e at the present state.
-static double compute_energy(const engine_t* const self, const slow_t* slow) {
-    double e[PADDED(ENGINE_MAX_STATES)];
-    double sum = 0.0;
-    panels_multiply(slow->rank, self->columns - self->states, slow->rest, &self->here->z[self->states], e);
+/// Begin a quiet stretch if no event can come before the next edge: e'Q e is below the limit. slow_z must be that of the
+/// present sample.
+static void certify(engine_t* const self, const slow_t* slow) {
+    double e[ENGINE_MAX_STATES], energy = 0.0;
+    if (!self->has_limit) {
+        find_limit(self, slow);
+    }
     for (int i = 0; i < slow->rank; i++) {
-        e[i] = self->here->z[slow->row[i]] - e[i];
+        e[i] = self->slow_z[i] - self->rest[i];
     }
     for (int i = 0; i < slow->rank; i++) {
         for (int j = 0; j < slow->rank; j++) {
-            sum += e[i] * slow->energy[i * slow->rank + j] * e[j];
+            energy += e[i] * slow->energy[i * slow->rank + j] * e[j];
         }
     }
-    return sum;
+    if (energy < self->energy_limit) {
+        self->clear = NO_END;
+    }
 }
 
-static void advance_slow(const slow_t* slow, int width, const double* change, double* z) {
+// ---------------------------------------------       STRETCHES        ---------------------------------------------
+
+static void advance_slow(const engine_t* const self, const slow_t* slow, int width, const double* change, double* z) {
     double padded[PADDED(ENGINE_MAX_STATES)];
-    panels_multiply(slow->rank, width, change, z, padded);
+    self->kernels->multiply(slow->rank, width, change, z, padded);
     for (int i = 0; i < slow->rank; i++) {
         z[i] += padded[i];
     }
 }
 
-bool quiet_holds(engine_t* const self) {
-    if (self->quiet) {
-        return true;
+static int width_of(const engine_t* const self, const slow_t* slow) {
+    return slow->rank + self->columns - self->states;
+}
+
+/// Advance slow states by a number of ticks, at most one sample period.
+static void move_slow(const engine_t* const self, const slow_t* slow, int64_t ticks, double* z) {
+    const int width = width_of(self, slow);
+    for (int level = 0; ticks >> level != 0; level++) {
+        if ((ticks >> level & 1) != 0) {
+            advance_slow(self, slow, width, &slow->ladder[level * PANEL_ELEMENTS(slow->rank, width)], z);
+        }
     }
-    if (self->elapsed < ENGINE_TICKS_PER_SAMPLE || self->now % ENGINE_TICKS_PER_SAMPLE != 0) {
+}
+
+/// Begin a stretch at the present sample, with the slow states in slow_z.
+static void begin(engine_t* const self, const slow_t* slow) {
+    for (int j = self->states; j < self->columns; j++) {
+        self->slow_z[slow->rank + j - self->states] = self->z[j];
+    }
+    self->slow_age = 0;
+    self->is_slow  = true;
+}
+
+bool quiet_begin(engine_t* const self, int64_t tick) {
+    double        s[PADDED(ENGINE_MAX_STATES)];
+    const slow_t* slow  = events_look_until(self, self->origin + ENGINE_TICKS_PER_SAMPLE) ? find_slow(self) : NULL;
+    const int64_t since = tick - self->origin;
+    if (slow == NULL || since < INT64_C(1) << slow->least_level) {
+        return false;
+    }
+    self->kernels->multiply(slow->rank, self->columns, slow->first, self->origin_z, s);
+    for (int i = 0; i < slow->rank; i++) {
+        self->slow_z[i] = s[i];
+    }
+    begin(self, slow);
+    move_slow(self, slow, since - (INT64_C(1) << slow->least_level), self->slow_z);
+    self->now = tick;
+    certify(self, slow);
+    return true;
+}
+
+/// Begin a stretch at the present instant. Return false if it is no sample instant, or if the fast states still matter.
+static bool begin_here(engine_t* const self) {
+    if (self->now % ENGINE_TICKS_PER_SAMPLE != 0 || self->now - self->origin < ENGINE_TICKS_PER_SAMPLE) {
         return false;
     }
     const slow_t* slow = find_slow(self);
     if (slow == NULL) {
         return false;
     }
-    if (!self->has_limit) {
-        self->energy_limit = find_limit(self, slow);
-        self->has_limit    = true;
+    for (int i = 0; i < slow->rank; i++) {
+        self->slow_z[i] = self->z[slow->row[i]];
     }
-    if (!(compute_energy(self, slow) < self->energy_limit)) {
+    begin(self, slow);
+    certify(self, slow);
+    return true;
+}
+
+/// Advance by one sample period if no event comes in it.
+static bool watch_step(engine_t* const self) {
+    const slow_t* slow  = &self->mode->slow;
+    const int     width = width_of(self, slow);
+    double        z[MAX_COLUMNS];
+    memcpy(z, self->slow_z, (size_t)width * sizeof z[0]);
+    advance_slow(self, slow, width, slow->change, z);
+    if (!events_extend(self, self->now + ENGINE_TICKS_PER_SAMPLE, width, slow->w, z)) {
         return false;
     }
-    for (int i = 0; i < slow->rank; i++) {
-        self->slow_z[i] = self->here->z[slow->row[i]];
-    }
-    const int constants = self->columns - self->states;
-    memcpy(&self->slow_z[slow->rank], &self->here->z[self->states], (size_t)constants * sizeof(double));
-    self->slow_age = 0;
-    self->quiet    = true;
+    memcpy(self->slow_z, z, (size_t)width * sizeof z[0]);
+    self->now += ENGINE_TICKS_PER_SAMPLE;
+    certify(self, slow);
     return true;
 }
 
 void quiet_step(engine_t* const self) {
-    const slow_t* slow = self->mode->slow;
+    const slow_t* slow = &self->mode->slow;
+    self->slow_age++;
     if (self->slow_age == LEAP) {
-        advance_slow(slow, slow->rank + self->columns - self->states, slow->leap, self->slow_z);
+        advance_slow(self, slow, width_of(self, slow), slow->leap, self->slow_z);
         self->slow_age = 0;
     }
-    self->slow_age++;
     self->now += ENGINE_TICKS_PER_SAMPLE;
     self->counts.quiet++;
 }
 
 void quiet_leap(engine_t* const self, double* y) {
-    const slow_t* slow  = self->mode->slow;
-    const int     width = slow->rank + self->columns - self->states;
-    advance_slow(slow, width, slow->leap, self->slow_z);
-    panels_multiply(LEAP * self->outputs, width, slow->y, self->slow_z, y);
+    const slow_t* slow  = &self->mode->slow;
+    const int     width = width_of(self, slow);
+    advance_slow(self, slow, width, slow->leap, self->slow_z);
+    self->kernels->multiply(LEAP * self->outputs, width, slow->y, self->slow_z, y);
     self->now += LEAP * ENGINE_TICKS_PER_SAMPLE;
     self->counts.quiet += LEAP;
 }
 
 void quiet_read(const engine_t* const self, double* y) {
-    const slow_t* slow  = self->mode->slow;
-    const int     width = slow->rank + self->columns - self->states;
-    const int     start = (self->slow_age - 1) * PANEL_ELEMENTS(self->outputs, width);
-    panels_multiply(self->outputs, width, &slow->y[start], self->slow_z, y);
+    const slow_t* slow  = &self->mode->slow;
+    const int     width = width_of(self, slow);
+    self->kernels->multiply(self->outputs, width, &slow->y[self->slow_age * PANEL_ELEMENTS(self->outputs, width)],
+                            self->slow_z, y);
 }
 
-void quiet_get_state(const engine_t* const self, double* x) {
+/// x a number of ticks later.
+static void get_state_after(const engine_t* const self, int64_t ticks, double* x) {
     double        padded[PADDED(ENGINE_MAX_STATES)], z[MAX_COLUMNS];
-    const slow_t* slow  = self->mode->slow;
-    const int     width = slow->rank + self->columns - self->states;
-    memcpy(z, self->slow_z, sizeof z);
+    const slow_t* slow  = &self->mode->slow;
+    const int     width = width_of(self, slow);
+    memcpy(z, self->slow_z, (size_t)width * sizeof z[0]);
     for (int i = 0; i < self->slow_age; i++) {
-        advance_slow(slow, width, slow->change, z);
+        advance_slow(self, slow, width, slow->change, z);
     }
-    panels_multiply(self->states, width, slow->state, z, padded);
+    move_slow(self, slow, ticks, z);
+    self->kernels->multiply(self->states, width, slow->state, z, padded);
     memcpy(x, padded, (size_t)self->states * sizeof x[0]);
 }
 
-void quiet_leave(engine_t* const self) {
-    if (self->quiet) {
-        quiet_get_state(self, self->here->z);
-        measure_kinks(self, self->here);
-        self->level_before = NO_LEVEL;
-        self->quiet        = false;
+void quiet_get_state(const engine_t* const self, double* x) { get_state_after(self, 0, x); }
+
+/// End a stretch a number of ticks later.
+static void leave(engine_t* const self, int64_t ticks) {
+    get_state_after(self, ticks, self->z);
+    self->is_slow = false;
+    self->now += ticks;
+    if (self->clear == NO_END) {
+        events_resume(self);
     }
+}
+
+void quiet_leave(engine_t* const self) {
+    if (self->is_slow) {
+        leave(self, 0);
+    }
+}
+
+bool quiet_advance(engine_t* const self, int64_t tick) {
+    const int64_t next = self->now + ENGINE_TICKS_PER_SAMPLE;
+    if (!self->is_slow && (tick < next || !begin_here(self))) {
+        return false;
+    }
+    if (tick >= next && self->clear == NO_END) {
+        quiet_step(self);
+        return true;
+    }
+    if (tick >= next && watch_step(self)) {
+        return true;
+    }
+    if (tick < next && self->clear >= tick) {
+        leave(self, tick - self->now);
+        return true;
+    }
+    quiet_leave(self);
+    return false;
 }

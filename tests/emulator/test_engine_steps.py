@@ -1,0 +1,121 @@
+"""Voltages do not depend on how the engine steps, on the processor, or on the options of the compiler."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+from collections.abc import Callable
+from ctypes import CDLL
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+from numpy.typing import NDArray
+
+from analogrig_emulator import (
+    TICKS_PER_SAMPLE,
+    Circuit,
+    Edges,
+    Engine,
+    Excitation,
+    OpAmp,
+    OpAmpModel,
+    SuspensionComputer,
+    VoltageSource,
+    piecewise_linear,
+)
+from analogrig_emulator.engine import library
+
+Volts = NDArray[np.float64]
+
+OVERLOAD = Excitation(low_v=-10.0, high_v=10.0)
+PRBS = Excitation(shape="prbs", frequency_hz=7e3, clock="free", phase=0.3)
+LOUD = Excitation(shape="prbs", low_v=-12.0, high_v=12.0, frequency_hz=9e3, clock="free")
+FREE = Excitation(clock="free", phase=0.137, drift_ppm=20.0, frequency_hz=333.0)
+
+
+def played(program: str, opamp: str, excitation: Excitation, samples: int) -> Volts:
+    computer = SuspensionComputer(program, opamp=opamp, rng=np.random.default_rng(3))
+    return np.concatenate(list(computer.play(excitation, samples)))
+
+
+@pytest.mark.parametrize("program", ["front", "shock", "two-mass"])
+def test_a_machine_without_events_follows_the_matrix_exponential_at_every_sample(program: str) -> None:
+    """Edges of 10 mV at any instant: nothing slews or clamps."""
+    excitation = Excitation(clock="free", phase=0.3, low_v=-5e-3, high_v=5e-3, frequency_hz=1171.0)
+    computer = SuspensionComputer(program)
+    system = piecewise_linear(computer.circuit)
+    states = len(system.states)
+    slopes = np.array([kink.slopes[1] for kink in system.kinks])
+    generator = np.zeros((states + 2, states + 2))
+    generator[:states] = system.abc + (system.g * slopes) @ system.cde
+    edges = excitation.edges(0, 40 * TICKS_PER_SAMPLE, 20e3)
+    level_v = dict(zip(edges.ticks.tolist(), edges.levels_v.tolist(), strict=True))
+    z, now, rows = np.append(np.zeros(states + 1), 1.0), 0, []
+    reading = np.array(system.readings(computer.program.channel_nodes))
+    for tick in sorted({*level_v, *range(0, 40 * TICKS_PER_SAMPLE, TICKS_PER_SAMPLE)}):
+        z = scipy.linalg.expm(generator * ((tick - now) / TICKS_PER_SAMPLE * 50e-6)) @ z
+        z[states], now = level_v.get(tick, z[states]), tick
+        if tick % TICKS_PER_SAMPLE == 0:
+            rows.append(reading @ z)
+    volts = np.concatenate(list(computer.play(excitation, 40))) * computer.program.channel_signs
+    np.testing.assert_allclose(volts, rows, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("program", "opamp", "excitation", "displacement_v", "net_force_v"),
+    [
+        ("front", "tl07x", OVERLOAD, (1.70885833290501, -5.94629477046024), (0.0606992647458811, 13.3602289773438)),
+        ("front", "tl07x", PRBS, (1.708858332905014, 3.326310472674324), (0.06069926474588112, 2.32752516665547)),
+        ("bump-stop", "741", LOUD, (1.95956840810641, -3.88090310450470), (0.227115955726201, -5.13084572316338)),
+        ("two-mass", "tl07x", FREE, (2.171841856032764, 0.7689271225163599), (0.1343459534250931, 1.7470325078464146)),
+    ],
+)
+def test_voltages_are_those_of_steps_that_grow_from_one_tick(
+    program: str,
+    opamp: str,
+    excitation: Excitation,
+    displacement_v: tuple[float, float],
+    net_force_v: tuple[float, float],
+) -> None:
+    """Samples 7 and 101 as computed by another search for events: steps of 1, 1, 2, 4 ... ticks, and bisection."""
+    volts = played(program, opamp, excitation, 102)[[7, 101]]
+    np.testing.assert_allclose(volts[:, 1], displacement_v, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(volts[:, 3], net_force_v, rtol=0, atol=1e-12)
+
+
+def test_slewing_ends_where_the_law_says_so_in_a_circuit_faster_than_a_tick() -> None:
+    """A follower with a time constant of 0.16 ps, an eightieth of a tick: it slews, and then it is at its input."""
+    model = OpAmpModel(gbw_hz=1e12, slew_v_per_s=0.5e6)
+    system = piecewise_linear(Circuit([VoltageSource("V1", "in"), OpAmp("U1", "in", "out", "out", model)]))
+    engine = Engine(system, ["out"], sample_rate_hz=1e6)
+    volts = engine.run(30, {"V1": Edges(np.array([0]), np.array([10.0]))})[:, 0]
+    np.testing.assert_allclose(volts, np.minimum(0.5 * np.arange(30), 10.0), rtol=0, atol=1e-8)
+    assert engine.counts.events == 1
+    assert math.isclose(volts[-1], 10.0, abs_tol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., CDLL]:
+    """The engine, compiled with these options."""
+
+    def compile_with(*options: str) -> CDLL:
+        product = tmp_path_factory.mktemp("engine") / "_engine.so"
+        sources = sorted(Path(library.__file__).parent.glob("*.c"))
+        fixed = ("-std=c99", "-shared", "-fPIC", "-ffp-contract=off")
+        subprocess.run(["cc", *options, *fixed, "-o", product, *sources], check=True)
+        return library.load_from(product)
+
+    return compile_with
+
+
+@pytest.mark.parametrize("options", [("-O1", "-DENGINE_NARROW"), ("-O3", "-march=native")], ids=" ".join)
+def test_bits_do_not_depend_on_the_width_of_registers_or_the_compilers_options(
+    options: tuple[str, ...], compiled: Callable[..., CDLL], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cases = (("front", "tl07x", LOUD), ("shock", "opa627", FREE), ("two-mass", "741", OVERLOAD))
+    usual = [played(*case, 200).tobytes() for case in cases]
+    other = compiled(*options)
+    monkeypatch.setattr(library, "load", lambda: other)
+    assert [played(*case, 200).tobytes() for case in cases] == usual
