@@ -6,13 +6,14 @@ as in SPICE.
 
 from __future__ import annotations
 
+import functools
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Real
-from typing import ClassVar, Never, TypeAlias, TypeVar
+from typing import Any, ClassVar, Never, TypeAlias, TypeVar
 
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.pot import check_dial
@@ -233,6 +234,7 @@ class Switch(_TwoEnded):
 
 
 Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch
+_T = TypeVar("_T")
 _E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, CurrentSource, DiodeLimiter, Switch)
 
 _LEAST = 1e-100
@@ -259,13 +261,13 @@ class Circuit:
         _check_loops(self.elements)
         _check_feedback(self.elements)
 
-    @property
+    @functools.cached_property
     def nodes(self) -> tuple[str, ...]:
         """Every node but ground, in order of appearance."""
         seen = dict.fromkeys(node for element in self.elements for node in element.nodes)
         return tuple(node for node in seen if node != GROUND)
 
-    @property
+    @functools.cached_property
     def inputs(self) -> tuple[VoltageSource | CurrentSource, ...]:
         """Sources without a constant level: inputs in V or A, in netlist order."""
         sources = (element for element in self.elements if isinstance(element, VoltageSource | CurrentSource))
@@ -274,6 +276,17 @@ class Circuit:
     def of(self, kind: type[_E]) -> tuple[_E, ...]:
         """The elements of one kind, in netlist order."""
         return tuple(element for element in self.elements if isinstance(element, kind))
+
+    def derive(self, make: Callable[[Circuit], _T]) -> _T:
+        """make(self), computed once for each function `make`."""
+        if make not in self._derived:
+            self._derived[make] = make(self)
+        derived: _T = self._derived[make]
+        return derived
+
+    @functools.cached_property
+    def _derived(self) -> dict[object, Any]:
+        return {}
 
     def with_switches(self, closed: Mapping[str, bool]) -> Circuit:
         """The same circuit with the switches named in closed thrown so.

@@ -263,7 +263,7 @@ class Components:
         deviation that leaves no positive value.
         """
         elements = tuple(elements)
-        if self._perfect:
+        if self.is_perfect:
             return elements
         self._check_given(elements)
         return tuple(part for element in elements for part in self._parts(element))
@@ -293,7 +293,7 @@ class Components:
                 raise CircuitError(f"components: {field_name}: no {what} is called {min(unknown)!r}")
 
     @property
-    def _perfect(self) -> bool:
+    def is_perfect(self) -> bool:
         """True if fit() changes nothing. Most machines are nominal, and drawing takes longer than solving them."""
         given = self.given or self.given_bandwidth or self.given_slew
         return not given and self._kinds == NOMINAL._kinds

@@ -47,12 +47,16 @@ def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
 
     Raises CircuitError naming the node where the circuit is singular.
     """
-    return Nodal(circuit).at({})
+    return circuit.derive(Nodal).at({})
+
+
+_KEPT_SYSTEMS = 32
 
 
 class Nodal:
     """Equations of one circuit with all but pots and switches entered, so that turning a pot is cheap.
 
+    The last state spaces are kept: returning to earlier dials costs nothing.
     Raises CircuitError for a circuit that exceeds the limits of the engine.
     """
 
@@ -91,13 +95,28 @@ class Nodal:
         self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
         self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
         self._enter(circuit)
+        self._kept: dict[object, PiecewiseLinear] = {}
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
         """State space with pots at `dials` and switches at `closed`; the others are as in the netlist.
 
         Raises PotError for a dial off its track, CircuitError for a singular circuit.
         """
-        solution = self._solution(dials, closed or {})
+        closed = closed or {}
+        place = (
+            tuple([dials.get(pot.name, pot.dial) for pot in self._pots]),
+            tuple([closed.get(switch.name, switch.closed) for switch in self._switches]),
+        )
+        system = self._kept.get(place)
+        if system is None:
+            system = self._system(dials, closed)
+            if len(self._kept) >= _KEPT_SYSTEMS:
+                del self._kept[next(iter(self._kept))]
+            self._kept[place] = system
+        return system
+
+    def _system(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> PiecewiseLinear:
+        solution = self._solution(dials, closed)
         abc, g, cde, w_phi = self._flow(solution)
         voltages = solution[: len(self._nodes)]
         return PiecewiseLinear(

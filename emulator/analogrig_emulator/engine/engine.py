@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import functools
-import itertools
 import math
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.engine import library
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
 from analogrig_emulator.errors import EngineError
 
 _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
@@ -115,9 +113,8 @@ class Engine:
             raise EngineError(
                 f"the new circuit has states {system.states} and inputs {system.inputs}, not {self._names}"
             )
-        block, starts = _pack(system, self._outputs)
-        circuit = library.System(*(block.ctypes.data + start for start in starts))
-        self._check(self._library.engine_set_system(self._handle, ctypes.byref(circuit)))
+        self._layout = system.layout(self._outputs)
+        self._check(self._library.engine_set_system(self._handle, ctypes.byref(self._layout.circuit)))
 
     def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
         """Record the next samples, each after the edges at its instant: float64 (samples, outputs), V.
@@ -144,6 +141,26 @@ class Engine:
     def _run_until(self, tick: int, trains: _Trains, volts: NDArray[np.float64]) -> None:
         addresses = [array.ctypes.data for array in (*trains, volts)]
         self._check(self._library.engine_run(self._handle, tick, trains[0].size, *addresses))
+
+    def run_changing(
+        self, samples: int, changes: Sequence[tuple[int, PiecewiseLinear]], edges: Mapping[str, Edges] | None = None
+    ) -> NDArray[np.float64]:
+        """Record the next samples like run(), and after each sample k of `changes` set its circuit.
+
+        Equals alternating run() and set_system(), at a fraction of the cost. Raises EngineError like both.
+        """
+        volts = self._allocate(samples)
+        layouts = [self._layout, *(system.layout(self._outputs) for _, system in changes)]
+        circuits = (library.System * len(layouts))(*(layout.circuit for layout in layouts))
+        lasts = [*(sample for sample, _ in changes), self._recorded + samples - 1]
+        until = np.array(lasts, np.int64) * TICKS_PER_SAMPLE
+        trains = self._merge(edges or {})
+        addresses = [array.ctypes.data for array in (*trains, volts)]
+        turned = (len(circuits), circuits, until.ctypes.data, trains[0].size)
+        self._check(self._library.engine_play(self._handle, *turned, *addresses))
+        self._layout = layouts[-1]
+        self._advance_clock(samples)
+        return volts
 
     def run_turning(
         self,
@@ -265,9 +282,9 @@ class CircuitSchedule:
         last_samples: Sequence[int],
         patience_ticks: int,
     ) -> None:
-        laid_out = [_pack(system, outputs) for system in systems]
-        starts = laid_out[0][1]
-        self.blocks = np.stack([block for block, _ in laid_out])
+        layouts = [system.layout(tuple(outputs)) for system in systems]
+        starts = layouts[0].starts
+        self.blocks = np.stack([layout.block for layout in layouts])
         self.circuits = (library.System * len(systems))(
             *(library.System(*(row.ctypes.data + start for start in starts)) for row in self.blocks)
         )
@@ -280,16 +297,3 @@ class CircuitSchedule:
             for field, rows in ((0, len(systems[0].states)), (2, len(systems[0].kinks)))
         )
 
-
-def _pack(system: PiecewiseLinear, outputs: Sequence[str]) -> tuple[NDArray[np.float64], list[int]]:
-    """One block of memory with the arrays of engine_system_t, and the offset of each in bytes."""
-    rows = system.rows(outputs)
-    arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
-    parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
-    return np.concatenate(parts), list(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
-
-
-@functools.lru_cache(maxsize=64)
-def _kink_table(kinks: tuple[Kink, ...]) -> NDArray[np.float64]:
-    """Rows of engine_kink_t: (kinks, 8)."""
-    return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)

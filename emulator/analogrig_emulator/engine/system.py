@@ -7,6 +7,8 @@ x: states, u: inputs, v: node voltages, phi: one Kink per element of w.
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -115,6 +117,29 @@ class Rest(NamedTuple):
     volts: Mapping[str, float]
 
 
+class Layout(NamedTuple):
+    """Arrays of an engine_system_t: one block of memory, the offset of each in bytes, and the structure itself."""
+
+    block: Matrix
+    starts: tuple[int, ...]
+    circuit: library.System
+
+    @classmethod
+    def of(cls, system: PiecewiseLinear, outputs: tuple[str, ...]) -> Layout:
+        rows = system.rows(outputs)
+        arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
+        parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
+        block = np.concatenate(parts)
+        starts = tuple(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
+        return cls(block, starts, library.System(*(block.ctypes.data + start for start in starts)))
+
+
+@functools.lru_cache(maxsize=64)
+def _kink_table(kinks: tuple[Kink, ...]) -> Matrix:
+    """Rows of engine_kink_t: (kinks, 8)."""
+    return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)
+
+
 @dataclass(frozen=True)
 class PiecewiseLinear:
     """The state space of a circuit, in the form of the module docstring.
@@ -136,6 +161,21 @@ class PiecewiseLinear:
     w_phi: Matrix
     lmn: Matrix
     v_phi: Matrix
+
+    def __post_init__(self) -> None:
+        for matrix in (self.abc, self.g, self.cde, self.w_phi, self.lmn, self.v_phi):
+            matrix.setflags(write=False)  # the layouts are copies
+
+    @functools.cached_property
+    def layouts(self) -> dict[tuple[str, ...], Layout]:
+        """Layouts by outputs, as far as made."""
+        return {}
+
+    def layout(self, outputs: tuple[str, ...]) -> Layout:
+        """Layout for the engine, with these nodes as outputs. Raises CircuitError for an unknown node."""
+        if outputs not in self.layouts:
+            self.layouts[outputs] = Layout.of(self, outputs)
+        return self.layouts[outputs]
 
     def readings(self, nodes: Sequence[str]) -> Matrix:
         """Rows of lmn for these nodes, in this order. Raises CircuitError for an unknown node."""

@@ -98,7 +98,7 @@ class ForceLaw(Parameter):
 
 
 class Program(ABC):
-    """Circuit for the machine, with its scales and pots."""
+    """Circuit for the machine, with its scales and pots. Programs never change."""
 
     name: str
 

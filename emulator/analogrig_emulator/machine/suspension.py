@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +59,10 @@ class SuspensionComputer:
         self.program = _program(program)
         self.sample_rate_hz = sample_rate_hz
         models = _models(opamp, self.program.amplifiers, rng, offset_v)
-        circuit = Circuit(components.fit(self.program.netlist(models)))
-        self._pots = _pots(self.program, circuit, components)
+        if components.is_perfect and isinstance(self.program, Hashable):
+            circuit, self._pots = _nominal(self.program, tuple(models))
+        else:
+            circuit, self._pots = _wired(self.program, models, components)
         self._signs = self.program.channel_signs
         self.machine = AnalogComputer(
             circuit,
@@ -144,6 +149,11 @@ class SuspensionComputer:
             parts = []
             edges = excitation.edges(*self.machine.window(stop - start), self.sample_rate_hz)
             while play == self._plays and self.machine.recorded < stop:
+                now = list(itertools.takewhile(lambda turn: turn.sample < stop, turns))
+                if not self.machine.is_turning and not any(turn.ramp_n for turn in now):
+                    parts.append(self._advance(edges, stop - self.machine.recorded, now))
+                    del turns[: len(now)]
+                    continue
                 until = min(stop, turns[0].sample + 1) if turns else stop
                 parts.append(self._advance(edges, until - self.machine.recorded))
                 while turns and turns[0].sample + 1 == self.machine.recorded:
@@ -153,9 +163,11 @@ class SuspensionComputer:
                 raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _advance(self, edges: Edges, samples: int) -> NDArray[np.float64]:
-        """Volts of the next samples: (samples, channels)."""
-        volts = self.machine.run(samples, {SOURCE: edges.within(*self.machine.window(samples))})
+    def _advance(self, edges: Edges, samples: int, turns: Sequence[PotTurn] = ()) -> NDArray[np.float64]:
+        """Volts of the next samples, with these turns, all at once: (samples, channels)."""
+        trains = {SOURCE: edges.within(*self.machine.window(samples))}
+        jumps = [(turn.sample, turn.values) for turn in turns]
+        volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
         volts *= self._signs
         return volts
 
@@ -196,7 +208,22 @@ class _LoadedPot:
         return self.model.dial(coefficient, self.load_ohm, self.name)
 
 
-def _pots(program: Program, circuit: Circuit, components: Components) -> dict[str, _LoadedPot]:
+_LoadedPots: TypeAlias = dict[str, _LoadedPot]
+
+
+def _wired(program: Program, models: Sequence[OpAmpModel], components: Components) -> tuple[Circuit, _LoadedPots]:
+    """Circuit of a program with these op-amps and components, and its pots."""
+    circuit = Circuit(components.fit(program.netlist(models)))
+    return circuit, _pots(program, circuit, components)
+
+
+@functools.lru_cache(maxsize=16)
+def _nominal(program: Program, models: tuple[OpAmpModel, ...]) -> tuple[Circuit, _LoadedPots]:
+    """The same with perfect components. Equal machines share their circuit, and with it its equations."""
+    return _wired(program, models, NOMINAL)
+
+
+def _pots(program: Program, circuit: Circuit, components: Components) -> _LoadedPots:
     loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
     tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
