@@ -81,8 +81,10 @@ typedef struct {
     bool          stiff;
     double*       block;
     int           capacity;  // of the block
-    double* ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels from base, rows of the states only
-    double* looks;     // panelled w over the z of 2^level ticks before, for the same levels
+    int           top;       // the highest level computed so far
+    double*       ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels base .. top, states only
+    double*       looks;     // panelled w over the z of 2^level ticks before, for the same levels
+    double*       change;    // the matrix of level `top`, row-major
     double* terms;     // panelled terms ([A B c] h)^k / k! of the series for k = 1 .. TERMS, below one another
     double* readings;  // panelled w and y over z; used if phi feeds one of them
     slow_t  slow;
@@ -101,6 +103,9 @@ typedef struct {
 
     /// out = left[:, :n] right; rows of all are `stride` long, which is a multiple of PANEL.
     void (*compose)(int rows, int n, int stride, const double* left, const double* right, double* out);
+
+    /// to = factor to + gain from; count is a multiple of PANEL.
+    void (*add)(int count, double factor, const double* from, double gain, double* to);
 
     /// z += the sum of part^k terms[k - 1] for k = 1 .. terms; rows is a multiple of PANEL.
     void (*sum)(int rows, int stride, int terms, const double* term, double part, double* z);
@@ -226,8 +231,11 @@ bool matrix_is_positive(int n, double* a);
 /// ENGINE_TOO_STIFF if a is too large.
 engine_status_t ladder_plan(const engine_t* self, const double* a, int* base, bool* stiff);
 
-/// Compute ladder, looks and terms of a mode. Overwrites a.
-void ladder_build(const engine_t* self, mode_t* mode, const double* w_panels, double* a);
+/// Compute the terms of the present mode, and its lowest level. Overwrites a.
+void ladder_build(engine_t* self, double* a);
+
+/// Compute the levels of the present mode up to this one.
+void ladder_reach(engine_t* self, int level);
 
 /// Advance z by a number of ticks of the present mode, at most one sample period.
 void ladder_move(engine_t* self, int64_t ticks, double* z);

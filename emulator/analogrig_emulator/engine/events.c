@@ -213,6 +213,7 @@ static bool crosses_within(engine_t* const self, const double* from, int64_t tic
 /// `clear`; CROSSED if a bound is crossed within the next *ticks.
 static judgement_t search(engine_t* const self, int64_t tick, int64_t* ticks) {
     while (self->clear < tick && self->look <= TOP_LEVEL) {
+        ladder_reach(self, self->look);
         const judgement_t judgement = self->kernels->look_on(self, tick);
         if (judgement == CLEAR) {
             continue;

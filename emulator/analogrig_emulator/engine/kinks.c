@@ -36,7 +36,7 @@ static void add_phi(const engine_t*      self,
         const double intercept = self->kink[k].intercept[piece[k]];
         for (int i = 0; i < rows; i++) {
             const double gain = phi_gain[i * self->kinks + k];
-            for (int j = 0; j < columns; j++) {
+            for (int j = 0; j < columns && fabs(gain) > 0.0; j++) {
                 a[i * stride + j] += gain * (slope * w[k * columns + j]);
             }
             a[i * stride + columns - 1] += gain * intercept;

@@ -13,12 +13,11 @@
 #define MAX_BASE (NEAR_LEVEL - 1)
 
 /// f = exp(2 t) - I from f = exp(t) - I, as 2 f + f f.
-static void square(const engine_t* const self, int n, int stride, double* f) {
-    double ff[MAX_ELEMENTS];
+static void square(const engine_t* const self, double* f) {
+    const int n = self->states, stride = PADDED(self->columns);
+    double    ff[MAX_ELEMENTS];
     self->kernels->compose(n, n, stride, f, f, ff);
-    for (int i = 0; i < n * stride; i++) {
-        f[i] = 2.0 * f[i] + ff[i];
-    }
+    self->kernels->add(n * stride, 2.0, ff, 1.0, f);
 }
 
 engine_status_t ladder_plan(const engine_t* const self, const double* a, int* base, bool* stiff) {
@@ -33,48 +32,59 @@ engine_status_t ladder_plan(const engine_t* const self, const double* a, int* ba
 
 /// f = exp(a) - I, with the terms of its series packed one below the other.
 static void sum_terms(const engine_t* const self, const double* a, double* terms, double* f) {
-    const int n = self->states, columns = self->columns, stride = PADDED(columns);
-    double    term[MAX_ELEMENTS];
-    double    next[MAX_ELEMENTS];
+    const int n = self->states, columns = self->columns, stride = PADDED(columns), elements = PANEL_ELEMENTS(n, columns);
+    double    term[MAX_ELEMENTS], next[MAX_ELEMENTS];
     memcpy(term, a, (size_t)(n * stride) * sizeof term[0]);
     memcpy(f, a, (size_t)(n * stride) * sizeof f[0]);
     panels_pack(n, columns, stride, term, terms);
     for (int k = 2; k <= TERMS; k++) {
         self->kernels->compose(n, n, stride, a, term, next);
-        for (int i = 0; i < n * stride; i++) {
-            term[i] = next[i] / (double)k;
-            f[i] += term[i];
-        }
-        panels_pack(n, columns, stride, term, &terms[(k - 1) * PANEL_ELEMENTS(n, columns)]);
+        self->kernels->add(n * stride, 0.0, next, 1.0 / (double)k, term);
+        self->kernels->add(n * stride, 1.0, term, 1.0, f);
+        panels_pack(n, columns, stride, term, &terms[(k - 1) * elements]);
     }
 }
 
-void ladder_build(const engine_t* const self, mode_t* mode, const double* w_panels, double* a) {
-    const int n = self->states, q = self->kinks, columns = self->columns, stride = PADDED(columns);
-    double    f[MAX_ELEMENTS], w[ENGINE_MAX_KINKS * MAX_STRIDE], later[ENGINE_MAX_KINKS * MAX_STRIDE];
-    double    step_s   = self->tick_s * (double)(INT64_C(1) << mode->base);
-    int       halvings = 0;
-    while (mode->stiff && matrix_norm(n, stride, a) * step_s > TAYLOR_NORM) {
-        step_s *= 0.5;
+/// Store the matrix of the highest level in the ladder, and its look.
+static void store_level(engine_t* const self) {
+    const mode_t* mode = self->mode;
+    const int     n = self->states, q = self->kinks, columns = self->columns, stride = PADDED(columns);
+    const int     rung = mode->top - mode->base;
+    double        w[ENGINE_MAX_KINKS * MAX_STRIDE], later[ENGINE_MAX_KINKS * MAX_STRIDE];
+    memset(w, 0, (size_t)(q * stride) * sizeof w[0]);
+    panels_pack(n, columns, stride, mode->change, &mode->ladder[rung * PANEL_ELEMENTS(n, columns)]);
+    panels_unpack(q, columns, stride, self->w_panels, w);
+    self->kernels->compose(q, n, stride, w, mode->change, later);
+    self->kernels->add(q * stride, 1.0, w, 1.0, later);
+    panels_pack(q, columns, stride, later, &mode->looks[rung * PANEL_ELEMENTS(q, columns)]);
+}
+
+void ladder_build(engine_t* const self, double* a) {
+    mode_t* const mode = self->mode;
+    const int     n = self->states, stride = PADDED(self->columns);
+    const double  step_s   = self->tick_s * (double)(INT64_C(1) << mode->base);
+    double        part     = 1.0;
+    int           halvings = 0;
+    while (mode->stiff && matrix_norm(n, stride, a) * step_s * part > TAYLOR_NORM) {
+        part *= 0.5;
         halvings++;
     }
     for (int i = 0; i < n * stride; i++) {
-        a[i] *= step_s;
+        a[i] *= step_s * part;
     }
-    sum_terms(self, a, mode->terms, f);
+    sum_terms(self, a, mode->terms, mode->change);
     while (halvings-- > 0) {
-        square(self, n, stride, f);
+        square(self, mode->change);
     }
-    memset(w, 0, (size_t)(q * stride) * sizeof w[0]);
-    panels_unpack(q, columns, stride, w_panels, w);
-    for (int level = mode->base; level < ENGINE_LEVELS; level++) {
-        panels_pack(n, columns, stride, f, &mode->ladder[(level - mode->base) * PANEL_ELEMENTS(n, columns)]);
-        self->kernels->compose(q, n, stride, w, f, later);
-        for (int i = 0; i < q * stride; i++) {
-            later[i] += w[i];
-        }
-        panels_pack(q, columns, stride, later, &mode->looks[(level - mode->base) * PANEL_ELEMENTS(q, columns)]);
-        square(self, n, stride, f);
+    mode->top = mode->base;
+    store_level(self);
+}
+
+void ladder_reach(engine_t* const self, int level) {
+    while (self->mode->top < level) {
+        square(self, self->mode->change);
+        self->mode->top++;
+        store_level(self);
     }
 }
 
@@ -97,6 +107,7 @@ void ladder_move(engine_t* const self, int64_t ticks, double* z) {
     for (int level = base; ticks >> level != 0; level++) {
         if ((ticks >> level & 1) != 0) {
             double change[PADDED(ENGINE_MAX_STATES)];
+            ladder_reach(self, level);
             self->kernels->multiply(self->states, self->columns, &self->mode->ladder[(level - base) * elements], z,
                                     change);
             for (int i = 0; i < self->states; i++) {

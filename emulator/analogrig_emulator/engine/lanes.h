@@ -52,20 +52,31 @@ KERNEL(multiply)(int rows, int columns, const double* restrict panels, const dou
 
 TARGET static void KERNEL(compose)(
     int rows, int n, int stride, const double* restrict left, const double* restrict right, double* restrict out) {
-    for (int i = 0; i < rows; i++) {
-        for (int j = 0; j < stride; j += PANEL) {
-            lanes_t low = { 0.0 }, high = { 0.0 };
+    for (int i = 0; i < rows; i++, left += stride, out += stride) {
+        int j = 0;
+        for (; j + LANES < stride; j += 2 * LANES) {
+            lanes_t sum = { 0.0 }, next = { 0.0 };
             for (int k = 0; k < n; k++) {
-                low += left[i * stride + k] * *(const lanes_t*)&right[k * stride + j];
-                if (LANES < PANEL) {
-                    high += left[i * stride + k] * *(const lanes_t*)&right[k * stride + j + PANEL - LANES];
-                }
+                sum += left[k] * *(const lanes_t*)&right[k * stride + j];
+                next += left[k] * *(const lanes_t*)&right[k * stride + j + LANES];
             }
-            *(lanes_t*)&out[i * stride + j] = low;
-            if (LANES < PANEL) {
-                *(lanes_t*)&out[i * stride + j + PANEL - LANES] = high;
-            }
+            *(lanes_t*)&out[j]         = sum;
+            *(lanes_t*)&out[j + LANES] = next;
         }
+        if (j < stride) {
+            lanes_t sum = { 0.0 };
+            for (int k = 0; k < n; k++) {
+                sum += left[k] * *(const lanes_t*)&right[k * stride + j];
+            }
+            *(lanes_t*)&out[j] = sum;
+        }
+    }
+}
+
+TARGET static void KERNEL(add)(int count, double factor, const double* restrict from, double gain, double* restrict to) {
+    for (int i = 0; i < count; i += LANES) {
+        lanes_t* const lanes = (lanes_t*)&to[i];
+        *lanes               = factor * *lanes + gain * *(const lanes_t*)&from[i];
     }
 }
 
@@ -132,7 +143,7 @@ KERNEL(look)(engine_t* self, int columns, const double* panels, const double* z,
 TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     const int     columns = self->columns, base = self->mode->base, elements = PANEL_ELEMENTS(self->kinks, columns);
     const double* looks = &self->mode->looks[(self->look - base) * elements];
-    for (; self->clear < tick && self->look <= TOP_LEVEL; looks += elements) {
+    for (; self->clear < tick && self->look <= self->mode->top; looks += elements) {
         const int         since     = self->look - base;
         const double      growth    = since < 2 ? (double)since : 2.0;
         const judgement_t judgement = KERNEL(look_once)(self, columns, looks, self->origin_z, growth);
@@ -146,7 +157,7 @@ TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     return CLEAR;
 }
 
-static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(compose), KERNEL(sum), KERNEL(look),
+static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(compose), KERNEL(add), KERNEL(sum), KERNEL(look),
                                            KERNEL(look_on) };
 
 #undef INLINE

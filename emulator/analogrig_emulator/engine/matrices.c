@@ -4,9 +4,11 @@
 #define PIVOT_TOLERANCE 1e-13
 
 void panels_pack(int rows, int columns, int stride, const double* matrix, double* panels) {
-    for (int i = 0; i < PADDED(rows); i++) {
+    for (int i = 0; i < rows; i += PANEL) {
         for (int j = 0; j < columns; j++) {
-            panels[((i / PANEL) * columns + j) * PANEL + i % PANEL] = i < rows ? matrix[i * stride + j] : 0.0;
+            for (int k = 0; k < PANEL; k++) {
+                *panels++ = i + k < rows ? matrix[(i + k) * stride + j] : 0.0;
+            }
         }
     }
 }

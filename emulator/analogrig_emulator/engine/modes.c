@@ -34,7 +34,8 @@ static mode_t* find_mode(engine_t* const self) {
 static bool allocate(const engine_t* const self, mode_t* mode) {
     const int n = PANEL_ELEMENTS(self->states, self->columns), q = PANEL_ELEMENTS(self->kinks, self->columns);
     const int levels = ENGINE_LEVELS - mode->base;
-    const int needed = (levels + TERMS) * n + (levels + 1) * q + PANEL_ELEMENTS(self->outputs, self->columns);
+    const int matrix = self->states * PADDED(self->columns);
+    const int needed = (levels + TERMS) * n + matrix + (levels + 1) * q + PANEL_ELEMENTS(self->outputs, self->columns);
     if (mode->capacity < needed) {
         free(mode->block);
         mode->block    = malloc((size_t)needed * sizeof(double));
@@ -42,9 +43,18 @@ static bool allocate(const engine_t* const self, mode_t* mode) {
     }
     mode->ladder   = mode->block;
     mode->terms    = mode->ladder + levels * n;
-    mode->looks    = mode->terms + TERMS * n;
+    mode->change   = mode->terms + TERMS * n;
+    mode->looks    = mode->change + matrix;
     mode->readings = mode->looks + levels * q;
     return mode->block != NULL;
+}
+
+/// Take w and y from the readings of the present mode if phi feeds one of them.
+static void point_readings(engine_t* const self) {
+    if (self->feeds) {
+        self->w_panels = self->mode->readings;
+        self->y_panels = &self->mode->readings[PANEL_ELEMENTS(self->kinks, self->columns)];
+    }
 }
 
 /// Build the present mode in the place of the oldest of the store.
@@ -65,7 +75,8 @@ static engine_status_t build_mode(engine_t* const self) {
     if (self->feeds) {
         kinks_build_readings(self, mode->piece, mode->readings);
     }
-    ladder_build(self, mode, self->feeds ? mode->readings : self->cde_panels, a);
+    point_readings(self);
+    ladder_build(self, a);
     return ENGINE_OK;
 }
 
@@ -88,8 +99,7 @@ engine_status_t mode_enter(engine_t* const self) {
         return status;
     }
     if (self->feeds) {
-        self->w_panels = self->mode->readings;
-        self->y_panels = &self->mode->readings[PANEL_ELEMENTS(self->kinks, self->columns)];
+        point_readings(self);
         self->kernels->multiply(self->kinks, self->columns, self->w_panels, self->z, self->w);
     }
     copy_z(self, self->z, self->origin_z);

@@ -340,13 +340,14 @@ static void find_first(const engine_t* const self, slow_t* slow, const double* m
 }
 
 /// Build the slow part of the present mode.
-static void build_slow(const engine_t* const self, slow_t* slow) {
+static void build_slow(engine_t* const self, slow_t* slow) {
     const int n = self->states, q = self->kinks, p = self->outputs, columns = self->columns;
     double    f[ENGINE_MAX_STATES * MAX_COLUMNS], map[ENGINE_MAX_STATES * MAX_COLUMNS];
     double    change[ENGINE_MAX_STATES * MAX_COLUMNS];
     double    rows[ENGINE_MAX_OUTPUTS * MAX_COLUMNS], y[ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
     double    later[ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
     double    w[ENGINE_MAX_KINKS * MAX_COLUMNS];
+    ladder_reach(self, TOP_LEVEL);
     const int top = (TOP_LEVEL - self->mode->base) * PANEL_ELEMENTS(n, columns);
     panels_unpack(n, columns, columns, &self->mode->ladder[top], f);
     slow->certain = false;
