@@ -19,6 +19,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import is_integer
 from analogrig_emulator.errors import SamplerError
 
@@ -237,21 +238,21 @@ class Sampler:
         """Held voltages (n, channels): each step from sample to sample lacks exp(-acquisition)."""
         if self._residual == 0.0 or not len(volts):
             return volts
+        volts = np.ascontiguousarray(volts, np.float64)
+        if self._held_v is None:
+            self._held_v = volts[0].copy()
         held_v = np.empty_like(volts)
-        before = volts[0] if self._held_v is None else self._held_v
-        for k, target in enumerate(volts):
-            before = target + self._residual * (before - target)
-            held_v[k] = before
-        self._held_v = before
+        addresses = [array.ctypes.data for array in (volts, self._held_v, held_v)]
+        library.load().engine_hold(*volts.shape, self._residual, *addresses)
         return held_v
 
 
 def _approximate_successively(seen_lsb: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.uint16]:
     """Codes by successive approximation: from the highest bit down, keep a bit if the input reaches its level."""
-    codes = np.zeros(seen_lsb.shape, np.uint16)
-    for bit in reversed(range(levels.size.bit_length() - 1)):
-        tried = codes | np.uint16(1 << bit)
-        codes = np.where(seen_lsb >= levels[tried], tried, codes)
+    seen_lsb = np.ascontiguousarray(seen_lsb, np.float64)
+    codes = np.empty(seen_lsb.shape, np.uint16)
+    addresses = [array.ctypes.data for array in (levels, seen_lsb, codes)]
+    library.load().engine_approximate(seen_lsb.size, levels.size.bit_length() - 1, *addresses)
     return codes
 
 

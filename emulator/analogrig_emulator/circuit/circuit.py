@@ -241,6 +241,9 @@ _LEAST = 1e-100
 """Least ohms and farads: no reciprocal of them, nor of an end stop's part of a track, overflows."""
 
 
+_KEPT_VARIANTS = 4
+
+
 @dataclass(frozen=True)
 class Circuit:
     """A checked netlist.
@@ -294,22 +297,41 @@ class Circuit:
         Raises CircuitError for a switch that is not there.
         """
         _check_known("switch", closed, self.of(Switch))
-        return Circuit(
-            replace(element, closed=closed[element.name])
-            if isinstance(element, Switch) and element.name in closed
-            else element
-            for element in self.elements
+        return self._variant(
+            ("switches", *sorted(closed.items())),
+            lambda: Circuit(
+                replace(element, closed=closed[element.name])
+                if isinstance(element, Switch) and element.name in closed
+                else element
+                for element in self.elements
+            ),
         )
 
     def with_dials(self, dials: Mapping[str, float]) -> Circuit:
         """The same circuit with the pots named in dials set anew. Raises CircuitError for a pot that is not there."""
         _check_known("pot", dials, self.of(Pot))
-        return Circuit(
-            replace(element, dial=dials[element.name])
-            if isinstance(element, Pot) and element.name in dials
-            else element
-            for element in self.elements
+        return self._variant(
+            ("dials", *sorted(dials.items())),
+            lambda: Circuit(
+                replace(element, dial=dials[element.name])
+                if isinstance(element, Pot) and element.name in dials
+                else element
+                for element in self.elements
+            ),
         )
+
+    def _variant(self, settings: object, make: Callable[[], Circuit]) -> Circuit:
+        """This circuit with other settings: one of the last few, or a new one."""
+        if settings not in self._variants:
+            variant = make()
+            if len(self._variants) >= _KEPT_VARIANTS:
+                del self._variants[next(iter(self._variants))]
+            self._variants[settings] = variant
+        return self._variants[settings]
+
+    @functools.cached_property
+    def _variants(self) -> dict[object, Circuit]:
+        return {}
 
 
 def label(element: Element) -> str:

@@ -50,7 +50,7 @@ def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
     return circuit.derive(Nodal).at({})
 
 
-_KEPT_SYSTEMS = 32
+_KEPT_SYSTEMS = 16
 
 
 class Nodal:

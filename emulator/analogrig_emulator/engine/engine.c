@@ -54,54 +54,137 @@ void engine_free(engine_t* const self) {
     if (self == NULL) {
         return;
     }
-    for (int i = 0; i < MODES; i++) {
-        free(self->store[i].block);
-        free(self->store[i].slow.block);
+    for (int i = 0; i < CIRCUITS && self->circuits[i] != NULL; i++) {
+        for (int k = 0; k < MODES; k++) {
+            free(self->circuits[i]->store[k].block);
+            free(self->circuits[i]->store[k].slow.block);
+        }
+        free(self->circuits[i]->block);
+        free(self->circuits[i]);
     }
     free(self);
 }
 
 // ---------------------------------------------    CIRCUIT AND STATE   ---------------------------------------------
 
-/// Copy count elements. Return true iff they differ from those before.
-static bool replace_elements(void* to, const void* from, size_t count, size_t size) {
-    if (count == 0U || memcmp(to, from, count * size) == 0) {
-        return false;
+/// Number of elements of each array of engine_system_t.
+typedef struct {
+    size_t abc, g, cde, w_phi, lmn, y_phi, kinks;
+} sizes_t;
+
+static sizes_t sizes_of(const engine_t* const self) {
+    const size_t n = (size_t)self->states, q = (size_t)self->kinks, p = (size_t)self->outputs;
+    const size_t columns = (size_t)self->columns;
+    return (sizes_t){ n * columns, n * q, q * columns, q * q, p * columns, p * q, q };
+}
+
+static bool is_equal(size_t count, size_t size, const void* one, const void* other) {
+    return count == 0U || memcmp(one, other, count * size) == 0;
+}
+
+static bool holds(const engine_t* const self, const circuit_t* circuit, const engine_system_t* system) {
+    const sizes_t sizes = sizes_of(self);
+    return circuit->is_set && is_equal(sizes.abc, sizeof(double), circuit->abc, system->abc) &&
+           is_equal(sizes.g, sizeof(double), circuit->g, system->g) &&
+           is_equal(sizes.cde, sizeof(double), circuit->cde, system->cde) &&
+           is_equal(sizes.w_phi, sizeof(double), circuit->w_phi, system->w_phi) &&
+           is_equal(sizes.lmn, sizeof(double), circuit->lmn, system->lmn) &&
+           is_equal(sizes.y_phi, sizeof(double), circuit->y_phi, system->y_phi) &&
+           is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks);
+}
+
+/// Take `count` elements of a block.
+static double* carve(double** block, size_t count) {
+    double* const part = *block;
+    *block += count;
+    return part;
+}
+
+/// Return a circuit with room for its arrays; NULL if memory is short.
+static circuit_t* new_circuit(const engine_t* const self) {
+    const sizes_t    sizes     = sizes_of(self);
+    const size_t     of_kinks  = (size_t)PANEL_ELEMENTS(self->kinks, self->columns);
+    const size_t     of_panels = of_kinks + (size_t)PANEL_ELEMENTS(self->outputs, self->columns);
+    const size_t     matrices  = sizes.abc + sizes.g + sizes.cde + sizes.w_phi + sizes.lmn + sizes.y_phi;
+    circuit_t* const circuit   = calloc(1, sizeof *circuit);
+    if (circuit != NULL) {
+        circuit->block = malloc((matrices + of_panels) * sizeof(double) + sizes.kinks * sizeof(engine_kink_t) + 1U);
     }
-    memcpy(to, from, count * size);
-    return true;
+    if (circuit == NULL || circuit->block == NULL) {
+        free(circuit);
+        return NULL;
+    }
+    double* free_part   = circuit->block;
+    circuit->abc        = carve(&free_part, sizes.abc);
+    circuit->g          = carve(&free_part, sizes.g);
+    circuit->cde        = carve(&free_part, sizes.cde);
+    circuit->w_phi      = carve(&free_part, sizes.w_phi);
+    circuit->lmn        = carve(&free_part, sizes.lmn);
+    circuit->y_phi      = carve(&free_part, sizes.y_phi);
+    circuit->cde_panels = carve(&free_part, of_kinks);
+    circuit->lmn_panels = carve(&free_part, of_panels - of_kinks);
+    circuit->kink       = (engine_kink_t*)(void*)free_part;
+    return circuit;
+}
+
+static void copy(size_t count, size_t size, const void* from, void* to) {
+    if (count > 0U) {
+        memcpy(to, from, count * size);
+    }
+}
+
+/// Put a circuit in the place of the one set longest ago, and make it the present one.
+static engine_status_t keep_circuit(engine_t* const self, const engine_system_t* system) {
+    const sizes_t sizes = sizes_of(self);
+    circuit_t**   place = &self->circuits[self->oldest];
+    if (*place == NULL) {
+        *place = new_circuit(self);
+    }
+    circuit_t* const circuit = *place;
+    if (circuit == NULL) {
+        return ENGINE_NO_MEMORY;
+    }
+    self->oldest = (self->oldest + 1) % CIRCUITS;
+    copy(sizes.abc, sizeof(double), system->abc, circuit->abc);
+    copy(sizes.g, sizeof(double), system->g, circuit->g);
+    copy(sizes.cde, sizeof(double), system->cde, circuit->cde);
+    copy(sizes.w_phi, sizeof(double), system->w_phi, circuit->w_phi);
+    copy(sizes.lmn, sizeof(double), system->lmn, circuit->lmn);
+    copy(sizes.y_phi, sizeof(double), system->y_phi, circuit->y_phi);
+    copy(sizes.kinks, sizeof(engine_kink_t), system->kinks, circuit->kink);
+    circuit->stored = 0;
+    circuit->oldest = 0;
+    self->circuit   = circuit;
+    kinks_list_feeding(self);
+    circuit->is_set = kinks_are_unique(self);
+    panels_pack(self->kinks, self->columns, self->columns, circuit->cde, circuit->cde_panels);
+    panels_pack(self->outputs, self->columns, self->columns, circuit->lmn, circuit->lmn_panels);
+    return circuit->is_set ? ENGINE_OK : ENGINE_NOT_UNIQUE;
 }
 
 engine_status_t engine_set_system(engine_t* const self, const engine_system_t* system) {
-    const size_t n = (size_t)self->states, q = (size_t)self->kinks, p = (size_t)self->outputs;
-    const size_t columns = (size_t)self->columns;
-    bool         changed = !self->has_system;
-    changed |= replace_elements(self->abc, system->abc, n * columns, sizeof(double));
-    changed |= replace_elements(self->g, system->g, n * q, sizeof(double));
-    changed |= replace_elements(self->cde, system->cde, q * columns, sizeof(double));
-    changed |= replace_elements(self->w_phi, system->w_phi, q * q, sizeof(double));
-    changed |= replace_elements(self->lmn, system->lmn, p * columns, sizeof(double));
-    changed |= replace_elements(self->y_phi, system->y_phi, p * q, sizeof(double));
-    changed |= replace_elements(self->kink, system->kinks, q, sizeof(engine_kink_t));
-    if (!changed) {
+    engine_status_t status = ENGINE_OK;
+    if (self->has_system && holds(self, self->circuit, system)) {
         return ENGINE_OK;
     }
     if (self->has_system) {
         quiet_leave(self);
     }
-    self->stored = 0;
-    self->oldest = 0;
-    kinks_list_feeding(self);
-    self->has_system = kinks_are_unique(self);
-    if (!self->has_system) {
-        return ENGINE_NOT_UNIQUE;
+    int place = 0;
+    while (place < CIRCUITS && self->circuits[place] != NULL && !holds(self, self->circuits[place], system)) {
+        place++;
     }
-    panels_pack(self->kinks, self->columns, self->columns, self->cde, self->cde_panels);
-    panels_pack(self->outputs, self->columns, self->columns, self->lmn, self->lmn_panels);
-    self->w_panels               = self->cde_panels;
-    self->y_panels               = self->lmn_panels;
-    const engine_status_t status = mode_enter(self);
-    self->has_system             = status == ENGINE_OK;
+    if (place < CIRCUITS && self->circuits[place] != NULL) {
+        self->circuit = self->circuits[place];
+    } else {
+        status = keep_circuit(self, system);
+    }
+    if (status == ENGINE_OK) {
+        self->w_panels = self->circuit->cde_panels;
+        self->y_panels = self->circuit->lmn_panels;
+        status         = mode_enter(self);
+    }
+    self->has_system = status == ENGINE_OK;
     return status;
 }
 

@@ -15,8 +15,8 @@
 ///
 /// The library is C99 with malloc, libm and the vectors of GCC and clang, for the host: not for interrupts and not for the
 /// device. One engine must not be used by two threads at once; different engines may. Results depend on the inputs alone,
-/// not on how a run is cut into calls, on the compiler's options or on the processor. RAM: 420 kB an engine; for each of up
-/// to 64 modes 45 kB with seven states, and 40 kB once it has been without events for a sample period.
+/// not on how a run is cut into calls, on the compiler's options or on the processor. RAM: 10 kB an engine, 40 kB a
+/// circuit; for each of up to 64 modes 45 kB with seven states, and 40 kB once it has been without events for a sample period.
 ///
 /// Rows of [A B c], [C D e] and [L M n] are stored side by side: (states + inputs + 1) columns, row-major.
 ///
@@ -83,16 +83,16 @@ engine_t* engine_new(int states, int inputs, int kinks, int outputs, double samp
 /// Free the engine. NULL is allowed.
 void engine_free(engine_t* self);
 
-/// Return the engine to the state of engine_new(), without a circuit. Memory already allocated is kept.
+/// Return the engine to the state of engine_new(), without a circuit. Memory and the matrices of circuits are kept.
 void engine_restart(engine_t* self);
 
 /// Set or replace the circuit; to be called before engine_run(). x and u keep their values. A circuit equal to the present
-/// one to the bit changes nothing.
+/// one to the bit changes nothing. The last 8 circuits are kept, with the matrices of their modes.
 ///
 /// Fails with ENGINE_NOT_UNIQUE, or as engine_run() where it enters the mode. Without a circuit, engine_run() then fails.
-/// Cost: a copy, one determinant for each combination of pieces of the kinks that feed a w, and later one ladder for each
-/// mode that occurs: about 30 n^2 (n + m + 1) multiplications with n states and m inputs. Of more than 4096 combinations,
-/// only those that occur are checked.
+/// Cost: a comparison with those kept; for a new one a copy, one determinant for each combination of pieces of the kinks that
+/// feed a w, and later one ladder for each mode that occurs: about 30 n^2 (n + m + 1) multiplications with n states and m
+/// inputs. Of more than 4096 combinations, only those that occur are checked.
 engine_status_t engine_set_system(engine_t* self, const engine_system_t* system);
 
 /// Copy the state to x. Cannot fail.
@@ -160,5 +160,13 @@ void engine_noise_run(int           n,
                       const double* normal,
                       double*       x,
                       double*       y);
+
+/// For each sample of `channels` voltages, record in out what a sample-and-hold has acquired: the step from the voltage held
+/// before lacks the part `residual`. held: the voltages held before, then those of the last sample.
+void engine_hold(int64_t samples, int channels, double residual, const double* volts, double* held, double* out);
+
+/// Convert by successive approximation: from the highest bit down, keep a bit if the input reaches the level of the code.
+/// levels: 2^bits transitions, that of code 0 unused; bits is at most 16.
+void engine_approximate(int64_t count, int bits, const double* levels, const double* seen, uint16_t* codes);
 
 #endif  // ENGINE_H

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import math
 import weakref
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,10 +70,11 @@ class Engine:
                 f"{len(self._outputs)} nodes are to be recorded; the engine takes at most {library.MAX_OUTPUTS}"
             )
         sizes = (len(system.states), len(system.inputs), len(system.kinks), len(self._outputs))
-        self._handle = self._library.engine_new(*sizes, 1.0 / sample_rate_hz, events_per_sample)
+        kind = (self._library, (*sizes, 1.0 / sample_rate_hz, events_per_sample))
+        self._handle = _take(kind)
         if not self._handle:
             raise EngineError("cannot make an engine for {} states, {} inputs, {} kinks, {} outputs".format(*sizes))
-        weakref.finalize(self, self._library.engine_free, self._handle)
+        weakref.finalize(self, _release, kind, self._handle)
         self._kinks = len(system.kinks)
         self._recorded = 0
         self._now_tick = -1
@@ -265,6 +268,37 @@ class Engine:
             raise EngineError(f"after {self.counts.samples} samples: {_REASONS.get(status, f'status {status}')}")
 
 
+_Kind: TypeAlias = tuple[ctypes.CDLL, tuple[float, ...]]
+"""Library of an engine, and the arguments of its engine_new."""
+
+_IDLE_KINDS, _IDLE_OF_A_KIND = 8, 2
+
+_idle: dict[_Kind, deque[int]] = {}
+"""Addresses of engines that nobody uses. They keep their matrices for the next machine of their kind."""
+
+
+def _take(kind: _Kind) -> int | None:
+    """Address of an engine at rest; None as from engine_new."""
+    engines, arguments = kind
+    try:
+        handle = _idle[kind].pop()
+    except LookupError:
+        new: int | None = engines.engine_new(*arguments)
+        return new
+    engines.engine_restart(handle)
+    return handle
+
+
+def _release(kind: _Kind, handle: int) -> None:
+    """Keep an engine, or free it if enough are kept. May run at any time and in any thread."""
+    if kind in _idle or len(_idle) < _IDLE_KINDS:
+        kept = _idle.setdefault(kind, deque())
+        if len(kept) < _IDLE_OF_A_KIND:
+            kept.append(handle)
+            return
+    kind[0].engine_free(handle)
+
+
 class CircuitSchedule:
     """Circuits of one play in the engine's memory layout, for repeated plays.
 
@@ -296,4 +330,3 @@ class CircuitSchedule:
             starts[field] // self.blocks.itemsize + np.arange(1, rows + 1) * width - 1
             for field, rows in ((0, len(systems[0].states)), (2, len(systems[0].kinks)))
         )
-

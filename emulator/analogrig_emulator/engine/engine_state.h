@@ -9,6 +9,7 @@
 ///     matrices.c  panels, products, linear equations
 ///     kernels.c   inner loops, from lanes.h
 ///     noise.c     noise of a linear circuit, independent of the rest
+///     card.c      steps of a data-acquisition card, independent of the rest
 
 #ifndef ENGINE_STATE_H
 #define ENGINE_STATE_H
@@ -37,6 +38,9 @@
 
 /// Capacity of the store of modes. The suspension visits about ten.
 #define MODES 64
+
+/// Circuits that are kept with their modes, so that a return to one of them costs nothing.
+#define CIRCUITS 8
 
 /// Samples of a quiet stretch that are computed from the same state. They do not depend on one another, so that the
 /// processor can overlap them.
@@ -85,16 +89,29 @@ typedef struct {
     double*       ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels base .. top, states only
     double*       looks;     // panelled w over the z of 2^level ticks before, for the same levels
     double*       change;    // the matrix of level `top`, row-major
-    double* terms;     // panelled terms ([A B c] h)^k / k! of the series for k = 1 .. TERMS, below one another
-    double* readings;  // panelled w and y over z; used if phi feeds one of them
-    slow_t  slow;
-    bool    has_slow;
+    double*       terms;     // panelled terms ([A B c] h)^k / k! of the series for k = 1 .. TERMS, below one another
+    double*       readings;  // panelled w and y over z; used if phi feeds one of them
+    slow_t        slow;
+    bool          has_slow;
 } mode_t;
 
 /// The end of a step with respect to the bounds of the present mode. A step inside all bounds is CLEAR if w could not have
 /// left them on the way, even straying beyond both ends by the larger of two amounts: its change in this step, and its change
 /// at the speed of the step before. At the top of a peak the first alone may be zero.
 typedef enum { CLEAR, NEAR, CROSSED } judgement_t;
+
+/// A circuit and its modes. Arrays as in engine_system_t, in one block.
+typedef struct {
+    bool           is_set;  // it has a unique solution
+    double*        block;
+    double *       abc, *g, *cde, *w_phi, *lmn, *y_phi;
+    engine_kink_t* kink;
+    double *       cde_panels, *lmn_panels;
+    bool           feeds;                                     // phi feeds some w or y
+    int            coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
+    mode_t         store[MODES];
+    int            stored, oldest;
+} circuit_t;
 
 /// The inner loops. Memory must not overlap.
 typedef struct {
@@ -126,18 +143,10 @@ struct engine {
     double  tick_s;
     int64_t events_per_sample;
 
-    bool          has_system;
-    double        abc[ENGINE_MAX_STATES * MAX_COLUMNS];
-    double        g[ENGINE_MAX_STATES * ENGINE_MAX_KINKS];
-    double        cde[ENGINE_MAX_KINKS * MAX_COLUMNS];
-    double        w_phi[ENGINE_MAX_KINKS * ENGINE_MAX_KINKS];
-    double        lmn[ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
-    double        y_phi[ENGINE_MAX_OUTPUTS * ENGINE_MAX_KINKS];
-    bool          feeds;                                     // phi feeds some w or y
-    int           coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
-    engine_kink_t kink[ENGINE_MAX_KINKS];
-    double        cde_panels[PANEL_ELEMENTS(ENGINE_MAX_KINKS, MAX_COLUMNS)];
-    double        lmn_panels[PANEL_ELEMENTS(ENGINE_MAX_OUTPUTS, MAX_COLUMNS)];
+    bool       has_system;
+    circuit_t* circuit;             // the present one
+    circuit_t* circuits[CIRCUITS];  // NULL from the first free place on
+    int        oldest;              // place of the circuit set longest ago
 
     int64_t now;
     double  z[PADDED(MAX_COLUMNS)];  // [x u 1] now; without x in a stretch of slow states
@@ -160,8 +169,6 @@ struct engine {
     bool          has_limit;                        // rest and energy_limit are those of the present mode and inputs
     double        rest[PADDED(ENGINE_MAX_STATES)];  // of the slow states
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
-    mode_t        store[MODES];
-    int           stored, oldest;
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER

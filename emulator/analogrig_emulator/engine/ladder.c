@@ -32,8 +32,9 @@ engine_status_t ladder_plan(const engine_t* const self, const double* a, int* ba
 
 /// f = exp(a) - I, with the terms of its series packed one below the other.
 static void sum_terms(const engine_t* const self, const double* a, double* terms, double* f) {
-    const int n = self->states, columns = self->columns, stride = PADDED(columns), elements = PANEL_ELEMENTS(n, columns);
-    double    term[MAX_ELEMENTS], next[MAX_ELEMENTS];
+    const int n = self->states, columns = self->columns, stride = PADDED(columns),
+              elements = PANEL_ELEMENTS(n, columns);
+    double term[MAX_ELEMENTS], next[MAX_ELEMENTS];
     memcpy(term, a, (size_t)(n * stride) * sizeof term[0]);
     memcpy(f, a, (size_t)(n * stride) * sizeof f[0]);
     panels_pack(n, columns, stride, term, terms);

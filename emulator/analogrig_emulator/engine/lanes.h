@@ -73,7 +73,8 @@ TARGET static void KERNEL(compose)(
     }
 }
 
-TARGET static void KERNEL(add)(int count, double factor, const double* restrict from, double gain, double* restrict to) {
+TARGET static void
+KERNEL(add)(int count, double factor, const double* restrict from, double gain, double* restrict to) {
     for (int i = 0; i < count; i += LANES) {
         lanes_t* const lanes = (lanes_t*)&to[i];
         *lanes               = factor * *lanes + gain * *(const lanes_t*)&from[i];
@@ -157,8 +158,8 @@ TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     return CLEAR;
 }
 
-static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(compose), KERNEL(add), KERNEL(sum), KERNEL(look),
-                                           KERNEL(look_on) };
+static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(compose), KERNEL(add),
+                                           KERNEL(sum),      KERNEL(look),    KERNEL(look_on) };
 
 #undef INLINE
 #undef JOINED

@@ -47,6 +47,8 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
     ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
     ("engine_noise_run", None, (c_int, c_int, c_int64, *(c_void_p,) * 6)),
+    ("engine_hold", None, (c_int64, c_int, c_double, *(c_void_p,) * 3)),
+    ("engine_approximate", None, (c_int64, c_int, *(c_void_p,) * 3)),
 )
 
 

@@ -4,11 +4,17 @@
 #define PIVOT_TOLERANCE 1e-13
 
 void panels_pack(int rows, int columns, int stride, const double* matrix, double* panels) {
+    static const double none[MAX_STRIDE] = { 0.0 };
     for (int i = 0; i < rows; i += PANEL) {
-        for (int j = 0; j < columns; j++) {
-            for (int k = 0; k < PANEL; k++) {
-                *panels++ = i + k < rows ? matrix[(i + k) * stride + j] : 0.0;
-            }
+        const double* row[PANEL];
+        for (int k = 0; k < PANEL; k++) {
+            row[k] = i + k < rows ? &matrix[(i + k) * stride] : none;
+        }
+        for (int j = 0; j < columns; j++, panels += PANEL) {
+            panels[0] = row[0][j];
+            panels[1] = row[1][j];
+            panels[2] = row[2][j];
+            panels[3] = row[3][j];
         }
     }
 }

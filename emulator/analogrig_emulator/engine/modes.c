@@ -22,9 +22,9 @@ static void watch_kink(engine_t* const self, int kink) {
 }
 
 static mode_t* find_mode(engine_t* const self) {
-    for (int i = 0; i < self->stored; i++) {
-        if (memcmp(self->store[i].piece, self->piece, (size_t)self->kinks) == 0) {
-            return &self->store[i];
+    for (int i = 0; i < self->circuit->stored; i++) {
+        if (memcmp(self->circuit->store[i].piece, self->piece, (size_t)self->kinks) == 0) {
+            return &self->circuit->store[i];
         }
     }
     return NULL;
@@ -51,7 +51,7 @@ static bool allocate(const engine_t* const self, mode_t* mode) {
 
 /// Take w and y from the readings of the present mode if phi feeds one of them.
 static void point_readings(engine_t* const self) {
-    if (self->feeds) {
+    if (self->circuit->feeds) {
         self->w_panels = self->mode->readings;
         self->y_panels = &self->mode->readings[PANEL_ELEMENTS(self->kinks, self->columns)];
     }
@@ -60,19 +60,19 @@ static void point_readings(engine_t* const self) {
 /// Build the present mode in the place of the oldest of the store.
 static engine_status_t build_mode(engine_t* const self) {
     double        a[MAX_ELEMENTS];
-    mode_t* const mode = &self->store[self->oldest];
+    mode_t* const mode = &self->circuit->store[self->circuit->oldest];
     kinks_build_map(self, self->piece, a);
     const engine_status_t status = ladder_plan(self, a, &mode->base, &mode->stiff);
     if (status != ENGINE_OK || !allocate(self, mode)) {
         return status != ENGINE_OK ? status : ENGINE_NO_MEMORY;
     }
     memcpy(mode->piece, self->piece, (size_t)self->kinks);
-    mode->has_slow = false;
-    self->oldest   = (self->oldest + 1) % MODES;
-    self->stored   = self->stored < MODES ? self->stored + 1 : MODES;
-    self->mode     = mode;
+    mode->has_slow        = false;
+    self->circuit->oldest = (self->circuit->oldest + 1) % MODES;
+    self->circuit->stored = self->circuit->stored < MODES ? self->circuit->stored + 1 : MODES;
+    self->mode            = mode;
     self->counts.modes_built++;
-    if (self->feeds) {
+    if (self->circuit->feeds) {
         kinks_build_readings(self, mode->piece, mode->readings);
     }
     point_readings(self);
@@ -86,9 +86,9 @@ engine_status_t mode_enter(engine_t* const self) {
         return status;
     }
     for (int k = 0; k < self->kinks; k++) {
-        self->piece[k] = kink_piece(&self->kink[k], self->w[k]);
-        self->lower[k] = kink_lower_bound(&self->kink[k], self->piece[k]);
-        self->upper[k] = kink_upper_bound(&self->kink[k], self->piece[k]);
+        self->piece[k] = kink_piece(&self->circuit->kink[k], self->w[k]);
+        self->lower[k] = kink_lower_bound(&self->circuit->kink[k], self->piece[k]);
+        self->upper[k] = kink_upper_bound(&self->circuit->kink[k], self->piece[k]);
         watch_kink(self, k);
     }
     self->mode = find_mode(self);
@@ -98,7 +98,7 @@ engine_status_t mode_enter(engine_t* const self) {
     if (status != ENGINE_OK) {
         return status;
     }
-    if (self->feeds) {
+    if (self->circuit->feeds) {
         point_readings(self);
         self->kernels->multiply(self->kinks, self->columns, self->w_panels, self->z, self->w);
     }

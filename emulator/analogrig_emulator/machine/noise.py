@@ -17,6 +17,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +38,76 @@ _ZERO_C_K = 273.15
 
 _ROOT_TWO = math.sqrt(2.0)
 
+_KEPT_PROPAGATIONS = 16
+
 Matrix = NDArray[np.float64]
+
+
+class Propagation(NamedTuple):
+    """Noise over one sample period at some dials.
+
+    transition, covariance: Phi and cov(w), (n, n); factor: Cholesky factor of the covariance; reading: outputs by
+    state, (outputs, n).
+    """
+
+    transition: Matrix
+    covariance: Matrix
+    factor: Matrix
+    reading: Matrix
+
+
+@dataclass(frozen=True)
+class _Conditions:
+    """Conditions of a noise, apart from circuit and dials."""
+
+    outputs: tuple[str, ...]
+    op_amps: OpAmpGrade
+    temperature_k: float
+    period_s: float
+
+
+class _Sources:
+    """Sources of noise in one circuit. Its last propagations are kept: returning to earlier dials costs nothing."""
+
+    def __init__(self, circuit: Circuit) -> None:
+        self._nodal = circuit.derive(Nodal)
+        self._tracks_ohm = [(pot.name, pot.track_ohm) for pot in circuit.of(Pot)]
+        self._amps = circuit.of(OpAmp)
+        self._fixed_ohm = [resistor.ohm for resistor in circuit.of(Resistor)]
+        bonds = [(resistor.a, resistor.b) for resistor in circuit.of(Resistor)]
+        bonds += [leg for pot in circuit.of(Pot) for leg in pot.bonds]
+        self._from, self._to = [a for a, _ in bonds], [b for _, b in bonds]
+        self._kept: dict[object, Propagation] = {}
+
+    def propagation(self, conditions: _Conditions, dials: Mapping[str, float]) -> Propagation:
+        """Propagation at dials of all pots. Raises CircuitError."""
+        place = (conditions, tuple([dials[name] for name, _ in self._tracks_ohm]))
+        found = self._kept.get(place)
+        if found is None:
+            found = self._propagate(conditions, dials)
+            if len(self._kept) >= _KEPT_PROPAGATIONS:
+                del self._kept[next(iter(self._kept))]
+            self._kept[place] = found
+        return found
+
+    def _propagate(self, conditions: _Conditions, dials: Mapping[str, float]) -> Propagation:
+        system = self._nodal.at(dials)
+        a = _linear_matrix(system)
+        drives = self._drives(conditions, dials, self._nodal.disturbances(dials))
+        gathered = _propagate(a, _product(drives.T, drives), conditions.period_s)
+        return Propagation(*gathered, np.ascontiguousarray(system.readings(conditions.outputs)[:, : len(a)]))
+
+    def _drives(self, conditions: _Conditions, dials: Mapping[str, float], response: Mapping[str, Matrix]) -> Matrix:
+        """Contribution of each source to dx/dt, in V/s per root of its two-sided density: (sources, n)."""
+        grade = conditions.op_amps
+        legs_of_pots = [legs_ohm(dials[name], track_ohm) for name, track_ohm in self._tracks_ohm]
+        ohm = np.array([*self._fixed_ohm, *itertools.chain.from_iterable(legs_of_pots)])
+        thermal = _rows_of(response, self._from) - _rows_of(response, self._to)
+        thermal *= np.sqrt(2 * BOLTZMANN_J_PER_K * conditions.temperature_k / ohm)[:, None]
+        voltages = _rows_of(response, [amp.name for amp in self._amps]) * (grade.noise_v_per_rthz / _ROOT_TWO)
+        inputs = [node for amp in self._amps for node in (amp.plus, amp.minus)]
+        currents = _rows_of(response, inputs) * (grade.noise_a_per_rthz / _ROOT_TWO)
+        return np.concatenate((thermal, voltages, currents))
 
 
 class CircuitNoise:
@@ -55,49 +126,35 @@ class CircuitNoise:
         temperature_c: float = REFERENCE_C,
         sample_rate_hz: float = 20e3,
     ) -> None:
-        self._outputs = tuple(outputs)
-        self._op_amps = op_amps
-        self._temperature_k = temperature_c + _ZERO_C_K
-        self._period_s = 1.0 / sample_rate_hz
-        self._nodal = Nodal(circuit)
+        self._conditions = _Conditions(tuple(outputs), op_amps, temperature_c + _ZERO_C_K, 1.0 / sample_rate_hz)
+        self._sources = circuit.derive(_Sources)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
-        self._tracks_ohm = [(pot.name, pot.track_ohm) for pot in circuit.of(Pot)]
-        self._amps = circuit.of(OpAmp)
-        self._fixed_ohm = [resistor.ohm for resistor in circuit.of(Resistor)]
-        bonds = [(resistor.a, resistor.b) for resistor in circuit.of(Resistor)]
-        bonds += [leg for pot in circuit.of(Pot) for leg in pot.bonds]
-        self._from, self._to = [a for a, _ in bonds], [b for _, b in bonds]
         self.turn({})
         self._x = np.zeros(len(self.transition))
+
+    @property
+    def transition(self) -> Matrix:
+        """exp(A T) at the present dials, (n, n)."""
+        return self._propagation.transition
+
+    @property
+    def covariance(self) -> Matrix:
+        """Covariance gathered in one sample period at the present dials, (n, n)."""
+        return self._propagation.covariance
 
     def turn(self, dials: Mapping[str, float]) -> None:
         """Turn pots to dials."""
         self._dials |= dials
-        system = self._nodal.at(self._dials)
-        a = _linear_matrix(system)
-        drives = self._drives(self._nodal.disturbances(self._dials))
-        self.transition, self.covariance, self._factor = _propagate(a, _product(drives.T, drives), self._period_s)
-        self._reading = np.ascontiguousarray(system.readings(self._outputs)[:, : len(a)])
+        self._propagation = self._sources.propagation(self._conditions, self._dials)
 
     def volts(self, samples: int, rng: np.random.Generator) -> Matrix:
         """Noise at the next samples: (samples, outputs), V. Cutting a run into blocks changes no bit."""
+        transition, _, factor, reading = self._propagation
         normal = rng.standard_normal((samples, len(self._x)))
-        volts = np.empty((samples, len(self._reading)))
-        matrices = (self.transition, self._factor, self._reading, normal, self._x, volts)
-        addresses = [array.ctypes.data for array in matrices]
-        library.load().engine_noise_run(len(self._x), len(self._reading), samples, *addresses)
+        volts = np.empty((samples, len(reading)))
+        addresses = [array.ctypes.data for array in (transition, factor, reading, normal, self._x, volts)]
+        library.load().engine_noise_run(len(self._x), len(reading), samples, *addresses)
         return volts
-
-    def _drives(self, response: Mapping[str, Matrix]) -> Matrix:
-        """Contribution of each source to dx/dt, in V/s per root of its two-sided density: (sources, n)."""
-        legs_of_pots = [legs_ohm(self._dials[name], track_ohm) for name, track_ohm in self._tracks_ohm]
-        ohm = np.array([*self._fixed_ohm, *itertools.chain.from_iterable(legs_of_pots)])
-        thermal = _rows_of(response, self._from) - _rows_of(response, self._to)
-        thermal *= np.sqrt(2 * BOLTZMANN_J_PER_K * self._temperature_k / ohm)[:, None]
-        voltages = _rows_of(response, [amp.name for amp in self._amps]) * (self._op_amps.noise_v_per_rthz / _ROOT_TWO)
-        inputs = [node for amp in self._amps for node in (amp.plus, amp.minus)]
-        currents = _rows_of(response, inputs) * (self._op_amps.noise_a_per_rthz / _ROOT_TWO)
-        return np.concatenate((thermal, voltages, currents))
 
 
 class NoisySuspension:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -149,7 +148,7 @@ class SuspensionComputer:
             parts = []
             edges = excitation.edges(*self.machine.window(stop - start), self.sample_rate_hz)
             while play == self._plays and self.machine.recorded < stop:
-                now = list(itertools.takewhile(lambda turn: turn.sample < stop, turns))
+                now = [turn for turn in turns if turn.sample < stop]
                 if not self.machine.is_turning and not any(turn.ramp_n for turn in now):
                     parts.append(self._advance(edges, stop - self.machine.recorded, now))
                     del turns[: len(now)]
@@ -217,7 +216,7 @@ def _wired(program: Program, models: Sequence[OpAmpModel], components: Component
     return circuit, _pots(program, circuit, components)
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=8)
 def _nominal(program: Program, models: tuple[OpAmpModel, ...]) -> tuple[Circuit, _LoadedPots]:
     """The same with perfect components. Equal machines share their circuit, and with it its equations."""
     return _wired(program, models, NOMINAL)
