@@ -1,0 +1,161 @@
+"""Circuits, engines and noise that are kept for the next machine change no bit, and belong to nobody."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analogrig_emulator import (
+    OP_AMP_GRADES,
+    Capacitor,
+    Circuit,
+    CircuitError,
+    CircuitNoise,
+    Edges,
+    Engine,
+    Excitation,
+    Pot,
+    PotTurn,
+    Resistor,
+    SuspensionComputer,
+    Switch,
+    VoltageSource,
+    piecewise_linear,
+)
+from analogrig_emulator.circuit.nodal import Nodal
+
+Volts = NDArray[np.float64]
+
+JUMPS = [
+    PotTurn(0, {"M_kg": 80.0}),
+    PotTurn(30, {"K_n_per_m": 18000.0}),
+    PotTurn(30, {"B_n_s_per_m": 3453.0}),
+    PotTurn(63, {"K_n_per_m": 24500.0}),
+    PotTurn(99, {"M_kg": 30.0}),
+]
+LOUD = Excitation(low_v=-9.0, high_v=9.0, clock="free", phase=0.3, frequency_hz=900.0)
+
+
+def played(computer: SuspensionComputer, changes: Sequence[PotTurn] = (), block: int = 4096) -> Volts:
+    return np.concatenate(list(computer.play(LOUD, 100, changes, block)))
+
+
+def turned_by_hand() -> Volts:
+    """The jumps as an operator makes them, one run after another."""
+    computer, parts = SuspensionComputer("front"), []
+    blocks = computer.play(LOUD, 100, (), 1)
+    for sample in range(100):
+        parts.append(next(blocks))
+        for change in JUMPS:
+            if change.sample == sample:
+                computer.set(**change.values)
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("block", [1, 31, 64, 100])
+def test_jumps_played_at_once_are_those_of_an_operator(block: int) -> None:
+    computer = SuspensionComputer("front")
+    assert played(computer, JUMPS, block).tobytes() == turned_by_hand().tobytes()
+    assert computer.dials == computer.dials_for(M_kg=30.0) | computer.dials_for(K_n_per_m=24500.0, B_n_s_per_m=3453.0)
+
+
+def test_a_ramp_before_a_jump_is_still_a_ramp() -> None:
+    changes = [PotTurn(10, {"K_n_per_m": 18000.0}, 20), PotTurn(15, {"M_kg": 60.0}), PotTurn(50, {"M_kg": 90.0})]
+    whole, apart = (played(SuspensionComputer("front"), changes, block) for block in (100, 1))
+    assert whole.tobytes() == apart.tobytes()
+    assert not np.array_equal(whole, played(SuspensionComputer("front"), changes[1:]))
+
+
+def test_equal_machines_share_nothing_that_changes() -> None:
+    one, other = SuspensionComputer("front"), SuspensionComputer("front")
+    untouched = played(other)
+    one.set(M_kg=60.0)
+    one.machine.set_initial({"U3": 4.0})
+    played(one, JUMPS)
+    assert other.program.values["M_kg"] == 115.0
+    assert played(other).tobytes() == untouched.tobytes()
+    assert played(SuspensionComputer("front")).tobytes() == untouched.tobytes()
+
+
+def test_state_spaces_that_are_shared_cannot_be_written() -> None:
+    system = piecewise_linear(SuspensionComputer("front").circuit)
+    for matrix in (system.abc, system.g, system.cde, system.w_phi, system.lmn, system.v_phi):
+        with pytest.raises(ValueError, match="read-only"):
+            matrix[...] = 0.0
+
+
+def low_pass(ohm: float) -> Circuit:
+    source, pot = VoltageSource("V1", "in"), Pot("P", "in", "w", "0", 10e3, 0.5)
+    load = Resistor("R", "w", "out", ohm), Capacitor("C", "out", "0", 10e-9)
+    return Circuit([source, pot, *load, Switch("S", "out", "0", 1.0, 1e9, closed=False)])
+
+
+EDGES = {"V1": Edges(np.array([0]), np.array([10.0]))}
+
+
+@pytest.mark.parametrize("others", [1, 7, 8, 20])
+def test_return_to_an_earlier_circuit_is_that_circuit(others: int) -> None:
+    """Eight circuits are kept: this one is among them, or it is computed anew."""
+    systems = [piecewise_linear(low_pass(1e3 * (1 + i))) for i in range(others + 1)]
+    engine = Engine(systems[0], ["out"])
+    engine.run(1, EDGES)
+    for system in [*systems[1:], systems[0]]:
+        engine.set_system(system)
+        engine.run(1)
+    fresh = Engine(systems[0], ["out"])
+    fresh.run(1, EDGES)
+    engine.state = fresh.state = engine.state
+    assert engine.run(5).tobytes() == fresh.run(5).tobytes()
+
+
+def test_engine_that_is_used_again_begins_at_rest() -> None:
+    def run(ohm: float) -> tuple[bytes, int, list[int]]:
+        engine = Engine(piecewise_linear(low_pass(ohm)), ["out", "w"])
+        ticks = engine.overdue_ticks.tolist()
+        return engine.run(10, EDGES).tobytes(), engine.counts.samples, ticks
+
+    first = run(3.21e3)
+    run(4.56e3)
+    gc.collect()
+    assert run(3.21e3) == first
+
+
+def test_variants_of_a_circuit_are_told_apart() -> None:
+    circuit = low_pass(1e3)
+    assert circuit.with_dials({"P": 0.25}) is circuit.with_dials({"P": 0.25})
+    for i in range(10):
+        dials = {"P": i / 10}
+        assert circuit.with_dials(dials).of(Pot)[0].dial == i / 10
+        assert circuit.with_switches({"S": i % 2 == 0}).of(Switch)[0].closed == (i % 2 == 0)
+        assert np.array_equal(Nodal(circuit).at(dials).abc, circuit.with_dials(dials).derive(Nodal).at({}).abc)
+    for _ in range(2):
+        with pytest.raises(CircuitError, match="no pot is called 'Q'"):
+            circuit.with_dials({"Q": 0.5})
+
+
+def test_state_space_of_dials_that_were_left_long_ago_is_the_same() -> None:
+    nodal = Nodal(low_pass(1e3))
+    first = nodal.at({"P": 0.3}, {"S": True}).abc.copy()
+    assert not np.array_equal(nodal.at({"P": 0.3}, {"S": False}).abc, first)
+    for i in range(40):
+        nodal.at({"P": i / 40})
+    assert np.array_equal(nodal.at({"P": 0.3}, {"S": True}).abc, first)
+
+
+def test_noise_is_that_of_its_own_conditions_and_dials() -> None:
+    circuit = low_pass(1e3)
+    grade = OP_AMP_GRADES["tl07x"]
+    cold, warm = (CircuitNoise(circuit, ["out"], op_amps=grade, temperature_c=t) for t in (-20.0, 80.0))
+    assert warm.covariance[0, 0] == pytest.approx(cold.covariance[0, 0] * (80.0 + 273.15) / (-20.0 + 273.15))
+    before = warm.transition.copy()
+    warm.turn({"P": 0.9})
+    assert not np.array_equal(warm.transition, before)
+    assert np.array_equal(CircuitNoise(low_pass(1e3), ["out"], op_amps=grade).transition, before)
+    for i in range(40):
+        warm.turn({"P": i / 40})
+    warm.turn({"P": 0.5})
+    assert np.array_equal(warm.transition, before)
