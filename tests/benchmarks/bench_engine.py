@@ -1,24 +1,29 @@
-"""Speed of the emulator, beside ngspice on the same deck.
+"""Speed of the emulator, beside ngspice on the same circuit.
 
 python -m tests.benchmarks engine
 
-Times are of the processor, not of the clock on the wall: the machine is shared.
+Times are of the processor, not of the clock on the wall: the machine is shared. ngspice runs once with every setting of
+SETTINGS. The fastest FINALISTS that come within TOLERATED_LSB run again with both solvers, in turn and just before the
+emulator. The best run of each counts. build/ngspice.csv has the whole grid.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
+import math
 import re
 import resource
 import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import scipy.interpolate
 from numpy.typing import NDArray
 
 from analogrig_emulator import (
@@ -58,14 +63,49 @@ RATE_HZ = 20e3
 LSB_V = 10.0 / 4096
 TOLERATED_LSB = 0.2
 
-ACCURACIES = (
-    Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=7.0, max_step_s=5e-5),
-    Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=7.0, max_step_s=1e-5),
-    Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=1.0, max_step_s=8e-6),
-    Accuracy(reltol=1e-4, vntol_v=1e-6, trtol=7.0, max_step_s=5e-6),
-    Accuracy(reltol=1e-6, vntol_v=1e-7, trtol=1.0, max_step_s=1e-4),
+MOST_TRIALS_OF_THEIR_OWN = 20
+FINALISTS = 3
+GRID = Path("build/ngspice.csv")
+
+
+@dataclass(frozen=True, order=True)
+class Setting:
+    """One way to run ngspice. Each field has the values of SETTINGS, but for the knowing op-amps and the solver.
+
+    op_amps: "exported", as `analogrig netlist` writes them; "lean", the same with a Norton output; "knowing", lean ones
+    without limits where the circuit never reaches them. points: time points at "every sample" or at the "start" alone.
+    """
+
+    method: str
+    op_amps: str
+    points: str
+    reltol: float
+    trtol: float
+    max_step_s: float
+    solver: str = "sparse"
+
+    def __str__(self) -> str:
+        """The setting in words."""
+        return (
+            f"{self.method}, {self.op_amps} op-amps, points at {self.points}, reltol {self.reltol:g}, "
+            f"trtol {self.trtol:g}, tmax {1e6 * self.max_step_s:g} us, {self.solver}"
+        )
+
+
+SETTINGS = tuple(
+    itertools.starmap(
+        Setting,
+        itertools.product(
+            ("trap", "gear"),
+            ("exported", "lean"),
+            ("every sample", "start"),
+            (1e-3, 1e-4, 1e-6),
+            (7.0, 1.0),
+            (50e-6, 12e-6, 8e-6),
+        ),
+    )
 )
-"""Settings of ngspice; each is tried with every deck of `variants`."""
+"""The searched grid."""
 
 
 def best_s(job: Callable[[], object]) -> float:
@@ -168,28 +208,73 @@ def trial_s(*, noisy: bool = False) -> float:
     return best_s(functools.partial(run_trials, trials, noisy=noisy)) / trials
 
 
+def own_trial_s() -> float:
+    """CPU time of a trial whose machine has offsets of its own: nothing is kept from the trial before."""
+    seeds = itertools.count()
+
+    def run() -> None:
+        for seed in itertools.islice(seeds, MOST_TRIALS_OF_THEIR_OWN):
+            computer = SuspensionComputer("front", rng=np.random.default_rng(seed))
+            for _ in computer.play(Excitation(), 800, THESIS_TWEAKS):
+                pass
+
+    return best_s(run) / MOST_TRIALS_OF_THEIR_OWN
+
+
+def stream_s() -> float:
+    return best_s(functools.partial(play, Excitation(), 500_000)) * 800 / 500_000
+
+
+OWN_TRIALS: Mapping[str, Callable[[], float]] = {
+    "machine included": trial_s,
+    "every machine with offsets of its own": own_trial_s,
+}
+OWN_STREAM: Mapping[str, Callable[[], float]] = {"machine included": stream_s}
+
+
 # ---- ngspice
 
 
-def decks(samples: int, tweaks: Sequence[PotTurn]) -> Iterator[str]:
-    computer = SuspensionComputer("front")
-    edges = {"F": Excitation().edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)}
-    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks]
-    for accuracy in ACCURACIES:
-        deck = to_spice(computer.circuit, samples=samples, edges=edges, turns=turns, nodes=["u5"], accuracy=accuracy)
-        yield from variants(deck)
-
-
-def variants(deck: str) -> Iterator[str]:
-    """Variants of a deck: time points on every sample, at the start alone, and the latter with leaner op-amps.
+def deck(setting: Setting, samples: int, tweaks: Sequence[PotTurn]) -> str:
+    """Text of the front suspension with a square wave for ngspice.
 
     Without any time point at the start ngspice's first step is too long, and it misses the first edge by 0.3 LSB.
     """
-    yield deck
-    at_start = _replaced(r"^(X\S* clock\S* time_points period=)\S+$", r"\g<1>1", deck)
-    yield at_start
-    thevenin = r"^Einner inner 0 state 0 1\nRout inner out \{max\(rout, 1e-4\)\}$"
-    yield _replaced(thevenin, "Gout 0 out state 0 {1 / max(rout, 1e-4)}\nRout out 0 {max(rout, 1e-4)}", at_start)
+    computer = SuspensionComputer("front")
+    text = to_spice(
+        computer.circuit,
+        samples=samples,
+        edges={"F": Excitation().edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)},
+        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks],
+        nodes=["u5"],
+        accuracy=Accuracy(reltol=setting.reltol, vntol_v=1e-6, trtol=setting.trtol, max_step_s=setting.max_step_s),
+    )
+    options = f".options method={setting.method}" + (" klu" if setting.solver == "klu" else "")
+    text = _replaced(r"^(\.options reltol=.*)$", rf"\g<1>\n{options}", text)
+    if setting.points == "start":
+        text = _replaced(r"^(X\S* clock\S* time_points period=)\S+$", r"\g<1>1", text)
+    if setting.op_amps != "exported":
+        thevenin = r"^Einner inner 0 state 0 1\nRout inner out \{max\(rout, 1e-4\)\}$"
+        text = _replaced(thevenin, NORTON, text)
+    if setting.op_amps == "knowing":
+        text = _replaced(r"^(\* analogue computer)$", rf"\g<1>\n{LINEAR}", text)
+        text = re.sub(
+            r"^(X_U[2-5] .*) opamp avol=(\S+) gbw=(\S+) .* rout=(\S+) .*$", LINEAR_CALL, text, flags=re.MULTILINE
+        )
+    return text
+
+
+NORTON = "Gout 0 out state 0 {1 / max(rout, 1e-4)}\nRout out 0 {max(rout, 1e-4)}"
+
+LINEAR = r""".subckt linear plus minus out avol=2e5 gbw=3e6 rout=100
+Cstate state 0 1e-10
+Gstate 0 state plus minus {6.283185307179586e-10 * gbw}
+Rstate state 0 {avol / (6.283185307179586e-10 * gbw)}
+Gout 0 out state 0 {1 / rout}
+Rout out 0 {rout}
+.ends"""
+
+LINEAR_CALL = r"\g<1> linear avol=\g<2> gbw=\g<3> rout=\g<4>"
 
 
 def _replaced(expression: str, by: str, deck: str) -> str:
@@ -200,41 +285,121 @@ def _replaced(expression: str, by: str, deck: str) -> str:
     return out
 
 
-def simulate(deck: str, samples: int) -> tuple[float, NDArray[np.float64]]:
-    """CPU time in seconds, and the displacement at the samples in V."""
+@dataclass(frozen=True)
+class Simulated:
+    """One run of ngspice: its CPU time, and its largest error at a sample."""
+
+    spent_s: float
+    error_lsb: float
+
+
+def simulate(text: str, exact_v: NDArray[np.float64]) -> Simulated:
+    """Run a deck. Between time points the better of a straight line and a smooth curve counts."""
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "deck.cir").write_text(deck)
+        Path(folder, "deck.cir").write_text(text)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run(["ngspice", "-b", "-r", "out.raw", "deck.cir"], cwd=folder, capture_output=True, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         names, table = _read_raw(Path(folder, "out.raw"))
     spent_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return spent_s, np.interp(np.arange(samples) / RATE_HZ, table[:, 0], table[:, names.index("v(u5)")])
+    t_s, first = np.unique(table[:, 0], return_index=True)
+    volts = table[first, names.index("v(u5)")]
+    at_s = np.clip(np.arange(exact_v.size) / RATE_HZ, t_s[0], t_s[-1])
+    errors_v = [
+        np.abs(curve - exact_v).max()
+        for curve in (np.interp(at_s, t_s, volts), scipy.interpolate.Akima1DInterpolator(t_s, volts)(at_s))
+    ]
+    return Simulated(spent_s, float(min(errors_v)) / LSB_V)
 
 
-def fastest_ngspice_s(samples: int, tweaks: Sequence[PotTurn]) -> float:
-    """Fastest deck that comes within TOLERATED_LSB of the displacement at every sample."""
-    exact = np.concatenate(list(SuspensionComputer("front").play(Excitation(), samples, tweaks)))[:, 1]
-    runs = [simulate(deck, samples) for deck in decks(samples, tweaks)]
-    return min(spent_s for spent_s, volts in runs if np.abs(volts - exact).max() <= TOLERATED_LSB * LSB_V)
+def exact_v(samples: int, tweaks: Sequence[PotTurn]) -> NDArray[np.float64]:
+    """Displacement at the samples, by the emulator."""
+    return np.concatenate(list(SuspensionComputer("front").play(Excitation(), samples, tweaks)))[:, 1]
 
 
-def compared(name: str, own_s: float, value: float, unit: str, ngspice_s: float | None) -> Figure:
-    if ngspice_s is None:
-        return Figure(name, value, unit)
-    what = f"ngspice within {TOLERATED_LSB} LSB: {ngspice_s:.3g} s"
-    return Figure(name, value, unit, what, ngspice_s / own_s)
+def search(samples: int, tweaks: Sequence[PotTurn]) -> dict[Setting, Simulated]:
+    """Run the whole grid once, write it to GRID, and return it."""
+    exact = exact_v(samples, tweaks)
+    found = {setting: simulate(deck(setting, samples, tweaks), exact) for setting in SETTINGS}
+    GRID.parent.mkdir(exist_ok=True)
+    rows = [f"{1e3 * run.spent_s:.1f},{run.error_lsb:.3f},{setting}" for setting, run in found.items()]
+    GRID.write_text("\n".join(["CPU ms,error LSB,setting", *rows, ""]))
+    return found
+
+
+def fastest(found: Mapping[Setting, Simulated]) -> list[Setting]:
+    """Settings within TOLERATED_LSB, the fastest first."""
+    return sorted(
+        (setting for setting, run in found.items() if run.error_lsb <= TOLERATED_LSB),
+        key=lambda setting: found[setting].spent_s,
+    )
+
+
+def final(
+    settings: Iterable[Setting], samples: int, tweaks: Sequence[PotTurn]
+) -> tuple[dict[Setting, Simulated], float]:
+    """Best of REPEATS runs of each setting, and of the start of ngspice alone, all in turn."""
+    exact, best, start_s = exact_v(samples, tweaks), dict[Setting, Simulated](), math.inf
+    texts = {setting: deck(setting, samples, tweaks) for setting in settings}
+    short = deck(SETTINGS[-1], 2, ())
+    for _ in range(REPEATS):
+        start_s = min(start_s, simulate(short, exact[:2]).spent_s)
+        for setting, text in texts.items():
+            run = simulate(text, exact)
+            if setting not in best or run.spent_s < best[setting].spent_s:
+                best[setting] = run
+    return best, start_s
+
+
+def ngspice_figures() -> Iterator[Figure]:
+    """Trial and stream beside ngspice at its best, and beside a deck that knows which amplifiers never limit."""
+    for name, samples, tweaks, own in (
+        ("trial of 800 samples with 4 tweaks", 800, THESIS_TWEAKS, OWN_TRIALS),
+        ("square wave of 800 samples in a stream", 800, (), OWN_STREAM),
+    ):
+        found = search(samples, tweaks)
+        order = fastest(found)
+        winner = order[0]
+        knowing = replace(winner, op_amps="knowing")
+        finalists = [replace(each, solver=solver) for each in order[:FINALISTS] for solver in ("sparse", "klu")]
+        runs, start_s = final([*finalists, knowing], samples, tweaks)
+        general = min(finalists, key=lambda setting: runs[setting].spent_s)
+        for group, settings in itertools.groupby(
+            sorted(found), key=lambda each: (each.method, each.op_amps, each.points)
+        ):
+            yield _group_figure(f"ngspice, {name}: {', '.join(group)}", list(settings), found)
+        for each, what in ((general, "best general setting"), (knowing, "the same with op-amps that know the circuit")):
+            run = runs[each]
+            label = f"{each}; {run.error_lsb:.3f} LSB; {1e3 * start_s:.1f} ms of it are the start"
+            yield Figure(f"ngspice, {name}: {what}", 1e3 * run.spent_s, "ms", label)
+        for label, job in own.items():
+            spent_s = job()
+            for each, what in ((general, "ngspice's best general setting"), (knowing, "op-amps that know the circuit")):
+                ratio = runs[each].spent_s / spent_s
+                yield Figure(f"emulator, {name}, {label}", 1e3 * spent_s, "ms", what, ratio)
+    yield own_error()
+
+
+def _group_figure(name: str, settings: Sequence[Setting], found: Mapping[Setting, Simulated]) -> Figure:
+    best = fastest({setting: found[setting] for setting in settings})
+    if not best:
+        least = min(found[setting].error_lsb for setting in settings)
+        return Figure(name, math.inf, "ms", f"none of {len(settings)} settings: {least:.2g} LSB at best")
+    run = found[best[0]]
+    return Figure(name, 1e3 * run.spent_s, "ms", f"best of {len(settings)}: {best[0]}; {run.error_lsb:.3f} LSB")
+
+
+def own_error() -> Figure:
+    """Largest difference of the trial from ngspice at its tightest setting: a bound of the emulator's own error."""
+    tight = Setting("trap", "exported", "every sample", 1e-7, 0.1, 1e-5)
+    run = simulate(deck(tight, 800, THESIS_TWEAKS), exact_v(800, THESIS_TWEAKS))
+    return Figure("emulator, trial: difference from ngspice at its tightest", run.error_lsb, "LSB", str(tight))
 
 
 def figures() -> Iterator[Figure]:
     yield from emulator_figures()
-    found = shutil.which("ngspice") is not None
-    spent_s = trial_s()
-    reference_s = fastest_ngspice_s(800, THESIS_TWEAKS) if found else None
-    name = "emulator, trial of 800 samples with 4 tweaks"
-    yield compared(name, spent_s, 1e3 * spent_s, "ms", reference_s)
-    noisy_s = trial_s(noisy=True)
-    yield Figure(f"{name}, noisy", 1e3 * noisy_s, "ms", "the quiet trial", spent_s / noisy_s)
-    spent_s = best_s(functools.partial(play, Excitation(), 500_000)) * 800 / 500_000
-    reference_s = fastest_ngspice_s(800, ()) if found else None
-    yield compared("emulator, 200 Hz square wave", spent_s, 800 / spent_s, "samples/s", reference_s)
+    spent_s, noisy_s = trial_s(), trial_s(noisy=True)
+    yield Figure("emulator, trial of 800 samples with 4 tweaks", 1e3 * spent_s, "ms")
+    yield Figure("emulator, noisy trial", 1e3 * noisy_s, "ms", "the quiet trial", spent_s / noisy_s)
+    if shutil.which("ngspice") is not None:
+        yield from ngspice_figures()

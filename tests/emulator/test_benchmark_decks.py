@@ -3,35 +3,66 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from analogrig_emulator import Excitation, SuspensionComputer
-from tests.benchmarks.bench_engine import ACCURACIES, LSB_V, THESIS_TWEAKS, TOLERATED_LSB, decks, simulate, variants
+from analogrig_emulator import to_spice
+from tests.benchmarks import bench_engine
+from tests.benchmarks.bench_engine import (
+    SETTINGS,
+    THESIS_TWEAKS,
+    TOLERATED_LSB,
+    Setting,
+    Simulated,
+    deck,
+    exact_v,
+    fastest,
+    simulate,
+)
 
 SAMPLES = 800
+GENERAL = Setting("trap", "lean", "start", 1e-3, 1.0, 8e-6)
 
 
-def periods_s(deck: str) -> list[float]:
-    return [float(text) for text in re.findall(r"^X\S* clock \S+ period=(\S+)$", deck, re.MULTILINE)]
+def test_settings_reach_the_deck() -> None:
+    texts = {setting: deck(setting, 5, ()) for setting in SETTINGS}
+    assert len(set(texts.values())) == len(SETTINGS)
+    for setting, text in texts.items():
+        assert f"method={setting.method}" in text
+        assert f"reltol={setting.reltol}" in text
+        assert re.findall(r"^X\S* clock \S+ period=(\S+)$", text, re.MULTILINE) == [
+            "5e-05" if setting.points == "every sample" else "1"
+        ]
+        assert ("Einner" in text) == (setting.op_amps == "exported")
+    assert " klu" in deck(replace(GENERAL, solver="klu"), 5, ())
 
 
-def test_two_of_three_decks_have_no_time_points_on_the_samples() -> None:
-    found = [periods_s(deck) for deck in decks(SAMPLES, THESIS_TWEAKS)]
-    assert found == [[5e-5], [1.0], [1.0]] * len(ACCURACIES)
+def test_knowing_deck_limits_the_summer_alone() -> None:
+    text = deck(replace(GENERAL, op_amps="knowing"), 5, ())
+    assert re.findall(r"^X_(U\d) .* (opamp|linear) ", text, re.MULTILINE) == [
+        ("U1", "opamp"),
+        *((f"U{i}", "linear") for i in range(2, 6)),
+    ]
 
 
-def test_deck_that_is_written_otherwise_is_refused() -> None:
-    deck = next(decks(SAMPLES, THESIS_TWEAKS)).replace("Xclock", "Vtimepoints")
+def test_deck_that_is_written_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        bench_engine, "to_spice", lambda *args, **kinds: to_spice(*args, **kinds).replace("Xclock", "Vtimepoints")
+    )
     with pytest.raises(ValueError, match="0 matches"):
-        list(variants(deck))
+        deck(GENERAL, 5, ())
+
+
+def test_fastest_setting_is_one_that_is_accurate() -> None:
+    settings = SETTINGS[:3]
+    runs = [Simulated(1.0, 2 * TOLERATED_LSB), Simulated(3.0, 0.0), Simulated(2.0, TOLERATED_LSB)]
+    assert fastest(dict(zip(settings, runs, strict=True))) == [settings[2], settings[1]]
 
 
 @pytest.mark.tools("ngspice")
-def test_decks_without_time_points_on_the_samples_compute_the_same_signals() -> None:
-    exact = np.concatenate(list(SuspensionComputer("front").play(Excitation(), SAMPLES, THESIS_TWEAKS)))[:, 1]
-    number = next(i for i, each in enumerate(ACCURACIES) if each.max_step_s == 8e-6)
-    for deck in list(decks(SAMPLES, THESIS_TWEAKS))[3 * number : 3 * number + 3]:
-        _, volts = simulate(deck, SAMPLES)
-        assert np.abs(volts - exact).max() <= TOLERATED_LSB * LSB_V
+@pytest.mark.parametrize("op_amps", ["exported", "lean", "knowing"])
+def test_decks_without_time_points_on_the_samples_compute_the_same_signals(op_amps: str) -> None:
+    run = simulate(deck(replace(GENERAL, op_amps=op_amps), SAMPLES, THESIS_TWEAKS), exact_v(SAMPLES, THESIS_TWEAKS))
+    assert run.error_lsb <= TOLERATED_LSB
+    assert run.spent_s > 0.0
