@@ -118,6 +118,9 @@ typedef struct {
     /// out = matrix z. out needs room for whole panels.
     void (*multiply)(int rows, int columns, const double* panels, const double* z, double* out);
 
+    /// z += matrix z, for the first rows of z.
+    void (*advance)(int rows, int columns, const double* panels, double* z);
+
     /// out = left[:, :n] right; rows of all are `stride` long, which is a multiple of PANEL.
     void (*compose)(int rows, int n, int stride, const double* left, const double* right, double* out);
 

@@ -107,13 +107,8 @@ void ladder_move(engine_t* const self, int64_t ticks, double* z) {
     const int64_t rest = ticks & ((INT64_C(1) << base) - 1);
     for (int level = base; ticks >> level != 0; level++) {
         if ((ticks >> level & 1) != 0) {
-            double change[PADDED(ENGINE_MAX_STATES)];
             ladder_reach(self, level);
-            self->kernels->multiply(self->states, self->columns, &self->mode->ladder[(level - base) * elements], z,
-                                    change);
-            for (int i = 0; i < self->states; i++) {
-                z[i] += change[i];
-            }
+            self->kernels->advance(self->states, self->columns, &self->mode->ladder[(level - base) * elements], z);
             self->counts.steps++;
         }
     }

@@ -50,6 +50,19 @@ KERNEL(multiply)(int rows, int columns, const double* restrict panels, const dou
     }
 }
 
+TARGET static void KERNEL(advance)(int rows, int columns, const double* restrict panels, double* restrict z) {
+    double change[PADDED(ENGINE_MAX_STATES)];
+    if (rows <= PANEL) {
+        const KERNEL(products_t) sum = KERNEL(product)(columns, panels, panels, z);
+        KERNEL(store)(sum.low, sum.high, change);
+    } else {
+        KERNEL(multiply)(rows, columns, panels, z, change);
+    }
+    for (int i = 0; i < rows; i++) {
+        z[i] += change[i];
+    }
+}
+
 TARGET static void KERNEL(compose)(
     int rows, int n, int stride, const double* restrict left, const double* restrict right, double* restrict out) {
     for (int i = 0; i < rows; i++, left += stride, out += stride) {
@@ -158,7 +171,7 @@ TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     return CLEAR;
 }
 
-static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(compose), KERNEL(add),
+static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose), KERNEL(add),
                                            KERNEL(sum),      KERNEL(look),    KERNEL(look_on) };
 
 #undef INLINE

@@ -462,14 +462,6 @@ static void certify(engine_t* const self, const slow_t* slow) {
 
 // ---------------------------------------------       STRETCHES        ---------------------------------------------
 
-static void advance_slow(const engine_t* const self, const slow_t* slow, int width, const double* change, double* z) {
-    double padded[PADDED(ENGINE_MAX_STATES)];
-    self->kernels->multiply(slow->rank, width, change, z, padded);
-    for (int i = 0; i < slow->rank; i++) {
-        z[i] += padded[i];
-    }
-}
-
 static int width_of(const engine_t* const self, const slow_t* slow) {
     return slow->rank + self->columns - self->states;
 }
@@ -479,7 +471,7 @@ static void move_slow(const engine_t* const self, const slow_t* slow, int64_t ti
     const int width = width_of(self, slow);
     for (int level = 0; ticks >> level != 0; level++) {
         if ((ticks >> level & 1) != 0) {
-            advance_slow(self, slow, width, &slow->ladder[level * PANEL_ELEMENTS(slow->rank, width)], z);
+            self->kernels->advance(slow->rank, width, &slow->ladder[level * PANEL_ELEMENTS(slow->rank, width)], z);
         }
     }
 }
@@ -534,7 +526,7 @@ static bool watch_step(engine_t* const self) {
     const int     width = width_of(self, slow);
     double        z[MAX_COLUMNS];
     memcpy(z, self->slow_z, (size_t)width * sizeof z[0]);
-    advance_slow(self, slow, width, slow->change, z);
+    self->kernels->advance(slow->rank, width, slow->change, z);
     if (!events_extend(self, self->now + ENGINE_TICKS_PER_SAMPLE, width, slow->w, z)) {
         return false;
     }
@@ -548,7 +540,7 @@ void quiet_step(engine_t* const self) {
     const slow_t* slow = &self->mode->slow;
     self->slow_age++;
     if (self->slow_age == LEAP) {
-        advance_slow(self, slow, width_of(self, slow), slow->leap, self->slow_z);
+        self->kernels->advance(slow->rank, width_of(self, slow), slow->leap, self->slow_z);
         self->slow_age = 0;
     }
     self->now += ENGINE_TICKS_PER_SAMPLE;
@@ -558,7 +550,7 @@ void quiet_step(engine_t* const self) {
 void quiet_leap(engine_t* const self, double* y) {
     const slow_t* slow  = &self->mode->slow;
     const int     width = width_of(self, slow);
-    advance_slow(self, slow, width, slow->leap, self->slow_z);
+    self->kernels->advance(slow->rank, width, slow->leap, self->slow_z);
     self->kernels->multiply(LEAP * self->outputs, width, slow->y, self->slow_z, y);
     self->now += LEAP * ENGINE_TICKS_PER_SAMPLE;
     self->counts.quiet += LEAP;
@@ -578,7 +570,7 @@ static void get_state_after(const engine_t* const self, int64_t ticks, double* x
     const int     width = width_of(self, slow);
     memcpy(z, self->slow_z, (size_t)width * sizeof z[0]);
     for (int i = 0; i < self->slow_age; i++) {
-        advance_slow(self, slow, width, slow->change, z);
+        self->kernels->advance(slow->rank, width, slow->change, z);
     }
     move_slow(self, slow, ticks, z);
     self->kernels->multiply(self->states, width, slow->state, z, padded);
