@@ -138,6 +138,10 @@ class _OnCardClock(Excitation):
     probes: int = 1
     clock_hz: float = 20e3
 
+    def period_ticks(self, sample_rate_hz: float) -> float:
+        del sample_rate_hz
+        return super().period_ticks(self.clock_hz)
+
     def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
         del sample_rate_hz  # the machine's rate; the generator follows clock_hz
         slow = super().edges(-(-start_tick // self.probes), -(-stop_tick // self.probes), self.clock_hz)

@@ -94,13 +94,8 @@ class Excitation:
         """Frequency with the drift of the generator's clock."""
         return self.frequency_hz * (1.0 + 1e-6 * self.drift_ppm)
 
-    def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
-        """Edges at ticks start_tick <= t < stop_tick, t >= 0. The edge at tick 0 switches the generator on.
-
-        A range cut into parts gives the same edges. Instants are exact to the tick up to tick 2^53 (29
-        hours at 20 kHz).
-        Raises ExcitationError for a frequency above half the sample rate, or so low that a period has more ticks.
-        """
+    def period_ticks(self, sample_rate_hz: float) -> float:
+        """Ticks per period (bit, for prbs). Raises ExcitationError like edges()."""
         if self.frequency_hz > 0.5 * sample_rate_hz:
             raise ExcitationError(
                 f"excitation: frequency_hz {self.frequency_hz!r} exceeds half the sample rate of {sample_rate_hz!r} Hz"
@@ -111,6 +106,16 @@ class Excitation:
                 f"excitation: frequency_hz {self.frequency_hz!r} is too low at {sample_rate_hz!r} samples/s: "
                 "a period has more than 2^53 ticks"
             )
+        return period
+
+    def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
+        """Edges at ticks start_tick <= t < stop_tick, t >= 0. The edge at tick 0 switches the generator on.
+
+        A range cut into parts gives the same edges. Instants are exact to the tick up to tick 2^53 (29
+        hours at 20 kHz).
+        Raises ExcitationError for a frequency above half the sample rate, or so low that a period has more ticks.
+        """
+        period = self.period_ticks(sample_rate_hz)
         # An edge on the card's clock may be up to a sample later than its ideal instant: begin a period early.
         first = math.floor(start_tick / period) - 1
         last = math.ceil(stop_tick / period) + 1

@@ -278,7 +278,14 @@ class Circuit:
 
     def of(self, kind: type[_E]) -> tuple[_E, ...]:
         """The elements of one kind, in netlist order."""
-        return tuple(element for element in self.elements if isinstance(element, kind))
+        if kind not in self._of_kind:
+            self._of_kind[kind] = tuple(element for element in self.elements if isinstance(element, kind))
+        found: tuple[_E, ...] = self._of_kind[kind]
+        return found
+
+    @functools.cached_property
+    def _of_kind(self) -> dict[type, Any]:
+        return {}
 
     def derive(self, make: Callable[[Circuit], _T]) -> _T:
         """make(self), computed once for each function `make`."""

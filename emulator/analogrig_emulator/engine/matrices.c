@@ -4,7 +4,7 @@
 #define PIVOT_TOLERANCE 1e-13
 
 void panels_pack(int rows, int columns, int stride, const double* matrix, double* panels) {
-    static const double none[MAX_STRIDE] = { 0.0 };
+    static const double none[2 * MAX_STRIDE] = { 0.0 };
     for (int i = 0; i < rows; i += PANEL) {
         const double* row[PANEL];
         for (int k = 0; k < PANEL; k++) {

@@ -100,20 +100,22 @@ void engine_noise_run(int           n,
                       const double* normal,
                       double*       x,
                       double*       y) {
-    double next[ENGINE_MAX_STATES];
+    const kernels_t* const kernels = kernels_find();
+    double                 panels[PANEL_ELEMENTS(ENGINE_MAX_STATES, 2 * ENGINE_MAX_STATES)];
+    double                 readings[PANEL_ELEMENTS(ENGINE_MAX_OUTPUTS, ENGINE_MAX_STATES)];
+    double                 both[2 * MAX_SQUARE], z[2 * ENGINE_MAX_STATES], padded[PADDED(ENGINE_MAX_OUTPUTS)];
+    for (int i = 0; i < n; i++) {
+        memcpy(&both[i * 2 * n], &phi[i * n], (size_t)n * sizeof both[0]);
+        memcpy(&both[i * 2 * n + n], &factor[i * n], (size_t)n * sizeof both[0]);
+    }
+    panels_pack(n, 2 * n, 2 * n, both, panels);
+    panels_pack(outputs, n, n, reading, readings);
     for (int64_t sample = 0; sample < samples; sample++, normal += n, y += outputs) {
-        for (int i = 0; i < outputs; i++) {
-            y[i] = 0.0;
-            for (int j = 0; j < n; j++) {
-                y[i] += reading[i * n + j] * x[j];
-            }
-        }
-        for (int i = 0; i < n; i++) {
-            next[i] = 0.0;
-            for (int j = 0; j < n; j++) {
-                next[i] += phi[i * n + j] * x[j] + factor[i * n + j] * normal[j];
-            }
-        }
-        memcpy(x, next, (size_t)n * sizeof x[0]);
+        kernels->multiply(outputs, n, readings, x, padded);
+        memcpy(y, padded, (size_t)outputs * sizeof y[0]);
+        memcpy(z, x, (size_t)n * sizeof z[0]);
+        memcpy(&z[n], normal, (size_t)n * sizeof z[0]);
+        kernels->multiply(n, 2 * n, panels, z, padded);
+        memcpy(x, padded, (size_t)n * sizeof x[0]);
     }
 }

@@ -133,7 +133,7 @@ class SuspensionComputer:
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
         turns = self.plan(changes, samples)
-        excitation.edges(0, 1, self.sample_rate_hz)
+        excitation.period_ticks(self.sample_rate_hz)
         self.machine.restart(Mode.OPERATE)
         self._plays += 1
         return self._blocks(self._plays, excitation, samples, turns, block_samples)
