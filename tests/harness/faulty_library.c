@@ -8,7 +8,8 @@
 #include <stdlib.h>
 #include <unistd.h>
 
-enum { NONE, SEGV, ABORT, EXIT_0, STACK, HANG, CLOSE, INPUT, STATE, RECORD, UNDONE, NOT_A_NUMBER, PRINT };
+enum { NONE, SEGV, ABORT, EXIT_0, STACK, HANG, CLOSE, INPUT, STATE, RECORD, UNDONE, NOT_A_NUMBER, PRINT, NEXT_BYTE };
+enum { EXTRA = NEXT_BYTE + 1, FORK, INIT };
 
 typedef struct {
     double   fault, at;
@@ -27,6 +28,9 @@ static int set(faulty_t* const self, const char* const name, const double value)
         self->at = value;
     } else {
         return 1;
+    }
+    if ((int)self->fault == INIT) {
+        abort();
     }
     return (value >= 0.0) ? 0 : 1;
 }
@@ -66,6 +70,14 @@ static void fail(faulty_t* const self, const analogrig_in_t* const in, analogrig
     case STATE:
         (void)memset(self, 0, 100000U);
         break;
+    case NEXT_BYTE:
+        ((volatile char*)self)[sizeof(*self)] = 1;
+        break;
+    case FORK:
+        if (fork() == 0) {
+            (void)pause();  // holds all descriptors
+        }
+        abort();
     case NOT_A_NUMBER:
         out->theta[0] = out->statistic = NAN;
         break;
@@ -135,6 +147,8 @@ void analogrig_step(void* state, size_t n, const analogrig_in_t* in, void* out, 
             wrong->done = 0U;
         } else if ((int)self->fault == RECORD) {
             wrong->theta[2] = 0.0F;
+        } else if ((int)self->fault == EXTRA) {
+            ((analogrig_out_t*)(void*)((char*)out + (n * stride)))->done = 1U;
         }
     }
 }

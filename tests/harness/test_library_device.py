@@ -51,6 +51,10 @@ class Fault(IntEnum):
     UNDONE = 10
     NOT_A_NUMBER = 11
     PRINT = 12
+    NEXT_BYTE = 13
+    EXTRA = 14
+    FORK = 15
+    INIT = 16
 
 
 ENDS = {
@@ -385,6 +389,32 @@ def test_broken_record_is_told_with_its_sample(
         device.start()
         with pytest.raises(DeviceError, match=f"^device bob: sample {at}: analogrig_step {message}"):
             list(device.play(cut(samples(), 100)))
+
+
+@WHERE
+@pytest.mark.parametrize(
+    ("fault", "what"),
+    [(Fault.NEXT_BYTE, "its state, which has state_bytes = 24"), (Fault.EXTRA, "the last of 100 records")],
+)
+def test_write_behind_state_or_records_is_told_with_its_block(
+    opened: Callable[..., EstimatorLibraryDevice], fault: Fault, what: str, *, in_process: bool
+) -> None:
+    device = opened(fault, 150, in_process=in_process)
+    device.start()
+    answers = device.play(cut(samples(), 100))
+    assert len(next(answers)) == 100
+    place = "samples 100 to 199: analogrig_step"
+    with pytest.raises(DeviceError, match=f"^device bob: {place} wrote beyond the end of {what}$"):
+        next(answers)
+    device.configure(at=N)
+    assert played(device, samples()) == played(opened(), samples())
+
+
+def test_child_of_the_library_ends_with_it(opened: Callable[..., EstimatorLibraryDevice]) -> None:
+    device = opened(Fault.FORK, 150)
+    device.start()
+    with pytest.raises(DeviceError, match=r"sample 150: analogrig_step: .* status -6 \(SIGABRT\)$"):
+        list(device.play(cut(samples(), 100)))  # its end closes the socket that both hold
 
 
 def test_crash_makes_the_run_inconclusive_and_the_next_one_is_whole(faulty: Path) -> None:

@@ -23,10 +23,12 @@
 #define EXIT_USAGE 2
 #define EXIT_CANNOT_PREPARE 3
 #define EXIT_NO_SOCKET 4
+#define EXIT_FORKED 5
 
 #define SLOTS_MAX 8U
 #define TEXT_MAX 1024U
 #define STATE_ALIGNMENT 64U
+#define CANARY 0xA5U
 
 /// Samples for analogrig_step(); n = 0 stands for analogrig_init().
 typedef struct {
@@ -36,7 +38,8 @@ typedef struct {
 } request_t;
 
 typedef struct {
-    int64_t result;  ///< of analogrig_init()
+    int64_t result;      ///< of analogrig_init()
+    int64_t is_overrun;  ///< 1: the library wrote beyond the end of its state
 } reply_t;
 
 /// analogrig_about_t with its name in place.
@@ -92,11 +95,30 @@ static void* map_guarded(const int fd, const size_t offset, const size_t size, c
 
 static size_t round_up(const size_t size, const size_t unit) { return ((size + unit - 1U) / unit) * unit; }
 
-/// State that ends at a guard page, but for its alignment.
-static void* map_state(const size_t state_bytes) {
-    const size_t used  = round_up((state_bytes > 0U) ? state_bytes : 1U, STATE_ALIGNMENT);
-    const size_t pages = round_up(used, (size_t)sysconf(_SC_PAGESIZE));
-    return (char*)map_guarded(-1, 0U, pages, PROT_READ | PROT_WRITE) + (pages - used);
+/// Size of a state with the canary that fills it to its alignment.
+static size_t padded(const size_t state_bytes) {
+    return round_up((state_bytes > 0U) ? state_bytes : 1U, STATE_ALIGNMENT);
+}
+
+/// State that ends at a guard page, but for its canary.
+static unsigned char* map_state(const size_t state_bytes) {
+    const size_t pages = round_up(padded(state_bytes), (size_t)sysconf(_SC_PAGESIZE));
+    return (unsigned char*)map_guarded(-1, 0U, pages, PROT_READ | PROT_WRITE) + (pages - padded(state_bytes));
+}
+
+/// All zeros, with the canary behind them.
+static void clear(unsigned char* const state, const size_t state_bytes) {
+    (void)memset(state, 0, state_bytes);
+    (void)memset(state + state_bytes, (int)CANARY, padded(state_bytes) - state_bytes);
+}
+
+static bool is_overrun(const unsigned char* const state, const size_t state_bytes) {
+    for (size_t i = state_bytes; i < padded(state_bytes); i++) {
+        if (state[i] != CANARY) {
+            return true;
+        }
+    }
+    return false;
 }
 
 static memory_t map_slots(const int fd, const size_t slots_n, const size_t samples_bytes, const size_t records_bytes) {
@@ -199,13 +221,15 @@ int main(const int argc, char* argv[]) {
     const memory_t  memory      = map_slots(shared, slots_n, samples_bytes, records_bytes);
     const library_t library     = load(argv[1], fd);
     const size_t    state_bytes = (size_t)greet(&library, fd);
-    void*           state       = NULL;
+    const pid_t     self        = getpid();
+    unsigned char*  state       = NULL;
     request_t       request;
     while (recv(fd, &request, sizeof(request), 0) == (ssize_t)sizeof(request)) {
         reply_t reply = { 0 };
         (void)fesetenv(FE_DFL_ENV);  // a library built with -ffast-math turns off denormals when it is loaded
         if (request.n == 0U) {
-            state        = (state == NULL) ? map_state(state_bytes) : memset(state, 0, state_bytes);
+            state = (state == NULL) ? map_state(state_bytes) : state;
+            clear(state, state_bytes);
             reply.result = library.init(state, settings, settings_n);
         } else if ((state != NULL) && (request.slot < memory.slots_n)) {
             library.step(state, (size_t)request.n, memory.samples[request.slot], memory.records[request.slot],
@@ -213,6 +237,10 @@ int main(const int argc, char* argv[]) {
         } else {
             return EXIT_USAGE;
         }
+        if (getpid() != self) {
+            _exit(EXIT_FORKED);  // a child of the library would take requests from it
+        }
+        reply.is_overrun = is_overrun(state, state_bytes) ? 1 : 0;
         send_to_parent(fd, &reply, sizeof(reply));
     }
     return EXIT_SUCCESS;

@@ -43,11 +43,13 @@ SAMPLE = np.dtype([("u", "<f4"), ("y", "<f4"), ("valid", "<u4")])
 
 _GUARD = 0xA5C3_5A3C
 """Value behind each record, which a library that writes beyond it destroys."""
+_CANARY = np.full(64, 0xA5, np.uint8)
+"""Bytes behind the last record of a block, and behind the state."""
 
 _MOST_MESSAGE = 2048
 _HELLO = struct.Struct("=IIQI1024s4x")
 _REQUEST = struct.Struct("=QII")
-_REPLY = struct.Struct("=q")
+_REPLY = struct.Struct("=qq")
 
 _NO_SOCKET = 4
 """Exit status of analogrig-library without its socket."""
@@ -76,7 +78,8 @@ def record_type(theta_n: int) -> np.dtype[Any]:
 
 
 SAMPLES_BYTES = SLOT_SAMPLES * SAMPLE.itemsize
-RECORDS_BYTES = SLOT_SAMPLES * record_type(MOST_THETA).itemsize
+RECORDS_BYTES = SLOT_SAMPLES * record_type(MOST_THETA).itemsize + mmap.PAGESIZE
+"""The last page holds the canary of a full slot."""
 
 
 @dataclass(frozen=True)
@@ -107,19 +110,29 @@ class About:
 class _Slot:
     """Memory of one block: views of its samples and records, made once because that takes longer than to fill them."""
 
-    def __init__(self, samples: NDArray[Any], records: NDArray[Any]) -> None:
+    def __init__(self, samples: NDArray[Any], room: NDArray[np.uint8], record: np.dtype[Any]) -> None:
+        """``room`` holds the records and the canary behind them."""
         self.u, self.y, self.valid = (samples[name] for name in ("u", "y", "valid"))
-        self.records = records
-        self.bytes = records.view(np.uint8)
-        self.done, self.guard = records["done"], records["guard"]
-        self.addresses = samples.ctypes.data, records.ctypes.data
+        self.records = room[: SLOT_SAMPLES * record.itemsize].view(record)
+        self._room = room
+        self.done, self.guard = self.records["done"], self.records["guard"]
+        self.addresses = samples.ctypes.data, room.ctypes.data
 
     def fill(self, u: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> None:
         """Set the samples, and prepare their records."""
         n = len(u)
         self.u[:n], self.y[:n], self.valid[:n] = u, y, valid
-        self.bytes[: n * self.records.itemsize] = 0
+        self._room[: n * self.records.itemsize] = 0
         self.guard[:n] = _GUARD
+        self._behind(n)[:] = _CANARY
+
+    def is_overrun(self, n: int) -> bool:
+        """True if something was written behind the last of ``n`` records."""
+        return bool((self._behind(n) != _CANARY).any())
+
+    def _behind(self, n: int) -> NDArray[np.uint8]:
+        end = n * self.records.itemsize
+        return self._room[end : end + len(_CANARY)]
 
     def done_n(self, n: int) -> int:
         """Number of complete records before the first incomplete one, of ``n``."""
@@ -147,7 +160,8 @@ class LibraryHost(ABC):
         self._slots = [
             _Slot(
                 np.frombuffer(memory, SAMPLE, SLOT_SAMPLES, samples),
-                np.frombuffer(memory, self._type, SLOT_SAMPLES, records),
+                np.frombuffer(memory, np.uint8, RECORDS_BYTES, records),
+                self._type,
             )
             for samples, records in zip(starts[:SLOTS], starts[SLOTS:], strict=True)
         ]
@@ -177,7 +191,8 @@ class LibraryHost(ABC):
         :raises TimeLimitReached: the time limit is over; ``answered`` counts the records until then.
         """
         slot = self._slots[self._taken % SLOTS]
-        self._await(_Call("analogrig_step", slot, n, first))
+        call = _Call("analogrig_step", slot, n, first)
+        self._await(call)
         self._taken += 1
         if (done_n := slot.done_n(n)) < n:
             raise DeviceError(
@@ -188,12 +203,22 @@ class LibraryHost(ABC):
                 f"device {self._device}: sample {first + int(np.argmax(broken))}: analogrig_step wrote beyond the end"
                 f" of its record, which holds theta_n = {self.about.theta_n} elements of theta"
             )
+        if slot.is_overrun(n):
+            raise self._overrun(call, f"the last of {n} records")
         return slot.records[:n]
 
     def answered(self, n: int) -> NDArray[Any]:
         """Records of the oldest block of n samples that are complete by now."""
         slot = self._slots[self._taken % SLOTS]
         return slot.records[: slot.done_n(n)]
+
+    def _overrun(self, call: _Call, what: str) -> DeviceError:
+        return DeviceError(f"device {self._device}: {call.places} wrote beyond the end of {what}")
+
+    def _check_state(self, call: _Call, *, is_overrun: bool) -> None:
+        """:raises DeviceError: the call wrote behind the state."""
+        if is_overrun:
+            raise self._overrun(call, f"its state, which has state_bytes = {self.about.state_bytes}")
 
     def start(self, settings: Mapping[str, float]) -> None:
         """Begin a record.
@@ -254,6 +279,13 @@ class _Call(NamedTuple):
             return self.function
         return f"sample {self.first + min(self.done_n, self.n - 1)}: {self.function}"
 
+    @property
+    def places(self) -> str:
+        """The function, with all its samples."""
+        if self.slot is None:
+            return self.function
+        return f"samples {self.first} to {self.first + self.n - 1}: {self.function}"
+
 
 class ChildHost(LibraryHost):
     """A library in a child process, whose crash is an error here. Nothing of the library is loaded in this process."""
@@ -308,14 +340,19 @@ class ChildHost(LibraryHost):
 
     def _init(self, settings: Mapping[str, float]) -> int:  # noqa: ARG002 - the process has them
         self._request(0)
-        (result,) = _REPLY.unpack(self._reply(_Call("analogrig_init"), self._timeout_s))
-        return int(result)
+        return self._result(_Call("analogrig_init"))
 
     def _post(self, slot: int, n: int) -> None:
         self._request(n, slot)
 
     def _await(self, call: _Call) -> None:
-        self._reply(call, self._timeout_s)
+        self._result(call)
+
+    def _result(self, call: _Call) -> int:
+        """Result of a call; errors as ``_reply``, and a library that wrote behind its state."""
+        result, is_overrun = _REPLY.unpack(self._reply(call, self._timeout_s))
+        self._check_state(call, is_overrun=bool(is_overrun))
+        return int(result)
 
     def _request(self, n: int, slot: int = 0) -> None:
         self._unanswered += 1
@@ -392,25 +429,37 @@ class InProcessHost(LibraryHost):
             raise ConfigurationError(f"device {device}: {library}: analogrig_about returned a null pointer")
         self._memory = self.memory()
         super().__init__(device, library, about[0].facts(), self._memory)
-        room = ctypes.create_string_buffer(self.about.state_bytes + _STATE_ALIGNMENT)
-        self._room = room
-        self._state = -(-ctypes.addressof(room) // _STATE_ALIGNMENT) * _STATE_ALIGNMENT
+        size = self.about.state_bytes
+        self._room = np.zeros(size + _STATE_ALIGNMENT + len(_CANARY), np.uint8)
+        self._state = -(-self._room.ctypes.data // _STATE_ALIGNMENT) * _STATE_ALIGNMENT
+        behind = self._state - self._room.ctypes.data + size
+        self._canary = self._room[behind : behind + len(_CANARY)]
+        self._overruns = [False] * SLOTS
+        """True for each slot behind whose block the state was overrun."""
         self._step = self._c.analogrig_step
         self._step.restype = None
         self._step.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t]
 
     def _init(self, settings: Mapping[str, float]) -> int:
         ctypes.memset(self._state, 0, self.about.state_bytes)
+        self._canary[:] = _CANARY
         given = (_Setting * len(settings))(*(_Setting(name.encode(), value) for name, value in settings.items()))
         with self._environment:
-            return int(self._c.analogrig_init(ctypes.c_void_p(self._state), given, ctypes.c_size_t(len(settings))))
+            result = int(self._c.analogrig_init(ctypes.c_void_p(self._state), given, ctypes.c_size_t(len(settings))))
+        self._check_state(_Call("analogrig_init"), is_overrun=self._is_overrun())
+        return result
 
     def _post(self, slot: int, n: int) -> None:
         with self._environment:
             self._step(self._state, n, *self._slots[slot].addresses, self._type.itemsize)
+        self._overruns[slot] = self._is_overrun()
 
     def _await(self, call: _Call) -> None:
-        """Return: the call has ended."""
+        """Check the state as it was behind the call, which has ended."""
+        self._check_state(call, is_overrun=self._overruns[self._taken % SLOTS])
+
+    def _is_overrun(self) -> bool:
+        return bool((self._canary != _CANARY).any())
 
 
 class _About(ctypes.Structure):

@@ -3,7 +3,7 @@
 /// With --stdio, the inherited descriptors IN and OUT are the command's standard input and output.
 /// The end of standard input ends the command, by SIGTERM and a second later by SIGKILL. If this program is killed, the
 /// kernel kills the command. If the command ends by itself, this program writes the last part of the command's standard
-/// error, and exits with the same status or signal.
+/// error, and exits with the same status or signal. Processes that the command left in its process group are killed.
 
 #include <errno.h>
 #include <signal.h>
@@ -75,7 +75,7 @@ static bool redirect(const stdio_t stdio) {
 /// Execute the command, in the child process. Returns the exit status only on failure.
 static int
 execute(char* const argv[], const stdio_t stdio, const int errors, const pid_t parent, const sigset_t* const mask) {
-    if ((prctl(PR_SET_PDEATHSIG, SIGKILL) != 0) || (getppid() != parent)) {
+    if ((prctl(PR_SET_PDEATHSIG, SIGKILL) != 0) || (getppid() != parent) || (setpgid(0, 0) != 0)) {
         return fail("cannot tie the command to its parent");
     }
     if (!redirect(stdio)) {
@@ -200,6 +200,7 @@ int main(const int argc, char* argv[]) {
     (void)close(errors[1]);
     close_stdio(stdio);
     const int status = watch(errors[0], &tail, &mask);
+    (void)kill(-pid, SIGKILL);  // its children, which hold its descriptors; ESRCH if there are none
     drain(errors[0], &tail);
     (void)!write(STDERR_FILENO, tail.bytes, tail.n);
     return exit_like(status, &mask);
