@@ -138,6 +138,7 @@ def test_program_that_says_half_a_line_is_ended(tmp_path: Path, monkeypatch: pyt
 def test_of_a_program_that_never_stops_talking_the_last_words_are_kept() -> None:
     """More than any pipe holds: it must neither block nor be remembered."""
     child = Child(["sh", "-c", "seq 1 200000 >&2; exit 3"], "the babbler")
+    assert ends(child.tether_pid)
     assert child.exit_report() == "the babbler ended with status 3: 200000"
     assert child.exit_report() == "the babbler ended with status 3: 200000"
     child.end()

@@ -18,6 +18,7 @@ import pytest
 from analogrig.answers import Answers, Samples
 from analogrig.bench import Bench
 from analogrig.catalogue import SteppedFlag
+from analogrig.devices import child
 from analogrig.devices.device import Device
 from analogrig.devices.program import ProgramDevice
 from analogrig.devices.registry import describe
@@ -253,6 +254,25 @@ def test_missing_samples_are_left_out_of_records_without_valid(tmp_path: Path) -
 def test_fault_of_a_binary_program_is_told_with_its_sample(tmp_path: Path, fault: str, told: str) -> None:
     with binary(tmp_path, fault, 5).connect() as device, pytest.raises(AnalogrigError, match=re.escape(told)):
         play(device, 256)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_answers_before_the_end_of_a_program_count(tmp_path: Path, *, text: bool) -> None:
+    end = "sys.stdout.flush(); sys.exit(0)"
+    program = scripted(tmp_path, f"if k == 400: {end}") if text else binary(tmp_path, end, 400)
+    with program.connect() as device, open_rig("emulator") as rig:
+        run = Bench(rig, device).play(Scenario.load("healthy"), seed=7)
+    assert run.samples == 400
+    assert "ended with status 0 after sample 399" in run.conditions.faults[0]
+    assert np.array_equal(run.theta[:, 0], run.codes[:, :2].sum(axis=1))
+
+
+def test_program_that_closes_its_output_is_ended_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child, "END_TIMEOUT_S", LONG_S)
+    monkeypatch.setattr(child, "CLOSED_TIMEOUT_S", 0.0)
+    device = scripted(tmp_path, "if k == 2: import os; os.close(1); sys.stdin.read()").connect()
+    with device, pytest.raises(LinkError, match="program .* closed its line after sample 1$"):
+        play(device, 4)
 
 
 def test_binary_program_that_hangs_is_told_with_its_sample(tmp_path: Path) -> None:

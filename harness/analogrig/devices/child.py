@@ -26,6 +26,8 @@ TETHER = PROGRAMS / "analogrig-tether"
 START_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 3.0
 """Longer than the tether waits before it kills."""
+CLOSED_TIMEOUT_S = 0.5
+"""Time in which a process that has closed its line may end by itself. Its status is then known."""
 
 _COMPLAINT = re.compile(r"[a-z][\w./-]*: ")
 """Beginning of an error message: the program's name. QEMU prints the processor's registers after it."""
@@ -46,6 +48,7 @@ class Child:
         """
         self._what = what
         self._stderr = ""
+        self._closed_its_line = False
         option = ("--stdio", *map(str, stdio)) if stdio else ()
         try:
             self._process = subprocess.Popen(
@@ -103,16 +106,22 @@ class Child:
         return line.decode(errors="replace").strip()
 
     def exit_report(self) -> str:
-        """Exit status with the last error message, or else the last line, of its standard error."""
-        try:
-            status = self._process.wait(END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
+        """Exit status with the last error message, or else the last line, of its standard error.
+
+        A process that only closed its line is ended. A crash keeps its status: a process that ends takes no signal.
+        """
+        if not (self._closed_its_line or self._ends_within(CLOSED_TIMEOUT_S)):
+            self._close_input()
+            ended = self._ends_within(END_TIMEOUT_S)
+            self._closed_its_line = not ended or self.status in (-signal.SIGTERM, -signal.SIGKILL)
+        if self._closed_its_line:
             return f"{self._what} closed its line"
         if self._process.stderr is not None and not self._process.stderr.closed:
             self._stderr += self._process.stderr.read().decode(errors="replace")
         lines = self._stderr.strip().splitlines()
         messages = [line for line in lines if _COMPLAINT.match(line)] or lines
-        return f"{self._what} ended with status {_status(status)}{f': {messages[-1]}' if messages else ''}"
+        status = _status(self._process.wait())
+        return f"{self._what} ended with status {status}{f': {messages[-1]}' if messages else ''}"
 
     @contextlib.contextmanager
     def reports_exit(self) -> Iterator[None]:
@@ -124,16 +133,24 @@ class Child:
 
     def end(self) -> None:
         """End the process by closing the tether's input. May be called twice."""
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                stream.close()
-        try:
-            self._process.wait(END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
+        self._close_input()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        if not self._ends_within(END_TIMEOUT_S):
             self._process.kill()  # the kernel then kills the command
             self._process.wait()
         if self._process.stderr is not None:
             self._process.stderr.close()
+
+    def _close_input(self) -> None:
+        """Make the tether end the command."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+
+    def _ends_within(self, time_s: float) -> bool:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(time_s)
+        return self.has_ended
 
 
 def _status(status: int) -> str:

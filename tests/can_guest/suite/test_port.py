@@ -30,7 +30,7 @@ from analogrig.catalogue import (
 )
 from analogrig.devices.child import Child
 from analogrig.devices.host import HOST_PROGRAM
-from tests.harness.processes import LONG_S, children
+from tests.harness.processes import LONG_S, children, ends
 
 from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan
 
@@ -104,6 +104,7 @@ def test_device_gives_the_reason_when_there_is_no_such_interface() -> None:
 @pytest.mark.parametrize("interface", [VIRTUAL, CONTROLLERS[1]])
 def test_device_ends_with_the_reason_when_its_interface_goes_down(interface: str) -> None:
     with device(interface) as child, down(interface):
+        assert ends(child.tether_pid)
         assert (
             child.exit_report()
             == f"the device ended with status 1: analogrig-device: lost {interface}: Network is down"
