@@ -31,12 +31,13 @@ DEVICE = Path("harness/analogrig/_device.so")
 HOST = Path("harness/analogrig/bin/analogrig-device")
 TETHER = Path("harness/analogrig/bin/analogrig-tether")
 LIBRARY_CHILD = Path("harness/analogrig/bin/analogrig-library")
+EXIT_GUARD = Path("harness/analogrig/_exit_guard.so")
 STAMP = Path("harness/analogrig/_commit.txt")
 UPLOT = {
     Path("harness/analogrig/reporting/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
     Path("harness/analogrig/reporting/uPlot.min.css"): "uplot/static/uPlot.min.css",
 }
-PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, LIBRARY_CHILD, *UPLOT)
+PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, LIBRARY_CHILD, EXIT_GUARD, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c",)
@@ -45,6 +46,7 @@ HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
 TETHER_SOURCES = ("harness/analogrig/devices/tether.c",)
 LIBRARY_CHILD_SOURCES = ("harness/analogrig/devices/library_child.c",)
+EXIT_GUARD_SOURCES = ("harness/analogrig/devices/exit_guard.c",)
 DATA = Path("analogrig")
 """The package of the wheel that receives SHIPPED, at the same paths below it."""
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
@@ -114,6 +116,7 @@ class BuildProducts(Command):
         compile_c(placed(HOST), (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *include))
         compile_c(placed(TETHER), sources(TETHER_SOURCES), POSIX)
         compile_c(placed(LIBRARY_CHILD), sources(LIBRARY_CHILD_SOURCES), LIBRARY_CHILD_FLAGS, ("-ldl", "-lm"))
+        compile_c(placed(EXIT_GUARD), sources(EXIT_GUARD_SOURCES), (*SHARED, *POSIX))
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), placed(product))
         if not in_tree:
@@ -130,7 +133,7 @@ class BuildProducts(Command):
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
-        programs = (*HOST_SOURCES, *LIBRARY_SOURCES, *TETHER_SOURCES, *LIBRARY_CHILD_SOURCES)
+        programs = (*HOST_SOURCES, *LIBRARY_SOURCES, *TETHER_SOURCES, *LIBRARY_CHILD_SOURCES, *EXIT_GUARD_SOURCES)
         return [str(path) for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *programs, *OTHER_SOURCES))]
 
     def get_outputs(self) -> list[str]:

@@ -41,6 +41,7 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
         "analogrig/_catalogue.py",
         "analogrig/_commit.txt",
         "analogrig/_device.so",
+        "analogrig/_exit_guard.so",
         "analogrig/bin/analogrig-device",
         "analogrig/bin/analogrig-library",
         "analogrig/bin/analogrig-tether",

@@ -17,6 +17,7 @@ AnalogrigError
 ├── TimeLimitReached            the time limit of the run is over
 └── DeviceError                 the device gave a wrong answer
     ├── CatalogueMismatch       the device has another message catalogue
+    ├── DeviceCrashed           the process of the device ended, or hangs
     └── DeviceRefused           the device refused a command or a value
 
 Errors of the operating system and of libraries are wrapped once, where they occur; the cause is kept.
@@ -96,6 +97,10 @@ class DeviceError(AnalogrigError):
 
 class CatalogueMismatch(DeviceError):  # noqa: N818 - the word of the field
     """The device has another message catalogue."""
+
+
+class DeviceCrashed(DeviceError):  # noqa: N818 - the word of the field
+    """The process of the device ended, or hangs. The run is inconclusive, also before the first sample."""
 
 
 class DeviceRefused(DeviceError):  # noqa: N818 - the word of the field

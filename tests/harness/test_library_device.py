@@ -437,6 +437,23 @@ def test_non_finite_answer_is_told_with_its_sample(
         list(device.play(cut(samples(), 64)))
 
 
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [
+        (f"fault={Fault.EXIT_0:d}&at=1000&in_process=true", "{library}: called exit() in this process: run it in"),
+        (f"fault={Fault.INIT:d}", "device {name}: analogrig_init: the process of the library ended with status -6"),
+    ],
+    ids=["exit(0) in process", "crash in analogrig_init"],
+)
+def test_command_is_inconclusive_after_a_crash(faulty: Path, tmp_path: Path, settings: str, error: str) -> None:
+    name = f"library:{faulty}?{settings}"
+    command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", name, "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert f"analogrig: INCONCLUSIVE: {error.format(library=faulty, name=name)}" in done.stderr
+    assert done.stderr.endswith("\n") and done.stderr.count("analogrig: ") == 1
+
+
 def test_killed_child_is_told_and_recovered(opened: Callable[..., EstimatorLibraryDevice]) -> None:
     device = opened()
     os.kill(pids(device)[1], signal.SIGKILL)

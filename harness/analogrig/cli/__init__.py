@@ -88,13 +88,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _explain(error: Exception) -> int:
     """Print in one line the error that ended a command; return the exit status."""
     try:
-        from analogrig.errors import AnalogrigError
+        from analogrig.errors import AnalogrigError, DeviceCrashed
         from analogrig_emulator import EmulatorError
     except (ImportError, MemoryError, OSError):
         cause = " ".join(str(error).split())[-_MOST_CAUSE:]
         return complain(f"not enough memory, or an incomplete installation: {cause}", INCONCLUSIVE)
     if isinstance(error, AnalogrigError | EmulatorError):
-        return complain(str(error), USAGE)
+        has_crashed = isinstance(error, DeviceCrashed)
+        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE) if has_crashed else complain(str(error), USAGE)
     if isinstance(error, FileNotFoundError) and _is_working_directory_gone():
         return complain("the working directory is gone: change to one that exists", USAGE)
     if "ANALOGRIG_DEBUG" in os.environ:

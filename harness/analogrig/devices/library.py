@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import functools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
@@ -13,6 +15,9 @@ from analogrig.links.wire import VirtualClock
 
 LIBRARY = Path(__file__).parents[1] / "_device.so"
 """The project's own device."""
+
+EXIT_GUARD = LIBRARY.with_name("_exit_guard.so")
+"""exit_guard.c: after exit() in a user's library, the status of this process is no success."""
 
 ALWAYS_ROOM = 255
 """Input blocks of a device that handles every message before the call returns: no message ever waits."""
@@ -50,6 +55,8 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
     if library.exists() and not library.is_file():
         raise ConfigurationError(f"{library}: not a file")
     try:
+        if library != LIBRARY:
+            _exit_guard().exit_guard_arm(str(library).encode())
         c = ctypes.CDLL(str(library))
     except OSError as error:
         if library == LIBRARY:
@@ -60,6 +67,13 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
     if lacking:
         raise ConfigurationError(f"{library}: is no library of a device: it lacks {', '.join(lacking)} ({cure})")
     return c
+
+
+@functools.cache
+def _exit_guard() -> ctypes.CDLL:
+    guard = ctypes.CDLL(str(EXIT_GUARD))
+    atexit.register(guard.exit_guard_disarm)  # Python runs it before it calls exit() itself
+    return guard
 
 
 class LibraryDevice:

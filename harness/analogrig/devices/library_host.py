@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from analogrig.datasheet import MOST_THETA
 from analogrig.devices.child import PROGRAMS, START_TIMEOUT_S, Child
 from analogrig.devices.library import load_library
-from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused, TimeLimitReached
+from analogrig.errors import ConfigurationError, DeviceCrashed, DeviceError, DeviceRefused, TimeLimitReached
 
 PROGRAM = PROGRAMS / "analogrig-library"
 
@@ -296,7 +296,7 @@ class ChildHost(LibraryHost):
         :param settings: those of every ``start``.
         :param timeout_s: longest time for one sample.
         :raises ConfigurationError: the file is no library of analogrig_estimator.h.
-        :raises DeviceError: the library crashes or hangs while it is loaded.
+        :raises DeviceCrashed: the library crashes or hangs while it is loaded.
         :raises LinkError: analogrig-library was not built.
         """
         self._device = device
@@ -362,7 +362,7 @@ class ChildHost(LibraryHost):
     def _reply(self, call: _Call, timeout_s: float) -> bytes:
         """Next message of the process.
 
-        :raises DeviceError: the process has ended, or the call makes no progress.
+        :raises DeviceCrashed: the process has ended, or the call makes no progress.
         :raises TimeLimitReached: the time limit is over.
         """
         done_n = stalls = 0
@@ -372,7 +372,7 @@ class ChildHost(LibraryHost):
             stalls = 0 if call.done_n > done_n else stalls + 1
             done_n = call.done_n
             if stalls == _POLLS:
-                raise DeviceError(f"device {self._device}: {call.place} has not returned for {timeout_s:g} s")
+                raise DeviceCrashed(f"device {self._device}: {call.place} has not returned for {timeout_s:g} s")
         try:
             message = self._socket.recv(_MOST_MESSAGE)
         except OSError:
@@ -380,7 +380,7 @@ class ChildHost(LibraryHost):
         if not message:
             report = self._child.exit_report()
             cause = ": the library closed a descriptor that it did not open" if self._child.status == _NO_SOCKET else ""
-            raise DeviceError(f"device {self._device}: {call.place}: {report}{cause}")
+            raise DeviceCrashed(f"device {self._device}: {call.place}: {report}{cause}")
         self._unanswered -= 1
         return message
 
