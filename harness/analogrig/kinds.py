@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Generic, TypeVar
 
 from analogrig.errors import ConfigurationError
+from analogrig.wording import error_text
 
 T = TypeVar("T")
 
@@ -61,6 +62,12 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
             if point.name in self._own or self._added[point.name] is not point
         }
 
+    def package_of(self, modules: Iterable[str]) -> str:
+        """Package that adds kinds from one of these modules; empty if there is none."""
+        packages = {module.partition(".")[0] for module in modules}
+        found = (point for point in self._points if point.module.partition(".")[0] in packages)
+        return next(map(self._package, found), "")
+
     @functools.cached_property
     def _points(self) -> tuple[importlib.metadata.EntryPoint, ...]:
         """Entry points of other packages in a fixed order."""
@@ -79,7 +86,7 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
         try:
             loaded = point.load()
         except (Exception, SystemExit) as error:  # foreign code raises what it likes
-            raise ConfigurationError(f"{where} cannot be imported: {type(error).__name__}: {error}") from error
+            raise ConfigurationError(f"{where} cannot be imported: {error_text(error)}") from error
         if not (isinstance(loaded, type) and issubclass(loaded, self._base)):
             raise ConfigurationError(f"{where} is no subclass of {self._base.__name__}")
         if (kind := getattr(loaded, "kind", point.name)) != point.name:

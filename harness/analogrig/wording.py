@@ -30,6 +30,15 @@ def _escape(char: str) -> str:
     return char.encode("unicode_escape").decode("ascii")
 
 
+def error_text(error: BaseException) -> str:
+    """Type and text of an error of foreign code, whose text may itself raise."""
+    try:
+        text = str(error)
+    except Exception:  # noqa: BLE001 - foreign code raises what it likes
+        text = ""
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
 def number_of(n: int, one: str, several: str = "", *, form: str = "") -> str:
     """A count with its noun: ``1 false alarm``, ``2 false alarms``.
 

@@ -247,6 +247,45 @@ def test_exception_names_sample_type_and_line_and_ends_the_run(way: str, folder:
     assert judge(run).outcome == "inconclusive"
 
 
+@pytest.mark.parametrize(
+    ("part", "status", "error"),
+    [
+        ("def step(self, u, y, valid): raise Odd('no')", 3, "step of sample 0 raised Odd: no ({file}:7)"),
+        ("def step(self, u, y, valid): raise Mute()", 3, "step of sample 0 raised Mute ({file}:7)"),
+        (
+            "def step(self, u, y, valid): raise KeyboardInterrupt",
+            3,
+            "step of sample 0 raised KeyboardInterrupt ({file}",
+        ),
+        ("def __init__(self): raise KeyboardInterrupt", 2, "{name}:It raised KeyboardInterrupt ({file}:7)"),
+        ("step = property(lambda self: 1 / 0)", 2, "step of {name}:It raised ZeroDivisionError: division by zero ("),
+        ("datasheet = property(lambda self: 1 / 0)", 2, "datasheet of {name}:It raised ZeroDivisionError: division"),
+    ],
+    ids=["BaseException", "__str__", "KeyboardInterrupt", "in factory", "step", "datasheet"],
+)
+def test_odd_failure_of_the_object_is_one_line(
+    folder: Path, part: str, status: int, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd = "class Odd(BaseException): pass\nclass Mute(Exception):\n    def __str__(self): return 1 / 0\n"
+    name = module(folder, f"{odd}class It:\n    def step(self, u, y, valid): return False\n\n    {part}\n")
+    assert main(["run", "--dut", f"python:{name}:It"]) == status
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"device python:{name}:It: {error.format(name=name, file=folder / f'{name}.py')}" in line
+
+
+def test_ctrl_c_is_no_failure_of_the_object(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = module(
+        folder,
+        """
+        import os, signal
+        class It:
+            def step(self, u, y, valid): os.kill(os.getpid(), signal.SIGINT)
+        """,
+    )
+    assert main(["run", "--dut", f"python:{name}:It"]) == 130
+    assert "interrupted by SIGINT" in capsys.readouterr().err
+
+
 WRONG_ANSWERS: dict[str, tuple[object, object, str]] = {
     "text": ("no", None, r"must return True, False or an object with such an alarm, not 'no' \(str\)"),
     "nothing": (None, None, r"not None \(NoneType\)"),

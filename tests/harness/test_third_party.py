@@ -148,6 +148,24 @@ def test_broken_packages_are_listed_and_break_nothing_else(site: Path, folder: P
     assert failed.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("fault", ["open", "things", "play"])
+def test_package_that_fails_is_named(site: Path, folder: Path, fault: str) -> None:
+    member = "@property\n    def things(self" if fault == "things" else "def open(self"
+    body = "return Failing(self)" if fault == "play" else "raise LookupError('no such board')"
+    (folder / "failing_kinds.py").write_text(
+        "from my_kinds import JumpDescription, JumpDevice\n"
+        "class Failing(JumpDevice):\n    def play(self, blocks):\n        raise LookupError('no such board')\n"
+        f"class It(JumpDescription):\n    kind = 'it'\n    {member}):\n        {body}\n"
+    )
+    install(folder, "failing", devices={"it": "failing_kinds:It"})
+    done = run(Path(f"{site}{os.pathsep}{folder}"), folder, "analogrig.cli", "run", "--dut", "it")
+    package = "the package failing (analogrig.devices: failing_kinds:It)"
+    assert (done.returncode, done.stderr) == (
+        3,
+        f"analogrig: {package}: LookupError: no such board (ANALOGRIG_DEBUG=1 shows where)\n",
+    )
+
+
 def test_every_kind_states_what_a_list_shows() -> None:
     assert all(cls.kind == kind and cls.usage and cls.summary for kind, cls in KINDS.items())
 

@@ -10,6 +10,7 @@ import errno
 import os
 import shlex
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -81,14 +82,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             return int(arguments.command(arguments))
         except KeyboardInterrupt:
             return complain("interrupted", INTERRUPTED)
-        except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
+        except SystemExit:
+            raise
+        except BaseException as error:  # noqa: BLE001 - whatever it is, a user gets one line
             return complain("interrupted", INTERRUPTED) if interruption(error) else _explain(error)
 
 
-def _explain(error: Exception) -> int:
+def _explain(error: BaseException) -> int:
     """Print in one line the error that ended a command; return the exit status."""
     try:
         from analogrig.errors import AnalogrigError, DeviceCrashed
+        from analogrig.wording import error_text, one_line
         from analogrig_emulator import EmulatorError
     except (ImportError, MemoryError, OSError):
         cause = " ".join(str(error).split())[-_MOST_CAUSE:]
@@ -104,8 +108,17 @@ def _explain(error: Exception) -> int:
         return complain("not enough memory", INCONCLUSIVE)
     if isinstance(error, OSError) and error.errno in _EXHAUSTED:
         return complain(f"{error.strerror}: {_EXHAUSTED[error.errno]}", INCONCLUSIVE)
-    what = " ".join(f"{type(error).__name__}: {error}".split())
-    return complain(f"a fault of analogrig itself: {what} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
+    culprit = _package_of(error) or "a fault of analogrig itself"
+    return complain(f"{culprit}: {one_line(error_text(error))} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
+
+
+def _package_of(error: BaseException) -> str:
+    """Package of somebody else, which adds kinds, in whose code an error was raised; empty if there is none."""
+    from analogrig.devices import registry
+    from analogrig.rigs import description
+
+    modules = [str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return registry.KINDS.package_of(modules) or description.KINDS.package_of(modules)
 
 
 def _is_working_directory_gone() -> bool:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import importlib
+import importlib.util
 import inspect
 import math
 import re
+import signal
 import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NoReturn, Self
 
 import numpy as np
 
@@ -29,11 +32,12 @@ from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused, Tim
 from analogrig.identity import DeviceFile
 from analogrig.protocol.pace import Pace
 from analogrig.trust import Thing
+from analogrig.wording import error_text
 
 _FACTORY = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 
 _FAILURES = (Exception, SystemExit, GeneratorExit)
-"""Errors of foreign code. Ctrl-C is not among them."""
+"""Errors that are always failures of foreign code. Others may end a test or a task: pytest, asyncio and Ctrl-C."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +115,7 @@ class PythonDevice(Device):
     def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
         if not self._has_started:
             self._has_started = True
-        elif callable(reset := getattr(self._object, "reset", None)):
+        elif (reset := self._method(self._object, "reset")) is not None:
             self._attempt(reset, "reset")
         else:
             self._object = self._make(self._description.settings)
@@ -145,13 +149,13 @@ class PythonDevice(Device):
             arrays = (block.u.copy(), block.y.copy(), block.valid.copy())
             self._attempt(lambda: rows.fill(self._object.step_block(*arrays)), what)
             return
-        step = self._object.step
+        step = self._attempt(lambda: self._object.step, f"step of sample {block.first}")
         for u, y, valid in zip(block.u.tolist(), block.y.tolist(), block.valid.tolist(), strict=True):
             self._check_time()
             try:
                 rows.add(step(u, y, valid))
-            except _FAILURES as error:
-                raise self._failure(f"step of sample {rows.next_sample}", error) from error
+            except BaseException as error:  # noqa: BLE001 - of foreign code
+                self._raise_failure(f"step of sample {rows.next_sample}", error)
 
     def _check_time(self) -> None:
         if time.monotonic() >= self._until_s:
@@ -167,7 +171,7 @@ class PythonDevice(Device):
         """
         self._check_settings(settings)
         made = self._attempt(lambda: self._factory(**settings), self._description.factory)
-        if not any(callable(getattr(made, name, None)) for name in ("step", "step_block")):
+        if all(self._method(made, name) is None for name in ("step", "step_block")):
             raise DeviceError(
                 f"device {self.name}: {self._description.factory} made a {type(made).__name__}, which has no method"
                 " step(u, y, valid)"
@@ -194,29 +198,45 @@ class PythonDevice(Device):
 
         :raises ConfigurationError: its data sheet is wrong.
         """
-        self._datasheet = self._combine(getattr(made, "datasheet", {}))
-        self._steps_blocks = callable(getattr(made, "step_block", None))
+        self._datasheet = self._combine(made)
+        self._steps_blocks = self._method(made, "step_block") is not None
         self._object = made
         self._has_started = False
 
-    def _combine(self, own: Any) -> Datasheet:
-        """The stated data sheet, with what the object states ``own`` in place of it."""
-        where = f"device {self.name}: datasheet of {self._description.factory}"
+    def _method(self, made: Any, name: str) -> Callable[..., Any] | None:
+        """Method of the object; None if it has none."""
+        method = self._attempt(lambda: getattr(made, name, None), f"{name} of {self._description.factory}")
+        return method if callable(method) else None
+
+    def _combine(self, made: Any) -> Datasheet:
+        """The stated data sheet, with what the object states in place of it."""
+        what = f"datasheet of {self._description.factory}"
+        where = f"device {self.name}: {what}"
+        own = self._attempt(lambda: getattr(made, "datasheet", {}), what)
         table = own.as_table() if isinstance(own, Datasheet) else own
         if not isinstance(table, Mapping):
             raise ConfigurationError(f"{where}: must be a mapping, not a {type(own).__name__}")
-        return config.build(Datasheet, {**self._description.datasheet.as_table(), **config.plain(table)}, where)
+        try:
+            return config.build(Datasheet, {**self._description.datasheet.as_table(), **config.plain(table)}, where)
+        except ConfigurationError:
+            raise
+        except BaseException as error:  # noqa: BLE001 - of foreign code
+            self._raise_failure(what, error)
 
     def _attempt(self, act: Callable[[], Any], what: str) -> Any:
         """:raises DeviceError: the foreign code failed."""
         try:
             return act()
-        except _FAILURES as error:
-            raise self._failure(what, error) from error
+        except BaseException as error:  # noqa: BLE001 - of foreign code
+            self._raise_failure(what, error)
 
-    def _failure(self, what: str, error: BaseException) -> DeviceError:
+    def _raise_failure(self, what: str, error: BaseException) -> NoReturn:
+        """:raises DeviceError: the foreign code failed. An error that must end more than the device is raised again."""
+        if not _is_failure(error, self._code):
+            raise error
         text = f": {error}" if isinstance(error, WrongAnswer) else f" raised {_text(error, self._code)}"
-        return DeviceError(f"device {self.name}: {what}{text}")
+        cause = None if isinstance(error, KeyboardInterrupt) else error  # by which the command would be interrupted
+        raise DeviceError(f"device {self.name}: {what}{text}") from cause
 
     def description(self) -> Mapping[str, Any]:
         return {**self._description.as_table(), "datasheet": self.datasheet.as_table()}
@@ -240,6 +260,14 @@ class _Module:
         return cls(origin or name, DeviceFile.of(name, Path(origin)).sha256 if origin else "")
 
 
+def _file_of(module: str) -> str:
+    """File of a module that cannot be imported; empty if there is none."""
+    with contextlib.suppress(Exception):
+        spec = importlib.util.find_spec(module)
+        return "" if spec is None else spec.origin or ""
+    return ""
+
+
 def _load(device: str, factory: str) -> tuple[_Module, Callable[..., Any]]:
     """Module and function of ``package.module:name``.
 
@@ -258,8 +286,11 @@ def _load(device: str, factory: str) -> tuple[_Module, Callable[..., Any]]:
         raise ConfigurationError(
             f"device {device}: there is no module {error.name}, neither in {folder} nor installed"
         ) from error
-    except _FAILURES as error:
-        raise ConfigurationError(f"device {device}: {name} cannot be imported: {_text(error, '')}") from error
+    except BaseException as error:
+        if not _is_failure(error, _file_of(name)):
+            raise
+        cause = None if isinstance(error, KeyboardInterrupt) else error
+        raise ConfigurationError(f"device {device}: {name} cannot be imported: {_text(error, '')}") from cause
     for part in attribute.split("."):
         if not hasattr(made, part):
             raise ConfigurationError(f"device {device}: {module.origin} has no {attribute}")
@@ -269,16 +300,28 @@ def _load(device: str, factory: str) -> tuple[_Module, Callable[..., Any]]:
     return module, made
 
 
+def _is_failure(error: BaseException, code: str) -> bool:
+    """True if an error shows that foreign code failed: always such a one, or raised in the file ``code``.
+
+    A KeyboardInterrupt seems to be raised where Ctrl-C found the code, unless the command line handles signals.
+    """
+    if isinstance(error, _FAILURES):
+        return True
+    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        return False
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and frames[-1].filename == code
+
+
 def _text(error: BaseException, code: str) -> str:
     """Type, text and place of an error: the innermost line of ``code``, else of any file but the import system's."""
     if isinstance(error, SyntaxError):
-        return f"{type(error).__name__}: {error}"
+        return error_text(error)
     frames = [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith("<frozen ")]
     ours = [each for each in frames if each.filename == code]
     others = [each for each in frames if not _is_here(each.filename)]
     place = next((f" ({each.filename}:{each.lineno})" for each in reversed(ours or others)), "")
-    text = f": {error}" if str(error) else ""
-    return f"{type(error).__name__}{text}{place}"
+    return f"{error_text(error)}{place}"
 
 
 def _is_here(file: str) -> bool:
