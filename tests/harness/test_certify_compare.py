@@ -153,6 +153,21 @@ def test_device_that_is_not_excited_is_not_certified_by_its_silence(
     assert "INCONCLUSIVE\n  seed 0: the trigger was armed in none of" in capsys.readouterr().out
 
 
+def test_device_of_the_scenario_is_certified_if_it_may_be_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("ANALOGRIG_DUT", raising=False)
+    scenario = tmp_path / "quiet.toml"
+    command = ["certify", "--scenario", str(scenario), "--far", "1e-3", "--confidence", "0.9", "--workers", "1"]
+    rest = "[excitation]\nlow_v = 3.0\nhigh_v = 7.0\n"
+    scenario.write_text(f'samples = 500\ndut = "inproc"\nrig = "emulator-0-10v"\n{rest}')
+    assert main([*command, "--allowed", "0"]) == 0
+    assert capsys.readouterr().out.startswith("inproc on emulator-0-10v: ")
+    scenario.write_text(f'samples = 500\ndut = "python:no_such_module:It"\n{rest}')
+    assert main(command) == 2
+    assert "the device imports python:no_such_module:It, which no file may order" in capsys.readouterr().err
+
+
 def test_samples_that_are_missing_make_a_run_within_this_process_as_invalid_as_elsewhere() -> None:
     """Displacements beyond the card's range of 4 V: most samples are missing, and the scenario allows a quarter."""
     rig = dict(rig_table("emulator"))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.campaign import add_workers, begin, workers
-from analogrig.cli.options import DUT, SCENARIO, add_command, add_json, add_rig, add_seed, trust_of
+from analogrig.cli.options import DUT, RIG_NAMES, SCENARIO, add_command, add_json, add_rig, add_seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, open_progress_line, show, show_result
 from analogrig.wording import number_of
 
@@ -55,12 +55,12 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--scenario", default="healthy", metavar=SCENARIO, help="scenario without changes (default: %(default)s)"
     )
-    add_rig(command)
+    add_rig(command, f"{RIG_NAMES} (default: $ANALOGRIG_RIG, that of the scenario, or emulator)", None)
     command.add_argument(
         "--dut",
-        default=os.environ.get("ANALOGRIG_DUT", "host"),
+        default=os.environ.get("ANALOGRIG_DUT", ""),
         metavar=DUT,
-        help="device (default: $ANALOGRIG_DUT or host)",
+        help="device (default: $ANALOGRIG_DUT, that of the scenario, or host)",
     )
     add_seed(command)
     add_workers(command)
@@ -73,13 +73,15 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.campaigns.certificate import Question, certify
     from analogrig.campaigns.plan import device_of, device_table, one_worker_only, rig_table
     from analogrig.errors import DeviceError, LinkError, RigError, WorkerError
+    from analogrig.rigs.description import DEFAULT_RIG
     from analogrig.scenario import Scenario
 
     trust = trust_of(arguments)
+    scenario = Scenario.load(arguments.scenario)
     question = Question(
-        rig_table(arguments.rig, trust),
-        device_table(arguments.dut, trust),
-        Scenario.load(arguments.scenario),
+        rig_table(arguments.rig or scenario.rig or DEFAULT_RIG, trust),
+        device_table(arguments.dut or scenario.dut or "host", trust),
+        scenario,
         far=arguments.far,
         confidence=arguments.confidence,
         allowed=arguments.allowed,
