@@ -25,6 +25,7 @@ from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout, RecordingError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
+from analogrig.links.dbc import MAX_DBC_BYTES
 from analogrig.recordings import WRITTEN, CanLog, import_run
 from analogrig.rigs.description import open_rig
 from analogrig.run import LOST, UNARMED, UNREPORTED, Run
@@ -522,7 +523,11 @@ def test_device_file_that_does_not_fit_its_dbc_is_refused_in_one_line(
     [
         ("SG_ Valid : 4|1@1+", "SG_ Valid : 3|1@1+", "overlapping"),
         ("SG_ Force : 7|16@0-", "SG_ Force : 7|8@0-", "8 bits hold -128 to 127"),
-        ("(0.25,-100) [0|0]", "(0.25,-100) [-100|500]", r"outside \[-100\|500\] of the DBC"),
+        (
+            "(0.25,-100) [0|0]",
+            "(0.25,-100) [-100|500]",
+            r"outside \[-100\|500\] of the DBC: set send.units.[uy], or correct",
+        ),
         (
             "BO_ 257 HIL_Travel: 8",
             "BO_ 257 HIL_Travel: 64",
@@ -538,6 +543,12 @@ def test_dbc_that_cannot_be_used_is_refused_in_one_line(file: Path, old: str, ne
     assert old in DBC
     (file.parent / "ecu.dbc").write_text(DBC.replace(old, new), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=message):
+        describe(str(file))
+
+
+def test_huge_dbc_is_refused_before_it_is_parsed(file: Path) -> None:
+    (file.parent / "ecu.dbc").write_text(DBC + "\n" * MAX_DBC_BYTES)
+    with pytest.raises(ConfigurationError, match="ecu.dbc: larger than 4000000 bytes$"):
         describe(str(file))
 
 

@@ -304,7 +304,11 @@ class EcuMessages:
         if factor == 0.0:
             raise self._error(f"send.units.{key}", "the scale is 0")
         for code in (0, codes - 1):
-            self._raw(f"send.{key}", f"{found.name}: code {code}", found.signal, code * factor + offset)
+            try:
+                self._raw(f"send.{key}", f"{found.name}: code {code}", found.signal, code * factor + offset)
+            except ConfigurationError as error:
+                cure = f"set send.units.{key}, or correct scale and range of {found.name} in the DBC"
+                raise ConfigurationError(f"{error}: {cure}") from error
         return [_to_raw(found.signal, code * factor + offset) for code in range(codes)]
 
     def _units(self, key: str) -> Units:

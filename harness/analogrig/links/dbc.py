@@ -11,7 +11,8 @@ from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.links.quiet import silence_logger
 
-MAX_DBC_BYTES = 16_000_000
+MAX_DBC_BYTES = 4_000_000
+"""Size that cantools takes some ten seconds to parse."""
 
 MOST_MESSAGE_BYTES = 1785
 """Longest message that a DBC may state: that of a J1939 transport session. Only those of one frame can be used."""
