@@ -126,6 +126,7 @@ def test_bit_rate_may_be_said_by_the_timing_of_a_bit(channel: str) -> None:
     [
         ({}, ConfigurationError, "can: no interface given: use can:virtual or can:socketcan/can0, or set it in"),
         ({"interface": "foo"}, ConfigurationError, "can:foo: python-can knows canalystii, .*, and no 'foo'"),
+        ({"interface": "sockecan"}, ConfigurationError, r".* and no 'sockecan': did you mean 'socketcan'\?$"),
         ({"interface": "slcan"}, ConfigurationError, "can:slcan: no channel given: use can:slcan/CHANNEL"),
         (
             {"interface": "slcan", "channel": "/dev/absent", "sleep_after_open": 0},

@@ -259,6 +259,24 @@ def test_wrong_description_is_one_line(tmp_path: Path, text: str, complaint: str
     assert complaint in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        (
+            "lien:/dev/ttyUSB0",
+            r"no device is called 'lien': did you mean 'lines'\? there are host, inproc, .*, shock, or",
+        ),
+        ("lien:./est.so", "did you mean 'lines'"),
+        ("inprocc", "did you mean 'inproc'"),
+        ("nonsense", "no device is called 'nonsense': there are host, "),
+        ("./est.so", "is a compiled file, not a description of a device: use library:./est.so for an estimator"),
+    ],
+)
+def test_unknown_kind_is_told_with_the_nearest(name: str, error: str) -> None:
+    with pytest.raises(ConfigurationError, match=error):
+        describe(name)
+
+
 def test_stranger_is_refused_with_both_catalogues() -> None:
     dut = CatalogueDevice(FramedLink(MemoryWire(1, catalogue_hash=0xDEADBEEF)), InprocDevice(name="bob"))
     with pytest.raises(

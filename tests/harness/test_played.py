@@ -53,4 +53,4 @@ def test_rate_counts_the_same_play_once_and_says_how_many_samples_it_takes() -> 
     again = Played(made_run(np.zeros(1000), [(0, FRONT)]))
     finding = rate_below(1e-5, [once, again], confidence=0.999)
     assert finding.why.startswith(rate_below(1e-5, [once], confidence=0.999).why)
-    assert finding.why.endswith("allowed 1e-05: with so many alarms that takes 690773 samples")
+    assert finding.why.endswith("; to show 1e-05 with so many alarms takes 690773 samples")

@@ -66,7 +66,9 @@ def test_late_alarm_fails_and_names_its_deadline() -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[500]))
     assert verdict.tweaks[0].late
     assert verdict.outcome == "failed"
-    assert "K at 400 was detected after 100 samples, later than" in verdict.reasons[0]
+    deadline = f"later than its deadline of {verdict.tweaks[0].deadline_n} samples (bound "
+    assert f"K at 400 was detected after 100 samples, {deadline}" in verdict.reasons[0]
+    assert verdict.reasons[0].endswith("; [expect] late_information_ratio = 4, late_slack_n = 15)")
 
 
 def test_scenario_sets_the_limits_of_missed_changes_and_false_alarms() -> None:
@@ -86,7 +88,7 @@ def test_bound_assumes_the_arl0_of_the_trigger() -> None:
     ("changes", "reason"),
     [
         ({"faults": ("device host: gone",)}, "device host: gone"),
-        ({"samples_asked": 900}, "the run ended after 800 of 900 samples"),
+        ({"samples_asked": 900}, "the run ended after 800 of 900 samples: the rig, recording or log gave no more"),
         ({"clipped": np.arange(800) % 3 == 0}, "267 of 800 samples were clipped"),
     ],
     ids=["fault", "short", "clipped"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,9 @@ from analogrig.trust import Thing, Trust, file_of, folder_of
 
 _FOUND_OUT = ("identity", "datasheet")
 """Tables of a record that the device, once opened, adds to its description."""
+
+_WORD = re.compile(r"[\w-]{1,40}")
+"""Name of a kind or a shipped device."""
 
 _ELF = b"\x7fELF"
 """First bytes of libraries, programs and firmware."""
@@ -79,6 +83,7 @@ def _read(name: str) -> tuple[DeviceDescription, str]:
             return KINDS[kind].from_name(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
         except ValueError as error:  # of the description of another package
             raise ConfigurationError(f"{name}: {error}") from error
+    _check_known(name, kind)
     _check_not_compiled(name)
     path = config.locate("devices", name)
     description = from_table({"name": path.stem, **config.read_toml(path)}, str(path))
@@ -86,6 +91,16 @@ def _read(name: str) -> tuple[DeviceDescription, str]:
         return description.placed(path.parent), str(path)
     except ConfigurationError as error:  # of a second file that the description names
         raise ConfigurationError(f"{path}: {error}") from error
+
+
+def _check_known(name: str, kind: str) -> None:
+    """:raises ConfigurationError: the name is like that of a kind or a shipped device, and there is none."""
+    known = dict.fromkeys([*KINDS, *config.names("devices")])
+    if _WORD.fullmatch(kind) and kind not in config.names("devices") and not os.path.exists(name):  # noqa: PTH110 - of any length
+        hint = config.suggest(kind, known)
+        raise ConfigurationError(
+            f"no device is called {kind!r}{hint or ':'} there are {', '.join(known)}, or give a .toml file"
+        )
 
 
 def _check_not_compiled(name: str) -> None:

@@ -28,6 +28,8 @@ _EXAMINED_SAMPLES = 4000
 
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences of advice, the most severe first; empty if there is nothing to advise."""
+    if not run.samples:
+        return ()
     return (
         *_statement(run),
         *_unjudged_quantities(verdict),

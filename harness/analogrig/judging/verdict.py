@@ -455,12 +455,14 @@ def invalid_reasons(run: Run, shown: Exposure, expect: Expectations) -> list[str
     """Reasons that a run with the exposure ``shown`` permits no verdict; empty if it is valid."""
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
-        reasons.append(f"the run ended after {run.samples} of {number_of(run.conditions.samples_asked, 'sample')}")
+        cause = "" if reasons else ": the rig, recording or log gave no more"
+        asked = number_of(run.conditions.samples_asked, "sample")
+        reasons.append(f"the run ended after {run.samples} of {asked}{cause}")
     reasons += _loss_reasons(run)
     refused = run.conditions.counters.get("refused", 0)
     reasons += [f"the device refused {number_of(refused, 'sample')}"] if refused else []
     reasons += expect.excess_missing(run.samples, int(np.count_nonzero(run.missing)), missing_text(run))
-    return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence else [])
+    return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence and run.samples else [])
 
 
 def _loss_reasons(run: Run) -> list[str]:
@@ -494,7 +496,8 @@ def _failure_reasons(
         reasons.append(f"missed {len(missed)} of {of} ({names}), at most {expect.missed} expected")
     reasons += [
         f"{tweak.what} at {tweak.sample} was detected after {number_of(tweak.latency_n or 0, 'sample')},"
-        f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
+        f" later than its deadline of {number_of(tweak.deadline_n or 0, 'sample')} (bound {tweak.bound_n}; [expect]"
+        f" late_information_ratio = {expect.late_information_ratio:g}, late_slack_n = {expect.late_slack_n})"
         for tweak in judged
         if tweak.late
     ]

@@ -232,7 +232,10 @@ def _load_config(given: dict[str, Any], context: str | None) -> dict[str, Any]:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         interface = given.get("interface")
         if interface is not None:
-            raise ConfigurationError(f"can:{interface}: python-can knows {known}, and no {interface!r}") from error
+            hint = suggest(str(interface), can.VALID_INTERFACES)
+            raise ConfigurationError(
+                f"can:{interface}: python-can knows {known}, and no {interface!r}{hint}"
+            ) from error
         suffix, section = ("", "") if context is None else (f"_{context}", f" [{context}]")
         raise ConfigurationError(
             "can: no interface given: use can:virtual or can:socketcan/can0, or set it in python-can's own"

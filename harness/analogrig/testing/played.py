@@ -217,10 +217,10 @@ def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Find
         return Finding(holds=False, why=f"no alarm could be raised in any of {number_of(len(plays), 'play')}: {why}")
     bound = upper_rate(events, samples, confidence)
     why = f"{number_of(events, 'false alarm')} in {number_of(samples, 'sample')}"
-    why += f": below {bound:.3g} a sample with {confidence:.4%} confidence"
+    why += f": the rate is below {bound:.3g} per sample with {confidence:.4%} confidence"
     if bound > rate:
         needed = Design(rate=rate, confidence=confidence, allowed=events).trials
-        why += f", allowed {rate:g}: with so many alarms that takes {needed} samples"
+        why += f"; to show {rate:g} with so many alarms takes {number_of(needed, 'sample')}"
     return Finding(bound <= rate, why)
 
 

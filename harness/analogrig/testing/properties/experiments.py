@@ -142,7 +142,7 @@ def false_alarms_of_plants_rarer(
         raise Inconclusive(nothing)
     count, samples = sum(map(len, alarms)), sum(each.armed for each in shown)
     low = lower_rate(count, samples, confidence)
-    why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
+    why = f"{count} false alarms in {samples} samples: the rate is at least {low:.2g} per sample, allowed {rate:g}"
     if _MOST_UNARMED * samples < plants * samples_each:
         raise Inconclusive(f"the trigger was armed in {samples} of {plants * samples_each} samples")
     if low <= rate:
@@ -166,7 +166,7 @@ def rare_false_alarms_rarer(
         pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
     rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
     low, high = mean_bounds(rates, confidence)
-    why = f"{np.mean(rates):.2g} false alarms a sample, {low:.2g} to {high:.2g}, allowed {rate:g}"
+    why = f"{np.mean(rates):.2g} false alarms per sample (between {low:.2g} and {high:.2g}), allowed {rate:g}"
     if low <= rate:
         return Finding(holds=True, why=why)
     return _witness(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)
