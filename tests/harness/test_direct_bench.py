@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from analogrig.answers import Samples
 from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_bench
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.opening import open_dut
@@ -62,6 +63,25 @@ def test_alarms_alone_are_those_of_the_run_across_blocks() -> None:
         assert len(run.alarm_index) >= len(late)
         for name in ("alarm_index", "alarm_kind", "alarm_statistic", "codes", "statistic", "innovation", "flags"):
             assert getattr(run, name).tobytes() == getattr(whole, name).tobytes()
+
+
+def test_skipped_indices_are_missing_samples_as_over_a_line() -> None:
+    draw = np.random.default_rng(5)
+    u, y = (draw.integers(1000, 3000, 400).astype(np.uint16) for _ in range(2))
+    blocks = [
+        Samples(first, u[first:to], y[first:to], np.ones(to - first, np.bool_)) for first, to in ((0, 100), (130, 400))
+    ]
+    description = describe("inproc?exchange=block")
+    with description.connect() as line, description.direct() as direct:
+        for device in (line, direct):
+            device.start()
+        for theirs, ours in zip(line.play(blocks), direct.play(blocks), strict=True):
+            for name in ("theta", "innovation", "statistic"):
+                assert np.array_equal(getattr(ours, name), getattr(theirs, name))
+        assert direct.stop()["missing"] == line.stop()["missing"] == 30
+        direct.start()
+        with pytest.raises(ValueError, match="sample 99 comes again: the next one is 100"):
+            list(direct.play([blocks[0], dataclasses.replace(blocks[1], first=99)]))
 
 
 def test_rig_that_fails_within_a_play_ends_the_run_and_not_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from analogrig.answers import Answers, RaisedAlarm, Samples
 from analogrig.catalogue import Trigger
 from analogrig.datasheet import Datasheet
@@ -35,6 +37,7 @@ class DirectDevice(Device):
         self._description: CatalogueDescription = description
         self._as_opened = description.estimator
         self._alarms_only = alarms_only
+        self._next_index = 0
         self.configure()
 
     @property
@@ -68,9 +71,14 @@ class DirectDevice(Device):
 
     def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
         self._estimator.restart()
+        self._next_index = 0
 
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         for block in blocks:
+            if skipped_n := block.skipped_after(self._next_index):
+                nothing = np.zeros(skipped_n, np.uint16)
+                self._estimator.run(nothing, nothing, np.zeros(skipped_n, np.bool_), with_theta=False)
+            self._next_index = block.first + len(block)
             steps = self._estimator.run(block.u, block.y, block.valid, with_theta=not self._alarms_only)
             indices = steps.alarms.tolist()
             statistics = steps.statistic[steps.alarms].tolist()
