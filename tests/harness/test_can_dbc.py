@@ -30,6 +30,7 @@ from analogrig.recordings import WRITTEN, CanLog, import_run
 from analogrig.rigs.description import open_rig
 from analogrig.run import LOST, UNARMED, UNREPORTED, Run
 from analogrig.scenario import Scenario
+from analogrig.testing.counterexample import Counterexample
 from tests.harness.scripted_ecu import DBC, Answer, ScriptedEcu, write
 
 THESIS_HASH = "2ba8713bf6ac34db"
@@ -589,6 +590,15 @@ def test_file_may_not_open_a_real_bus_unless_allowed(file: Path) -> None:
     )
     with pytest.raises(ConfigurationError, match="--allow|allow="):
         open_dut(str(file))
+
+
+def test_only_the_tests_can_play_again_through_a_device_in_their_process(file: Path) -> None:
+    run = played(file)
+    scenario = Path("runs/it/scenario.toml")
+    assert Counterexample(run).command(scenario) == "pytest runs/it/scenario.toml --hil-scenario-dir runs/it"
+    conditions = dataclasses.replace(run.conditions, dut={**run.conditions.dut, "interface": "slcan"})
+    elsewhere = Counterexample(dataclasses.replace(run, conditions=conditions))
+    assert elsewhere.command(scenario).startswith("analogrig run --scenario runs/it/scenario.toml --dut runs/it/dut")
 
 
 def test_units_of_the_channel_are_checked_against_the_rig(file: Path) -> None:

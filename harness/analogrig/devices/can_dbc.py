@@ -130,6 +130,10 @@ class CanDbcDevice(CanBusDescription, AdaptedDescription):
         return self.bus_name
 
     @property
+    def is_private(self) -> bool:
+        return self.interface == "virtual"
+
+    @property
     def capabilities(self) -> frozenset[Capability]:
         return frozenset({"pace"})
 

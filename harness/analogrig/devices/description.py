@@ -181,6 +181,11 @@ class DeviceDescription:
         """Name of the port or bus that two processes cannot share; empty if each can start a device of its own."""
         return ""
 
+    @property
+    def is_private(self) -> bool:
+        """True if only this process reaches the device: it is an object at the other end of a virtual bus."""
+        return False
+
     def as_table(self) -> dict[str, Any]:
         """Plain values; ``registry.from_table`` is the inverse."""
         table = {"kind": self.kind, **dataclasses.asdict(self)}

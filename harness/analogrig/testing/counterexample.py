@@ -42,7 +42,9 @@ class Counterexample:
 
     def command(self, scenario: Path) -> str:
         """Command that plays the run again from its scenario file, and from its device file if the device has no
-        name."""
+        name. A device that only the process of the tests reaches needs pytest."""
+        if self.is_private:
+            return self._pytest(scenario, scenario.parent)
         words = ["analogrig", "run", "--scenario", str(scenario)]
         if self.seed not in (None, self.run.conditions.seed):
             words += ["--seed", str(self.run.conditions.seed)]
@@ -52,8 +54,16 @@ class Counterexample:
 
     def suite_command(self, folder: Path) -> str:
         """Command that judges the play again as a test, and allows the things that the files name."""
+        return self._pytest(folder, folder)
+
+    @property
+    def is_private(self) -> bool:
+        """True if no other process reaches the device."""
+        return recorded(self.run.conditions.dut).is_private
+
+    def _pytest(self, what: Path, folder: Path) -> str:
         options = self._options("--hil-allow", with_device=True)
-        return shlex.join(["pytest", str(folder), "--hil-scenario-dir", str(folder), *options])
+        return shlex.join(["pytest", str(what), "--hil-scenario-dir", str(folder), *options])
 
     def _options(self, allow: str, *, with_device: bool) -> list[str]:
         """Options that allow the things which the files of the counterexample name."""

@@ -214,7 +214,7 @@ def write_counterexample(item: pytest.Item) -> str:
     except _write_errors() as error:
         return "\n".join([*lines, f"its recording could not be written to {folder}: {error}"])
     lines.append(f"recording and scenario: {folder}")
-    if counterexample.statement is not None:
+    if counterexample.statement is not None and not counterexample.is_private:
         lines.append(f"judge it again with: {counterexample.suite_command(folder)}")
     return "\n".join([*lines, f"play it again with: {counterexample.command(folder / SCENARIO_FILE)}"])
 
