@@ -62,6 +62,10 @@ _ENVIRONMENT_BYTES = 64
 _STATE_ALIGNMENT = 64
 
 
+def _is_broken(canary: NDArray[np.uint8]) -> bool:
+    return canary.tobytes() != _CANARY.tobytes()  # in a third of the time of a comparison of arrays
+
+
 class Reports(enum.IntFlag):
     """Flags of analogrig_about_t.reports."""
 
@@ -128,7 +132,7 @@ class _Slot:
 
     def is_overrun(self, n: int) -> bool:
         """True if something was written behind the last of ``n`` records."""
-        return bool((self._behind(n) != _CANARY).any())
+        return _is_broken(self._behind(n))
 
     def _behind(self, n: int) -> NDArray[np.uint8]:
         end = n * self.records.itemsize
@@ -459,7 +463,7 @@ class InProcessHost(LibraryHost):
         self._check_state(call, is_overrun=self._overruns[self._taken % SLOTS])
 
     def _is_overrun(self) -> bool:
-        return bool((self._canary != _CANARY).any())
+        return _is_broken(self._canary)
 
 
 class _About(ctypes.Structure):
