@@ -46,8 +46,10 @@
 /// processor can overlap them.
 #define LEAP 4
 
-/// Terms of the Taylor series of the exponential over the shortest step of a mode.
+/// Terms of the Taylor series of the exponential over the shortest step of a mode. With |A t| <= TAYLOR_NORM they leave 1e-16
+/// of the first one.
 #define TERMS 14
+#define TAYLOR_NORM 0.5
 
 /// Level of the shortest step near a bound that is not crossed: 1/64 of a sample period, with a look at its middle.
 /// Anything faster was set off by an event just before, and after an event the steps grow from the shortest one.
@@ -66,7 +68,10 @@ typedef struct {
     int     row[ENGINE_MAX_STATES];
     double* change;  // of s in one sample period
     double* leap;    // of s in LEAP sample periods
-    double* ladder;  // changes of s in 2^level ticks, for every level
+    int     base;    // |change of s| is so small in 2^base ticks that a series gives it
+    int     count;   // of the terms of that series
+    double* terms;   // of that series, as series_pack() stores them
+    double* ladder;  // changes of s in 2^level ticks, for levels from base on
     double* state;   // x
     double* first;   // s 2^least_level ticks after an event, over the z of that event
     double* w;
@@ -89,7 +94,7 @@ typedef struct {
     double*       ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels base .. top, states only
     double*       looks;     // panelled w over the z of 2^level ticks before, for the same levels
     double*       change;    // the matrix of level `top`, row-major
-    double*       terms;     // panelled terms ([A B c] h)^k / k! of the series for k = 1 .. TERMS, below one another
+    double*       terms;     // ([A B c] h)^k / k! for k = 1 .. TERMS, as series_pack() stores them
     double*       readings;  // panelled w and y over z; used if phi feeds one of them
     slow_t        slow;
     bool          has_slow;
@@ -127,9 +132,6 @@ typedef struct {
     /// to = factor to + gain from; count is a multiple of PANEL.
     void (*add)(int count, double factor, const double* from, double gain, double* to);
 
-    /// z += the sum of part^k terms[k - 1] for k = 1 .. terms; rows is a multiple of PANEL.
-    void (*sum)(int rows, int stride, int terms, const double* term, double part, double* z);
-
     /// Set w_there = matrix z, and judge it as the end of a step. growth: its length over that of the step before; 0 if
     /// there is none.
     judgement_t (*look)(engine_t* self, int columns, const double* panels, const double* z, double growth);
@@ -155,7 +157,7 @@ struct engine {
     double  z[PADDED(MAX_COLUMNS)];  // [x u 1] now; without x in a stretch of slow states
     int64_t origin;                  // tick of the last event, edge or new circuit
     double  origin_z[PADDED(MAX_COLUMNS)];
-    int64_t clear;                   // no event comes up to this tick; NO_END in a quiet stretch
+    int64_t clear;                   // no event comes up to this tick; NO_END in a quiet stretch and at its end
     int64_t stride;                  // ticks from w_before to w; 0 if w has a kink between
     int     look;                    // level of the next look from the origin; above TOP_LEVEL if there is none
     double *w, *w_before, *w_there;  // arguments of the kinks: at `clear`, a stride earlier, at the end of a step
@@ -220,6 +222,13 @@ static inline void copy_z(const engine_t* self, const double* from, double* to) 
 /// The inner loops for this processor.
 const kernels_t* kernels_find(void);
 
+/// Store term k of a series, counted from 0, such that the product of all `count` of them with z is a panelled matrix of
+/// rows x count.
+void series_pack(int rows, int columns, int stride, const double* term, int k, int count, double* terms);
+
+/// z += the series whose terms at z are a panelled matrix of rows x count, at a part of its step.
+void series_sum(const kernels_t* kernels, int rows, int count, const double* terms, double part, double* z);
+
 /// Cut a row-major matrix into panels. Rows beyond the last are zero.
 void panels_pack(int rows, int columns, int stride, const double* matrix, double* panels);
 
@@ -250,7 +259,7 @@ void ladder_reach(engine_t* self, int level);
 /// Advance z by a number of ticks of the present mode, at most one sample period.
 void ladder_move(engine_t* self, int64_t ticks, double* z);
 
-/// The terms of the series at z: TERMS rows of states, padded to whole panels.
+/// The terms of the series at z: a panelled matrix of states x TERMS.
 void ladder_expand(const engine_t* self, const double* z, double* terms);
 
 /// Advance z by a number of ticks within a shortest step, forwards or backwards, by the terms at z.
@@ -288,9 +297,6 @@ bool events_look_until(engine_t* self, int64_t tick);
 
 /// Advance `clear` to a tick, at which w is panels z. Return false if w could have left its bounds on the way.
 bool events_extend(engine_t* self, int64_t tick, int columns, const double* panels, const double* z);
-
-/// Go on with steps from z and the present instant.
-void events_resume(engine_t* self);
 
 /// Advance the slow states towards a tick. Return false if they do not suffice: z holds the state then, and `now` may lie
 /// before the tick.

@@ -34,15 +34,16 @@ static void measure(const engine_t* const self, const double* z) {
     self->kernels->multiply(self->kinks, self->columns, self->w_panels, z, self->w_there);
 }
 
-void events_resume(engine_t* const self) {
+/// Go on with steps from z and the present instant, at the end of a quiet stretch.
+static void resume(engine_t* const self) {
     measure(self, self->z);
     step_accept(self, 0);
     self->clear = self->now;
     self->look  = NO_LOOK;
 }
 
-static bool is_beyond(const engine_t* const self, int kink) {
-    return !(self->w_there[kink] >= self->lower[kink] && self->w_there[kink] <= self->upper[kink]);
+static bool is_beyond(const engine_t* const self, int kink, double w) {
+    return !(w >= self->lower[kink] && w <= self->upper[kink]);
 }
 
 // ---------------------------------------------       CROSSINGS        ---------------------------------------------
@@ -90,15 +91,20 @@ static double guess_tick(const engine_t* const self, const crossing_t* crossing,
 
 /// Improve a guess by Newton's method on the series at a place. Return true if it has converged within a shortest step.
 static bool improve_guess(const engine_t* const self, const crossing_t* crossing, const place_t* place, double* guess) {
-    const int     n = self->states, rows = PADDED(n);
     const double* row  = row_of(self, crossing->kink);
     const double  step = (double)(INT64_C(1) << self->mode->base);
     double        excess[TERMS + 1], part = (*guess - (double)place->tick) / step;
+    double        gain[PADDED(ENGINE_MAX_STATES)] = { 0.0 };
+    for (int j = 0; j < self->states; j++) {
+        gain[j] = crossing->sign * row[j * PANEL];
+    }
     excess[0] = compute_excess(self, crossing, place->z);
     for (int k = 0; k < TERMS; k++) {
         excess[k + 1] = 0.0;
-        for (int j = 0; j < n; j++) {
-            excess[k + 1] += crossing->sign * row[j * PANEL] * place->terms[k * rows + j];
+        for (int j = 0; j < self->states; j += PANEL) {
+            const double* term = &place->terms[j * TERMS + k * PANEL];
+            const double* by   = &gain[j];
+            excess[k + 1]      = excess[k + 1] + by[0] * term[0] + by[1] * term[1] + by[2] * term[2] + by[3] * term[3];
         }
     }
     for (int i = 0; i < NEWTON_STEPS; i++) {
@@ -164,7 +170,7 @@ static engine_status_t cross(engine_t* const self, int64_t ticks) {
     double z[PADDED(MAX_COLUMNS)], end[PADDED(MAX_COLUMNS)] = { 0.0 };
     bool   has_end = false;
     for (int k = 0; k < self->kinks; k++) {
-        if (found[k] || !is_beyond(self, k)) {
+        if (found[k] || !is_beyond(self, k, self->w_there[k])) {
             continue;
         }
         const bool       above = self->w_there[k] > self->upper[k];
@@ -195,17 +201,16 @@ static engine_status_t cross(engine_t* const self, int64_t ticks) {
 
 /// True if an argument is beyond its bound so many ticks after `from`. w_there is then there.
 static bool crosses_within(engine_t* const self, const double* from, int64_t ticks) {
-    double z[PADDED(MAX_COLUMNS)], end[PADDED(ENGINE_MAX_KINKS)];
+    double z[PADDED(MAX_COLUMNS)], w[PADDED(ENGINE_MAX_KINKS)];
     copy_z(self, from, z);
     ladder_move(self, ticks, z);
-    memcpy(end, self->w_there, sizeof end);
-    measure(self, z);
+    self->kernels->multiply(self->kinks, self->columns, self->w_panels, z, w);
     for (int k = 0; k < self->kinks; k++) {
-        if (is_beyond(self, k)) {
+        if (is_beyond(self, k, w[k])) {
+            memcpy(self->w_there, w, (size_t)self->kinks * sizeof w[0]);
             return true;
         }
     }
-    memcpy(self->w_there, end, sizeof end);
     return false;
 }
 
@@ -301,6 +306,9 @@ static bool step_over(engine_t* const self, int64_t tick) {
 engine_status_t events_advance(engine_t* const self, int64_t tick) {
     int64_t     ticks;
     judgement_t judgement;
+    if (self->clear == NO_END && self->kinks > 0) {
+        resume(self);
+    }
     while ((judgement = search(self, tick, &ticks)) != CLEAR) {
         if (self->look > TOP_LEVEL && self->now < self->clear && step_over(self, tick)) {
             return ENGINE_OK;

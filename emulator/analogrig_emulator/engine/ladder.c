@@ -5,8 +5,6 @@
 
 #include <string.h>
 
-/// TERMS terms of |A t| <= 1/2 leave 1e-16 of the first one.
-#define TAYLOR_NORM 0.5
 #define MAX_HALVINGS 40
 
 /// The longest of the shortest steps: its middle is looked at as well.
@@ -30,19 +28,18 @@ engine_status_t ladder_plan(const engine_t* const self, const double* a, int* ba
     return rate <= TAYLOR_NORM * (double)(INT64_C(1) << MAX_HALVINGS) ? ENGINE_OK : ENGINE_TOO_STIFF;
 }
 
-/// f = exp(a) - I, with the terms of its series packed one below the other.
+/// f = exp(a) - I, with the terms of its series.
 static void sum_terms(const engine_t* const self, const double* a, double* terms, double* f) {
-    const int n = self->states, columns = self->columns, stride = PADDED(columns),
-              elements = PANEL_ELEMENTS(n, columns);
-    double term[MAX_ELEMENTS], next[MAX_ELEMENTS];
+    const int n = self->states, columns = self->columns, stride = PADDED(columns);
+    double    term[MAX_ELEMENTS], next[MAX_ELEMENTS];
     memcpy(term, a, (size_t)(n * stride) * sizeof term[0]);
     memcpy(f, a, (size_t)(n * stride) * sizeof f[0]);
-    panels_pack(n, columns, stride, term, terms);
+    series_pack(n, columns, stride, term, 0, TERMS, terms);
     for (int k = 2; k <= TERMS; k++) {
         self->kernels->compose(n, n, stride, a, term, next);
         self->kernels->add(n * stride, 0.0, next, 1.0 / (double)k, term);
         self->kernels->add(n * stride, 1.0, term, 1.0, f);
-        panels_pack(n, columns, stride, term, &terms[(k - 1) * elements]);
+        series_pack(n, columns, stride, term, k - 1, TERMS, terms);
     }
 }
 
@@ -94,12 +91,7 @@ void ladder_expand(const engine_t* const self, const double* z, double* terms) {
 }
 
 void ladder_sum(const engine_t* const self, const double* terms, int64_t ticks, double* z) {
-    const double part = (double)ticks / (double)(INT64_C(1) << self->mode->base);
-    const int    rows = PADDED(self->states);
-    double       x[PADDED(ENGINE_MAX_STATES)];
-    memcpy(x, z, (size_t)self->states * sizeof x[0]);
-    self->kernels->sum(rows, rows, TERMS, terms, part, x);
-    memcpy(z, x, (size_t)self->states * sizeof x[0]);
+    series_sum(self->kernels, self->states, TERMS, terms, (double)ticks / (double)(INT64_C(1) << self->mode->base), z);
 }
 
 void ladder_move(engine_t* const self, int64_t ticks, double* z) {

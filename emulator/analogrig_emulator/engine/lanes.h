@@ -11,50 +11,93 @@
 typedef double lanes_t __attribute__((vector_size(LANES * sizeof(double)), aligned(sizeof(double)), may_alias));
 typedef __typeof__((lanes_t){ 0.0 } > (lanes_t){ 0.0 }) mask_t;
 
-/// Products of two panels, or of one and itself, with z: `low` and `high` are the halves of a panel, or `low` is all of it.
+/// One panel of a product with z: `low` and `high` are its halves, or `low` is all of it.
 typedef struct {
-    lanes_t low, high, next_low, next_high;
-} KERNEL(products_t);
+    lanes_t low, high;
+} KERNEL(part_t);
 
-INLINE KERNEL(products_t) KERNEL(product)(int columns, const double* panel, const double* next, const double* z) {
-    KERNEL(products_t) sum = { { 0.0 }, { 0.0 }, { 0.0 }, { 0.0 } };
-    for (int j = 0; j < columns; j++) {
-        sum.low += *(const lanes_t*)&panel[j * PANEL] * z[j];
-        sum.next_low += *(const lanes_t*)&next[j * PANEL] * z[j];
-        if (LANES < PANEL) {
-            sum.high += *(const lanes_t*)&panel[j * PANEL + PANEL - LANES] * z[j];
-            sum.next_high += *(const lanes_t*)&next[j * PANEL + PANEL - LANES] * z[j];
-        }
+typedef struct {
+    KERNEL(part_t) first, second, third, fourth;
+} KERNEL(parts_t);
+
+INLINE void KERNEL(add_column)(const double* column, double factor, KERNEL(part_t) * sum) {
+    sum->low += *(const lanes_t*)column * factor;
+    if (LANES < PANEL) {
+        sum->high += *(const lanes_t*)&column[PANEL - LANES] * factor;
+    }
+}
+
+/// Add one column of up to four panels. `next` elements lie between two of them.
+INLINE void
+KERNEL(add_columns)(int panels, ptrdiff_t next, const double* column, double factor, KERNEL(parts_t) * sum) {
+    KERNEL(add_column)(column, factor, &sum->first);
+    if (panels > 1) {
+        KERNEL(add_column)(&column[next], factor, &sum->second);
+    }
+    if (panels > 2) {
+        KERNEL(add_column)(&column[2 * next], factor, &sum->third);
+    }
+    if (panels > 3) {
+        KERNEL(add_column)(&column[3 * next], factor, &sum->fourth);
+    }
+}
+
+/// Products of one to four panels with z. Several sums at a time hide the latency of each.
+INLINE KERNEL(parts_t) KERNEL(product)(int panels, int columns, const double* panel, const double* z) {
+    const lanes_t zero       = { 0.0 };
+    KERNEL(parts_t) sum      = { { zero, zero }, { zero, zero }, { zero, zero }, { zero, zero } };
+    const ptrdiff_t     next = PANEL * (ptrdiff_t)columns;
+    const double* const end  = &z[columns - 1];
+    for (; z < end; z += 2, panel += 2 * PANEL) {
+        KERNEL(add_columns)(panels, next, panel, z[0], &sum);
+        KERNEL(add_columns)(panels, next, &panel[PANEL], z[1], &sum);
+    }
+    if (z == end) {
+        KERNEL(add_columns)(panels, next, panel, z[0], &sum);
     }
     return sum;
 }
 
-INLINE void KERNEL(store)(lanes_t low, lanes_t high, double* out) {
-    *(lanes_t*)out = low;
+INLINE void KERNEL(store)(KERNEL(part_t) part, double* out) {
+    *(lanes_t*)out = part.low;
     if (LANES < PANEL) {
-        *(lanes_t*)&out[PANEL - LANES] = high;
+        *(lanes_t*)&out[PANEL - LANES] = part.high;
+    }
+}
+
+INLINE void KERNEL(multiply_part)(
+    int panels, int columns, const double* restrict panel, const double* restrict z, double* restrict out) {
+    const KERNEL(parts_t) sum = KERNEL(product)(panels, columns, panel, z);
+    KERNEL(store)(sum.first, out);
+    if (panels > 1) {
+        KERNEL(store)(sum.second, &out[PANEL]);
+    }
+    if (panels > 2) {
+        KERNEL(store)(sum.third, &out[2 * PANEL]);
+    }
+    if (panels > 3) {
+        KERNEL(store)(sum.fourth, &out[3 * PANEL]);
     }
 }
 
 TARGET static void
 KERNEL(multiply)(int rows, int columns, const double* restrict panels, const double* restrict z, double* restrict out) {
-    int i = 0;
-    for (; i + PANEL < rows; i += 2 * PANEL, panels += 2 * PANEL * columns) {
-        const KERNEL(products_t) sum = KERNEL(product)(columns, panels, &panels[PANEL * columns], z);
-        KERNEL(store)(sum.low, sum.high, &out[i]);
-        KERNEL(store)(sum.next_low, sum.next_high, &out[i + PANEL]);
+    for (; rows > 3 * PANEL; rows -= 4 * PANEL, panels += 4 * PANEL * columns, out += 4 * PANEL) {
+        KERNEL(multiply_part)(4, columns, panels, z, out);
     }
-    if (i < rows) {
-        const KERNEL(products_t) sum = KERNEL(product)(columns, panels, panels, z);
-        KERNEL(store)(sum.low, sum.high, &out[i]);
+    if (rows > 2 * PANEL) {
+        KERNEL(multiply_part)(3, columns, panels, z, out);
+    } else if (rows > PANEL) {
+        KERNEL(multiply_part)(2, columns, panels, z, out);
+    } else if (rows > 0) {
+        KERNEL(multiply_part)(1, columns, panels, z, out);
     }
 }
 
 TARGET static void KERNEL(advance)(int rows, int columns, const double* restrict panels, double* restrict z) {
     double change[PADDED(ENGINE_MAX_STATES)];
     if (rows <= PANEL) {
-        const KERNEL(products_t) sum = KERNEL(product)(columns, panels, panels, z);
-        KERNEL(store)(sum.low, sum.high, change);
+        KERNEL(multiply_part)(1, columns, panels, z, change);
     } else {
         KERNEL(multiply)(rows, columns, panels, z, change);
     }
@@ -94,19 +137,12 @@ KERNEL(add)(int count, double factor, const double* restrict from, double gain, 
     }
 }
 
-TARGET static void
-KERNEL(sum)(int rows, int stride, int terms, const double* restrict term, double part, double* restrict z) {
-    for (int i = 0; i < rows; i += LANES) {
-        lanes_t sum = { 0.0 };
-        for (int k = terms - 1; k >= 0; k--) {
-            sum = (sum + *(const lanes_t*)&term[k * stride + i]) * part;
-        }
-        *(lanes_t*)&z[i] += sum;
-    }
+INLINE bool KERNEL(is_any)(mask_t mask) {
+    return LANES == 2 ? (mask[0] | mask[1]) != 0 : (mask[0] | mask[1] | mask[LANES - 2] | mask[LANES - 1]) != 0;
 }
 
 /// Part of look() for one group of lanes. w1: arguments at the end of the step.
-INLINE void KERNEL(judge)(const engine_t* self, int k, lanes_t w1, double growth, mask_t* inside, mask_t* near) {
+INLINE void KERNEL(judge_lanes)(const engine_t* self, int k, lanes_t w1, double growth, mask_t* inside, mask_t* near) {
     const lanes_t zero    = { 0.0 };
     const mask_t  no_sign = ~(mask_t)-zero;
     const lanes_t w0 = *(const lanes_t*)&self->w[k], before = *(const lanes_t*)&self->w_before[k];
@@ -114,10 +150,41 @@ INLINE void KERNEL(judge)(const engine_t* self, int k, lanes_t w1, double growth
     const lanes_t change   = (lanes_t)((mask_t)(w1 - w0) & no_sign);
     const lanes_t expected = (lanes_t)((mask_t)(w0 - before) & no_sign) * growth;
     const lanes_t both = w0 + w1, far = 3.0 * change, fast = change + 2.0 * expected;
+    const mask_t  farther = far > fast;
+    const lanes_t stray   = (lanes_t)(((mask_t)far & farther) | ((mask_t)fast & ~farther));
     *inside &= (w1 >= lower) & (w1 <= upper);
-    *near |= (both + far > 2.0 * upper) | (both - far < 2.0 * lower);
-    *near |= (both + fast > 2.0 * upper) | (both - fast < 2.0 * lower);
+    *near |= (both + stray > 2.0 * upper) | (both - stray < 2.0 * lower);
     *(lanes_t*)&self->w_there[k] = w1;
+}
+
+INLINE void KERNEL(judge)(const engine_t* self, int k, KERNEL(part_t) w1, double growth, mask_t* inside, mask_t* near) {
+    KERNEL(judge_lanes)(self, k, w1.low, growth, inside, near);
+    if (LANES < PANEL) {
+        KERNEL(judge_lanes)(self, k + PANEL - LANES, w1.high, growth, inside, near);
+    }
+}
+
+/// Part of look() for one to four panels from kink k on.
+INLINE void KERNEL(look_part)(const engine_t* self,
+                              int             panels,
+                              int             columns,
+                              int             k,
+                              const double* restrict panel,
+                              const double* restrict z,
+                              double  growth,
+                              mask_t* inside,
+                              mask_t* near) {
+    const KERNEL(parts_t) sum = KERNEL(product)(panels, columns, panel, z);
+    KERNEL(judge)(self, k, sum.first, growth, inside, near);
+    if (panels > 1) {
+        KERNEL(judge)(self, k + PANEL, sum.second, growth, inside, near);
+    }
+    if (panels > 2) {
+        KERNEL(judge)(self, k + 2 * PANEL, sum.third, growth, inside, near);
+    }
+    if (panels > 3) {
+        KERNEL(judge)(self, k + 3 * PANEL, sum.fourth, growth, inside, near);
+    }
 }
 
 INLINE judgement_t KERNEL(look_once)(
@@ -125,28 +192,17 @@ INLINE judgement_t KERNEL(look_once)(
     const lanes_t zero   = { 0.0 };
     mask_t        inside = zero <= zero, near = zero > zero;
     int           k = 0;
-    for (; k + PANEL < self->kinks; k += 2 * PANEL, panels += 2 * PANEL * columns) {
-        const KERNEL(products_t) sum = KERNEL(product)(columns, panels, &panels[PANEL * columns], z);
-        KERNEL(judge)(self, k, sum.low, growth, &inside, &near);
-        KERNEL(judge)(self, k + PANEL, sum.next_low, growth, &inside, &near);
-        if (LANES < PANEL) {
-            KERNEL(judge)(self, k + PANEL - LANES, sum.high, growth, &inside, &near);
-            KERNEL(judge)(self, k + 2 * PANEL - LANES, sum.next_high, growth, &inside, &near);
-        }
+    for (; k + 3 * PANEL < self->kinks; k += 4 * PANEL, panels += 4 * PANEL * columns) {
+        KERNEL(look_part)(self, 4, columns, k, panels, z, growth, &inside, &near);
     }
-    if (k < self->kinks) {
-        const KERNEL(products_t) sum = KERNEL(product)(columns, panels, panels, z);
-        KERNEL(judge)(self, k, sum.low, growth, &inside, &near);
-        if (LANES < PANEL) {
-            KERNEL(judge)(self, k + PANEL - LANES, sum.high, growth, &inside, &near);
-        }
+    if (k + 2 * PANEL < self->kinks) {
+        KERNEL(look_part)(self, 3, columns, k, panels, z, growth, &inside, &near);
+    } else if (k + PANEL < self->kinks) {
+        KERNEL(look_part)(self, 2, columns, k, panels, z, growth, &inside, &near);
+    } else if (k < self->kinks) {
+        KERNEL(look_part)(self, 1, columns, k, panels, z, growth, &inside, &near);
     }
-    int64_t all = -1, any = 0;
-    for (int i = 0; i < LANES; i++) {
-        all &= inside[i];
-        any |= near[i];
-    }
-    return all == 0 ? CROSSED : any != 0 ? NEAR : CLEAR;
+    return !KERNEL(is_any)(near | ~inside) ? CLEAR : KERNEL(is_any)(~inside) ? CROSSED : NEAR;
 }
 
 TARGET static judgement_t
@@ -171,8 +227,8 @@ TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     return CLEAR;
 }
 
-static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose), KERNEL(add),
-                                           KERNEL(sum),      KERNEL(look),    KERNEL(look_on) };
+static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose),
+                                           KERNEL(add),      KERNEL(look),    KERNEL(look_on) };
 
 #undef INLINE
 #undef JOINED

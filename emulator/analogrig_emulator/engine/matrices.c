@@ -27,6 +27,25 @@ void panels_unpack(int rows, int columns, int stride, const double* panels, doub
     }
 }
 
+void series_pack(int rows, int columns, int stride, const double* term, int k, int count, double* terms) {
+    for (int i = 0; i < rows; i += PANEL) {
+        const int height = rows - i < PANEL ? rows - i : PANEL;
+        panels_pack(height, columns, stride, &term[i * stride], &terms[(i * count + k * PANEL) * columns]);
+    }
+}
+
+void series_sum(const kernels_t* kernels, int rows, int count, const double* terms, double part, double* z) {
+    double power[TERMS], change[PADDED(ENGINE_MAX_STATES)];
+    power[0] = part;
+    for (int k = 1; k < count; k++) {
+        power[k] = power[k - 1] * part;
+    }
+    kernels->multiply(rows, count, terms, power, change);
+    for (int i = 0; i < rows; i++) {
+        z[i] += change[i];
+    }
+}
+
 double matrix_norm(int n, int stride, const double* a) {
     double largest = 0.0;
     for (int i = 0; i < n; i++) {

@@ -20,8 +20,8 @@
 
 #define LEAP_DOUBLINGS 2
 
-/// Terms of the series for the change of the slow states in a tick, which is below 1e-5 of them.
-#define TICK_TERMS 4
+/// Size of the term after which the series of the slow states ends.
+#define TAYLOR_END 1e-18
 
 // ---------------------------------------------      SLOW STATES       ---------------------------------------------
 
@@ -249,30 +249,49 @@ static void double_change(int rank, int width, double* change) {
     }
 }
 
-/// The changes of the slow states in 2^level ticks, from their flow per second.
+/// Find the longest step over which a series gives the slow states, and the number of its terms.
+static void plan_slow_ladder(slow_t* slow, double rate) {
+    double step = rate * (double)ENGINE_TICKS_PER_SAMPLE, term = 1.0;
+    slow->base = TOP_LEVEL;
+    while (slow->base > 0 && step > TAYLOR_NORM) {
+        slow->base--;
+        step *= 0.5;
+    }
+    slow->count = 0;
+    while (slow->count < TERMS && (slow->count == 0 || term > TAYLOR_END)) {
+        slow->count++;
+        term *= step / (double)slow->count;
+    }
+}
+
+/// Build the terms and the ladder of the slow states from their flow per second.
 static void build_slow_ladder(const engine_t* const self, slow_t* slow, const double* flow) {
-    const int rank = slow->rank, width = rank + self->columns - self->states, count = rank * width;
+    const int rank = slow->rank, width = rank + self->columns - self->states, elements = PANEL_ELEMENTS(rank, width);
     double    change[ENGINE_MAX_STATES * MAX_COLUMNS], term[ENGINE_MAX_STATES * MAX_COLUMNS];
     double    next[ENGINE_MAX_STATES * MAX_COLUMNS];
-    for (int i = 0; i < count; i++) {
-        term[i] = change[i] = flow[i] * self->tick_s;
+    plan_slow_ladder(slow, matrix_norm(rank, width, flow) * self->tick_s);
+    const double step_s = self->tick_s * (double)(INT64_C(1) << slow->base);
+    for (int i = 0; i < rank * width; i++) {
+        term[i] = change[i] = flow[i] * step_s;
     }
-    for (int k = 2; k <= TICK_TERMS; k++) {
+    series_pack(rank, width, width, term, 0, slow->count, slow->terms);
+    for (int k = 2; k <= slow->count; k++) {
         for (int i = 0; i < rank; i++) {
             for (int j = 0; j < width; j++) {
                 next[i * width + j] = 0.0;
                 for (int l = 0; l < rank; l++) {
-                    next[i * width + j] += flow[i * width + l] * (self->tick_s / (double)k) * term[l * width + j];
+                    next[i * width + j] += flow[i * width + l] * (step_s / (double)k) * term[l * width + j];
                 }
             }
         }
-        memcpy(term, next, (size_t)count * sizeof term[0]);
-        for (int i = 0; i < count; i++) {
+        memcpy(term, next, (size_t)(rank * width) * sizeof term[0]);
+        for (int i = 0; i < rank * width; i++) {
             change[i] += term[i];
         }
+        series_pack(rank, width, width, term, k - 1, slow->count, slow->terms);
     }
-    for (int level = 0; level < ENGINE_LEVELS; level++) {
-        panels_pack(rank, width, width, change, &slow->ladder[level * PANEL_ELEMENTS(rank, width)]);
+    for (int level = slow->base; level < ENGINE_LEVELS; level++) {
+        panels_pack(rank, width, width, change, &slow->ladder[(level - slow->base) * elements]);
         double_change(rank, width, change);
     }
 }
@@ -382,7 +401,7 @@ static bool allocate(const engine_t* const self, slow_t* slow) {
     const int of_states = PANEL_ELEMENTS(n, columns), of_kinks = PANEL_ELEMENTS(self->kinks, columns);
     const int of_outputs = LEAP * PANEL_ELEMENTS(self->outputs, columns);
     const int of_rest = PANEL_ELEMENTS(n, constants), of_rest_w = PANEL_ELEMENTS(self->kinks, constants);
-    const int count = (ENGINE_LEVELS + 4) * of_states + of_kinks + of_outputs + of_rest + of_rest_w + n * n;
+    const int count = (ENGINE_LEVELS + TERMS + 4) * of_states + of_kinks + of_outputs + of_rest + of_rest_w + n * n;
     if (slow->block == NULL) {
         slow->block = malloc((size_t)(count + self->kinks) * sizeof(double));
     }
@@ -391,7 +410,8 @@ static bool allocate(const engine_t* const self, slow_t* slow) {
     slow->state  = slow->leap + of_states;
     slow->first  = slow->state + of_states;
     slow->ladder = slow->first + of_states;
-    slow->w      = slow->ladder + ENGINE_LEVELS * of_states;
+    slow->terms  = slow->ladder + ENGINE_LEVELS * of_states;
+    slow->w      = slow->terms + TERMS * of_states;
     slow->y      = slow->w + of_kinks;
     slow->rest   = slow->y + of_outputs;
     slow->rest_w = slow->rest + of_rest;
@@ -468,11 +488,18 @@ static int width_of(const engine_t* const self, const slow_t* slow) {
 
 /// Advance slow states by a number of ticks, at most one sample period.
 static void move_slow(const engine_t* const self, const slow_t* slow, int64_t ticks, double* z) {
-    const int width = width_of(self, slow);
-    for (int level = 0; ticks >> level != 0; level++) {
+    const int     width = width_of(self, slow), rows = PADDED(slow->rank), elements = PANEL_ELEMENTS(slow->rank, width);
+    const int64_t rest = ticks & ((INT64_C(1) << slow->base) - 1);
+    for (int level = slow->base; ticks >> level != 0; level++) {
         if ((ticks >> level & 1) != 0) {
-            self->kernels->advance(slow->rank, width, &slow->ladder[level * PANEL_ELEMENTS(slow->rank, width)], z);
+            self->kernels->advance(slow->rank, width, &slow->ladder[(level - slow->base) * elements], z);
         }
+    }
+    if (rest != 0) {
+        const double part = (double)rest / (double)(INT64_C(1) << slow->base);
+        double       terms[TERMS * PADDED(ENGINE_MAX_STATES)];
+        self->kernels->multiply(slow->count * rows, width, slow->terms, z, terms);
+        series_sum(self->kernels, slow->rank, slow->count, terms, part, z);
     }
 }
 
@@ -584,9 +611,6 @@ static void leave(engine_t* const self, int64_t ticks) {
     get_state_after(self, ticks, self->z);
     self->is_slow = false;
     self->now += ticks;
-    if (self->clear == NO_END) {
-        events_resume(self);
-    }
 }
 
 void quiet_leave(engine_t* const self) {
