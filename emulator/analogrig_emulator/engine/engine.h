@@ -150,16 +150,24 @@ int engine_solve(int n, int columns, double* a, double* b);
 int engine_noise_gather(
     int n, double period_s, const double* a, const double* q, double* phi, double* cov, double* factor);
 
-/// For each sample, record y = reading x, then set x = phi x + factor v. reading: outputs x n; v: the next n of normal.
-void engine_noise_run(int           n,
-                      int           outputs,
-                      int64_t       samples,
-                      const double* phi,
-                      const double* factor,
-                      const double* reading,
-                      const double* normal,
-                      double*       x,
-                      double*       y);
+/// Noise of some samples: x becomes phi x + factor v in a sample period, and y = reading x. reading: outputs x n.
+typedef struct {
+    int64_t       samples;
+    const double* phi;
+    const double* factor;
+    const double* reading;
+} engine_noise_t;
+
+/// For each sample of all stretches, add sign y to volts, outputs a row, then advance x by a sample period. v: the next n of
+/// normal.
+void engine_noise_add(int                   n,
+                      int                   outputs,
+                      int64_t               stretches,
+                      const engine_noise_t* noise,
+                      const double*         sign,
+                      const double*         normal,
+                      double*               x,
+                      double*               volts);
 
 /// For each sample of `channels` voltages, record in out what a sample-and-hold has acquired: the step from the voltage held
 /// before lacks the part `residual`. held: the voltages held before, then those of the last sample.

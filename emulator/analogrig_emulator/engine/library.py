@@ -32,6 +32,12 @@ class System(ctypes.Structure):
     _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks"))
 
 
+class Noise(ctypes.Structure):
+    """The C type engine_noise_t."""
+
+    _fields_ = (("samples", c_int64), *((name, c_void_p) for name in ("phi", "factor", "reading")))
+
+
 _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_double, c_int64)),
     ("engine_free", None, (c_void_p,)),
@@ -46,7 +52,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_get_counts", None, (c_void_p, POINTER(Counts))),
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
     ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
-    ("engine_noise_run", None, (c_int, c_int, c_int64, *(c_void_p,) * 6)),
+    ("engine_noise_add", None, (c_int, c_int, c_int64, POINTER(Noise), *(c_void_p,) * 4)),
     ("engine_hold", None, (c_int64, c_int, c_double, *(c_void_p,) * 3)),
     ("engine_approximate", None, (c_int64, c_int, *(c_void_p,) * 3)),
 )

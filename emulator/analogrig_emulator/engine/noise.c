@@ -91,31 +91,43 @@ int engine_noise_gather(
     return finite ? 1 : 0;
 }
 
-void engine_noise_run(int           n,
-                      int           outputs,
-                      int64_t       samples,
-                      const double* phi,
-                      const double* factor,
-                      const double* reading,
-                      const double* normal,
-                      double*       x,
-                      double*       y) {
-    const kernels_t* const kernels = kernels_find();
-    double                 panels[PANEL_ELEMENTS(ENGINE_MAX_STATES, 2 * ENGINE_MAX_STATES)];
-    double                 readings[PANEL_ELEMENTS(ENGINE_MAX_OUTPUTS, ENGINE_MAX_STATES)];
-    double                 both[2 * MAX_SQUARE], z[2 * ENGINE_MAX_STATES], padded[PADDED(ENGINE_MAX_OUTPUTS)];
+/// Panels of [phi factor] over those of [reading 0]: the next x, padded to whole panels, and y over [x v].
+static void pack(int n, int outputs, const engine_noise_t* noise, double* panels) {
+    double both[ENGINE_MAX_OUTPUTS * 2 * ENGINE_MAX_STATES] = { 0.0 };
+    for (int i = 0; i < outputs; i++) {
+        memcpy(&both[i * 2 * n], &noise->reading[i * n], (size_t)n * sizeof both[0]);
+    }
+    panels_pack(outputs, 2 * n, 2 * n, both, &panels[PANEL_ELEMENTS(n, 2 * n)]);
     for (int i = 0; i < n; i++) {
-        memcpy(&both[i * 2 * n], &phi[i * n], (size_t)n * sizeof both[0]);
-        memcpy(&both[i * 2 * n + n], &factor[i * n], (size_t)n * sizeof both[0]);
+        memcpy(&both[i * 2 * n], &noise->phi[i * n], (size_t)n * sizeof both[0]);
+        memcpy(&both[i * 2 * n + n], &noise->factor[i * n], (size_t)n * sizeof both[0]);
     }
     panels_pack(n, 2 * n, 2 * n, both, panels);
-    panels_pack(outputs, n, n, reading, readings);
-    for (int64_t sample = 0; sample < samples; sample++, normal += n, y += outputs) {
-        kernels->multiply(outputs, n, readings, x, padded);
-        memcpy(y, padded, (size_t)outputs * sizeof y[0]);
-        memcpy(z, x, (size_t)n * sizeof z[0]);
-        memcpy(&z[n], normal, (size_t)n * sizeof z[0]);
-        kernels->multiply(n, 2 * n, panels, z, padded);
-        memcpy(x, padded, (size_t)n * sizeof x[0]);
+}
+
+void engine_noise_add(int                   n,
+                      int                   outputs,
+                      int64_t               stretches,
+                      const engine_noise_t* noise,
+                      const double*         sign,
+                      const double*         normal,
+                      double*               x,
+                      double*               volts) {
+    const kernels_t* const kernels = kernels_find();
+    const int              rows    = PADDED(n) + outputs;
+    double                 panels[PANEL_ELEMENTS(ENGINE_MAX_STATES + ENGINE_MAX_OUTPUTS, 2 * ENGINE_MAX_STATES)];
+    double                 z[2 * ENGINE_MAX_STATES], next[PADDED(ENGINE_MAX_STATES) + PADDED(ENGINE_MAX_OUTPUTS)];
+    memcpy(z, x, (size_t)n * sizeof z[0]);
+    for (int64_t stretch = 0; stretch < stretches; stretch++, noise++) {
+        pack(n, outputs, noise, panels);
+        for (int64_t sample = 0; sample < noise->samples; sample++, normal += n, volts += outputs) {
+            memcpy(&z[n], normal, (size_t)n * sizeof z[0]);
+            kernels->multiply(rows, 2 * n, panels, z, next);
+            memcpy(z, next, (size_t)n * sizeof z[0]);
+            for (int i = 0; i < outputs; i++) {
+                volts[i] += sign[i] * next[PADDED(n) + i];
+            }
+        }
     }
+    memcpy(x, z, (size_t)n * sizeof z[0]);
 }

@@ -131,7 +131,8 @@ class Layout(NamedTuple):
         parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
         block = np.concatenate(parts)
         starts = tuple(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
-        return cls(block, starts, library.System(*(block.ctypes.data + start for start in starts)))
+        address = block.ctypes.data
+        return cls(block, starts, library.System(*(address + start for start in starts)))
 
 
 @functools.lru_cache(maxsize=64)

@@ -47,13 +47,19 @@ class Propagation(NamedTuple):
     """Noise over one sample period at some dials.
 
     transition, covariance: Phi and cov(w), (n, n); factor: Cholesky factor of the covariance; reading: outputs by
-    state, (outputs, n).
+    state, (outputs, n). addresses: those of transition, factor and reading.
     """
 
     transition: Matrix
     covariance: Matrix
     factor: Matrix
     reading: Matrix
+    addresses: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, transition: Matrix, covariance: Matrix, factor: Matrix, reading: Matrix) -> Propagation:
+        addresses = (transition.ctypes.data, factor.ctypes.data, reading.ctypes.data)
+        return cls(transition, covariance, factor, reading, addresses)
 
 
 @dataclass(frozen=True)
@@ -95,7 +101,7 @@ class _Sources:
         a = _linear_matrix(system)
         drives = self._drives(conditions, dials, self._nodal.disturbances(dials))
         gathered = _propagate(a, _product(drives.T, drives), conditions.period_s)
-        return Propagation(*gathered, np.ascontiguousarray(system.readings(conditions.outputs)[:, : len(a)]))
+        return Propagation.of(*gathered, np.ascontiguousarray(system.readings(conditions.outputs)[:, : len(a)]))
 
     def _drives(self, conditions: _Conditions, dials: Mapping[str, float], response: Mapping[str, Matrix]) -> Matrix:
         """Contribution of each source to dx/dt, in V/s per root of its two-sided density: (sources, n)."""
@@ -149,12 +155,31 @@ class CircuitNoise:
 
     def volts(self, samples: int, rng: np.random.Generator) -> Matrix:
         """Noise at the next samples: (samples, outputs), V. Cutting a run into blocks changes no bit."""
-        transition, _, factor, reading = self._propagation
-        normal = rng.standard_normal((samples, len(self._x)))
-        volts = np.empty((samples, len(reading)))
-        addresses = [array.ctypes.data for array in (transition, factor, reading, normal, self._x, volts)]
-        library.load().engine_noise_run(len(self._x), len(reading), samples, *addresses)
+        volts = np.zeros((samples, len(self._propagation.reading)))
+        self.add_to(volts, np.ones(volts.shape[1]), (), rng)
         return volts
+
+    def add_to(
+        self,
+        volts: Matrix,
+        signs: Matrix,
+        turns: Sequence[tuple[int, Mapping[str, float]]],
+        rng: np.random.Generator,
+    ) -> None:
+        """Add the noise of the next samples, times signs, to volts (samples, outputs).
+
+        turns: dials set before a row of volts, in order of rows.
+        """
+        stretches, begun = [], 0
+        for row, dials in turns:
+            stretches.append(library.Noise(row - begun, *self._propagation.addresses))
+            self.turn(dials)
+            begun = row
+        stretches.append(library.Noise(len(volts) - begun, *self._propagation.addresses))
+        normal = rng.standard_normal((len(volts), len(self._x)))
+        addresses = [array.ctypes.data for array in (signs, normal, self._x, volts)]
+        array_of_stretches = (library.Noise * len(stretches))(*stretches)
+        library.load().engine_noise_add(len(self._x), len(signs), len(stretches), array_of_stretches, *addresses)
 
 
 class NoisySuspension:
@@ -187,8 +212,8 @@ class NoisySuspension:
     ) -> Iterator[Matrix]:
         """Play like SuspensionComputer.play. The noise ignores set() between blocks, and follows a ramp at its end."""
         computer = self._computer
-        turns = [(turn.sample + 1 + turn.ramp_n, turn.values) for turn in computer.plan(changes, samples)]
-        turns.sort(key=lambda turn: turn[0])
+        planned = computer.plan(changes, samples)
+        turns = sorted(((turn.sample + 1 + turn.ramp_n, turn.values) for turn in planned), key=lambda turn: turn[0])
         noise = CircuitNoise(
             computer.circuit,
             computer.program.channel_nodes,
@@ -196,20 +221,16 @@ class NoisySuspension:
             temperature_c=self._temperature_c,
             sample_rate_hz=computer.sample_rate_hz,
         )
-        return self._blocks(computer.play(excitation, samples, changes, block_samples), noise, turns)
+        return self._blocks(computer.play_planned(excitation, samples, planned, block_samples), noise, turns)
 
     def _blocks(
         self, quiet: Iterator[Matrix], noise: CircuitNoise, turns: list[tuple[int, Mapping[str, float]]]
     ) -> Iterator[Matrix]:
-        first = 0
+        first, signs = 0, self._computer.program.channel_signs
         for block in quiet:
-            done = 0
-            while done < len(block):
-                while turns and turns[0][0] <= first + done:
-                    noise.turn(turns.pop(0)[1])
-                until = min(len(block), turns[0][0] - first) if turns else len(block)
-                block[done:until] += noise.volts(until - done, self._rng) * self._computer.program.channel_signs
-                done = until
+            now = [(int(sample) - first, dials) for sample, dials in turns if sample < first + len(block)]
+            del turns[: len(now)]
+            noise.add_to(block, signs, now, self._rng)
             first += len(block)
             yield block
 

@@ -130,13 +130,18 @@ class SuspensionComputer:
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
         Raises PotError, ExcitationError and EngineError; for invalid arguments before anything is played.
         """
+        return self.play_planned(excitation, samples, self.plan(changes, samples), block_samples)
+
+    def play_planned(
+        self, excitation: Excitation, samples: int, turns: Sequence[PotTurn], block_samples: int = BLOCK_SAMPLES
+    ) -> Iterator[NDArray[np.float64]]:
+        """Play like play(), with turns from plan()."""
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
-        turns = self.plan(changes, samples)
         excitation.period_ticks(self.sample_rate_hz)
         self.machine.restart(Mode.OPERATE)
         self._plays += 1
-        return self._blocks(self._plays, excitation, samples, turns, block_samples)
+        return self._blocks(self._plays, excitation, samples, list(turns), block_samples)
 
     # ---- playing
 
