@@ -85,6 +85,16 @@ def test_voltages_are_those_of_steps_that_grow_from_one_tick(
     np.testing.assert_allclose(volts[:, 3], net_force_v, rtol=0, atol=1e-12)
 
 
+def test_a_faster_sample_rate_changes_no_voltage_and_still_steps_slow_states_alone() -> None:
+    """At 1 MHz every state matters a sample period after an edge; the amplifiers' are forgotten 12 us later."""
+    system, volts = piecewise_linear(SuspensionComputer("front").circuit), []
+    for rate_hz, samples in ((20e3, 200), (1e6, 10_000)):
+        engine = Engine(system, ["u5", "u1"], rate_hz)
+        volts.append(engine.run(samples, {"F": Excitation().edges(*engine.window(samples), rate_hz)}))
+    assert engine.counts.quiet > samples / 2
+    np.testing.assert_allclose(volts[1][::50], volts[0], rtol=0, atol=1e-11)  # a tick is 50 times shorter
+
+
 def test_slewing_ends_where_the_law_says_so_in_a_circuit_faster_than_a_tick() -> None:
     """A follower with a time constant of 0.16 ps, an eightieth of a tick: it slews, and then it is at its input."""
     model = OpAmpModel(gbw_hz=1e12, slew_v_per_s=0.5e6)

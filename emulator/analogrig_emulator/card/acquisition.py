@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card
 from analogrig_emulator.circuit.pot import PotTurn
+from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import Edges
 from analogrig_emulator.errors import SamplerError
 
@@ -26,9 +27,6 @@ PROBE_S = 1e-6
 """Longest time between probes, in s, with an aperture delay or jitter."""
 
 _MAX_PROBES = 1000
-
-_EARLIEST_PROBES = 1
-"""Probes kept from before the nominal instant, for early jitter."""
 
 
 class Playable(Protocol):
@@ -106,26 +104,22 @@ def _offsets(card: Card, count: int) -> NDArray[np.float64]:
 def _take_samples(
     probed: Iterator[NDArray[np.float64]], card: Card, count: int, rng: np.random.Generator
 ) -> Iterator[NDArray[np.float64]]:
-    """Yield the sample voltages of each block; keep its last probes for early jitter in the next."""
+    """Yield the sample voltages of each block; keep its last probe for early jitter in the next."""
     before: NDArray[np.float64] | None = None
+    offsets = _offsets(card, count)
+    jitter_probes = card.aperture_jitter_s * card.rate_hz * count
     for block in probed:
-        before = np.repeat(block[:1], _EARLIEST_PROBES, axis=0) if before is None else before
-        probes = np.concatenate((before, block))
-        before = block[-_EARLIEST_PROBES:]
-        nominal = np.arange(_EARLIEST_PROBES, len(block) + _EARLIEST_PROBES, count)[:, None]
-        jitter = rng.standard_normal((len(nominal), card.channels)) * (card.aperture_jitter_s * card.rate_hz * count)
-        yield _interpolate(probes, nominal, np.clip(_offsets(card, count) + jitter, -_EARLIEST_PROBES, count - 1.0))
-
-
-def _interpolate(
-    probes: NDArray[np.float64], nominal: NDArray[np.intp], late: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Voltages `late` probes after the nominal rows, interpolated between two probes."""
-    left = np.floor(late)
-    part = late - left
-    rows, columns = nominal + left.astype(np.intp), np.arange(probes.shape[1])
-    early_v, late_v = probes[rows, columns], probes[np.minimum(rows + 1, len(probes) - 1), columns]
-    return np.where(part > 0, early_v + part * (late_v - early_v), early_v)
+        probes = np.ascontiguousarray(block, np.float64)
+        before = probes[0] if before is None else before
+        late = rng.standard_normal((len(probes) // count, card.channels))
+        late *= jitter_probes
+        late += offsets
+        np.clip(late, -1.0, count - 1.0, out=late)
+        volts = np.empty_like(late)
+        addresses = [array.ctypes.data for array in (before, probes, late, volts)]
+        library.load().engine_interpolate(*late.shape, count, *addresses)
+        before = probes[-1].copy()
+        yield volts
 
 
 @dataclass(frozen=True)

@@ -20,3 +20,22 @@ void engine_approximate(int64_t count, int bits, const double* levels, const dou
         codes[k] = (uint16_t)code;
     }
 }
+
+void engine_interpolate(int64_t       samples,
+                        int           channels,
+                        int64_t       stride,
+                        const double* before,
+                        const double* probes,
+                        const double* late,
+                        double*       out) {
+    for (int64_t sample = 0; sample < samples; sample++, probes += stride * channels) {
+        for (int channel = 0; channel < channels; channel++, late++, out++) {
+            int64_t row = (int64_t)*late;
+            row -= (double)row > *late ? 1 : 0;
+            const double part  = *late - (double)row;
+            const double early = row < 0 ? before[channel] : probes[row * channels + channel];
+            *out               = part > 0.0 ? early + part * (probes[(row + 1) * channels + channel] - early) : early;
+        }
+        before = &probes[(stride - 1) * channels];
+    }
+}

@@ -177,4 +177,14 @@ void engine_hold(int64_t samples, int channels, double residual, const double* v
 /// levels: 2^bits transitions, that of code 0 unused; bits is at most 16.
 void engine_approximate(int64_t count, int bits, const double* levels, const double* seen, uint16_t* codes);
 
+/// For each sample and channel, record in out the voltage `late` probes after the first of the `stride` probes of that sample,
+/// on the straight line between two probes. before: the probe before the first one. late: at least -1, at most stride - 1.
+void engine_interpolate(int64_t       samples,
+                        int           channels,
+                        int64_t       stride,
+                        const double* before,
+                        const double* probes,
+                        const double* late,
+                        double*       out);
+
 #endif  // ENGINE_H

@@ -20,6 +20,10 @@
 
 #define LEAP_DOUBLINGS 2
 
+/// Where every state still matters one sample period after an event, those that matter 2^LATER_DOUBLINGS periods after it are
+/// stepped from then on.
+#define LATER_DOUBLINGS 6
+
 /// Size of the term after which the series of the slow states ends.
 #define TAYLOR_END 1e-18
 
@@ -327,35 +331,75 @@ certify_slow(const engine_t* const self, slow_t* slow, const double* map, const 
 
 // ---------------------------------------------      CONSTRUCTION      ---------------------------------------------
 
-/// Find the level of the shortest time after which the state no longer depends on the fast states, and the slow rows then.
+/// f = exp([A B c] h) - I. True if x at h is the map of its slow rows, whatever x was before.
+static bool forgets(const engine_t* const self, const slow_t* slow, const double* map, const double* f) {
+    const int n = self->states, columns = self->columns, width = slow->rank + columns - n;
+    double    largest = 0.0, error = 0.0;
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j < n; j++) {
+            const double e    = f[i * columns + j] + (i == j ? 1.0 : 0.0);
+            double       left = e;
+            for (int k = 0; k < slow->rank; k++) {
+                const int row = slow->row[k];
+                left -= map[i * width + k] * (f[row * columns + j] + (row == j ? 1.0 : 0.0));
+            }
+            error   = fabs(left) > error ? fabs(left) : error;
+            largest = fabs(e) > largest ? fabs(e) : largest;
+        }
+    }
+    return error <= FORGOTTEN * largest;
+}
+
+/// Find the level of the shortest time up to one sample period after which the state no longer depends on the fast states,
+/// and the slow rows then.
 static void find_first(const engine_t* const self, slow_t* slow, const double* map) {
-    const int n = self->states, columns = self->columns, width = slow->rank + columns - n, base = self->mode->base;
+    const int n = self->states, columns = self->columns, base = self->mode->base;
     double    f[ENGINE_MAX_STATES * MAX_COLUMNS], rows[ENGINE_MAX_STATES * MAX_COLUMNS];
     for (int level = TOP_LEVEL; level >= base; level--) {
-        double largest = 0.0, error = 0.0;
         panels_unpack(n, columns, columns, &self->mode->ladder[(level - base) * PANEL_ELEMENTS(n, columns)], f);
-        for (int i = 0; i < n; i++) {
-            f[i * columns + i] += 1.0;
-        }
-        for (int i = 0; i < n; i++) {
-            for (int j = 0; j < n; j++) {
-                double left = f[i * columns + j];
-                for (int k = 0; k < slow->rank; k++) {
-                    left -= map[i * width + k] * f[slow->row[k] * columns + j];
-                }
-                error   = fabs(left) > error ? fabs(left) : error;
-                largest = fabs(f[i * columns + j]) > largest ? fabs(f[i * columns + j]) : largest;
-            }
-        }
-        if (level < TOP_LEVEL && error > FORGOTTEN * largest) {
+        if (level < TOP_LEVEL && !forgets(self, slow, map, f)) {
             return;
         }
         for (int i = 0; i < slow->rank; i++) {
             memcpy(&rows[i * columns], &f[slow->row[i] * columns], (size_t)columns * sizeof rows[0]);
+            rows[i * columns + slow->row[i]] += 1.0;
         }
         panels_pack(slow->rank, columns, columns, rows, slow->first);
         slow->least_level = level;
     }
+}
+
+/// f = exp([A B c] h) - I, over twice the time.
+static void double_flow(int n, int columns, double* f) {
+    double doubled[ENGINE_MAX_STATES * MAX_COLUMNS];
+    advance_rows(n, columns, n, f, f, doubled);
+    for (int i = 0; i < n * columns; i++) {
+        f[i] += doubled[i];
+    }
+}
+
+/// Find the states that matter 2^doublings sample periods after an event, x over them, and after how long they alone do. f:
+/// exp([A B c] h) - I over one sample period. Return false if there is no such map.
+static bool choose_slow(const engine_t* const self, slow_t* slow, const double* f, int doublings, double* map) {
+    const int n = self->states, columns = self->columns;
+    double    later[ENGINE_MAX_STATES * MAX_COLUMNS];
+    memcpy(later, f, (size_t)(n * columns) * sizeof f[0]);
+    for (int i = 0; i < doublings; i++) {
+        double_flow(n, columns, later);
+    }
+    if (!build_slow_map(self, slow, later, map)) {
+        return false;
+    }
+    slow->least_level = TOP_LEVEL;
+    memcpy(later, f, (size_t)(n * columns) * sizeof f[0]);
+    while (slow->least_level < TOP_LEVEL + doublings && !forgets(self, slow, map, later)) {
+        double_flow(n, columns, later);
+        slow->least_level++;
+    }
+    if (slow->least_level == TOP_LEVEL) {
+        find_first(self, slow, map);
+    }
+    return true;
 }
 
 /// Build the slow part of the present mode.
@@ -370,11 +414,14 @@ static void build_slow(engine_t* const self, slow_t* slow) {
     const int top = (TOP_LEVEL - self->mode->base) * PANEL_ELEMENTS(n, columns);
     panels_unpack(n, columns, columns, &self->mode->ladder[top], f);
     slow->certain = false;
-    if (!build_slow_map(self, slow, f, map)) {
+    bool found    = choose_slow(self, slow, f, 0, map);
+    if (found && slow->rank == n) {
+        found = choose_slow(self, slow, f, LATER_DOUBLINGS, map);
+    }
+    if (!found) {
         return;
     }
     const int rank = slow->rank, width = rank + columns - n;
-    find_first(self, slow, map);
     restrict_slow_rows(self, slow, f, columns, map, change);
     panels_pack(rank, width, width, change, slow->change);
     panels_pack(n, width, width, map, slow->state);
@@ -536,7 +583,7 @@ static bool begin_here(engine_t* const self) {
         return false;
     }
     const slow_t* slow = find_slow(self);
-    if (slow == NULL) {
+    if (slow == NULL || self->now - self->origin < INT64_C(1) << slow->least_level) {
         return false;
     }
     for (int i = 0; i < slow->rank; i++) {
