@@ -18,6 +18,7 @@ from analogrig_emulator import (
     Edges,
     Engine,
     Excitation,
+    OpAmp,
     Pot,
     PotTurn,
     Resistor,
@@ -26,7 +27,7 @@ from analogrig_emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.nodal import Nodal, analyse
 
 Volts = NDArray[np.float64]
 
@@ -79,6 +80,26 @@ def test_equal_machines_share_nothing_that_changes() -> None:
     assert other.program.values["M_kg"] == 115.0
     assert played(other).tobytes() == untouched.tobytes()
     assert played(SuspensionComputer("front")).tobytes() == untouched.tobytes()
+
+
+@pytest.mark.parametrize("program", ["front", "bump-stop", "two-mass"])
+@pytest.mark.parametrize("opamp", ["tl07x", "ideal"])
+def test_a_machine_with_other_offsets_is_that_of_a_netlist_with_them(program: str, opamp: str) -> None:
+    circuit = SuspensionComputer(program, opamp=opamp, rng=np.random.default_rng(5)).circuit
+    nominal = SuspensionComputer(program, opamp=opamp).circuit
+    trimmed = nominal.with_offsets({amp.name: amp.model.vos_v for amp in circuit.of(OpAmp)})
+    alone = Circuit(circuit.elements)
+    assert trimmed.elements == alone.elements
+    turned = {circuit.of(Pot)[0].name: 0.1}
+    assert trimmed.with_dials(turned).elements == alone.with_dials(turned).elements
+    for dial in (0.2, 0.7):
+        dials = {circuit.of(Pot)[0].name: dial}
+        shared, own = analyse(trimmed).at(dials), Nodal(alone).at(dials)
+        for field in ("abc", "g", "cde", "w_phi", "lmn", "v_phi"):
+            assert getattr(shared, field).tobytes() == getattr(own, field).tobytes()
+        assert shared.layout(shared.nodes[:3]).block.tobytes() == own.layout(own.nodes[:3]).block.tobytes()
+    with pytest.raises(CircuitError, match="no op-amp is called 'U99'"):
+        nominal.with_offsets({"U99": 0.0})
 
 
 def test_state_spaces_that_are_shared_cannot_be_written() -> None:

@@ -279,7 +279,10 @@ class Circuit:
     def of(self, kind: type[_E]) -> tuple[_E, ...]:
         """The elements of one kind, in netlist order."""
         if kind not in self._of_kind:
-            self._of_kind[kind] = tuple(element for element in self.elements if isinstance(element, kind))
+            shared = self.untrimmed is not self and kind is not OpAmp
+            self._of_kind[kind] = (
+                self.untrimmed.of(kind) if shared else tuple(part for part in self.elements if isinstance(part, kind))
+            )
         found: tuple[_E, ...] = self._of_kind[kind]
         return found
 
@@ -304,6 +307,8 @@ class Circuit:
         Raises CircuitError for a switch that is not there.
         """
         _check_known("switch", closed, self.of(Switch))
+        if self.untrimmed is not self:
+            return self.untrimmed.with_switches(closed).with_offsets(self._vos_v)
         return self._variant(
             ("switches", *sorted(closed.items())),
             lambda: Circuit(
@@ -317,6 +322,8 @@ class Circuit:
     def with_dials(self, dials: Mapping[str, float]) -> Circuit:
         """The same circuit with the pots named in dials set anew. Raises CircuitError for a pot that is not there."""
         _check_known("pot", dials, self.of(Pot))
+        if self.untrimmed is not self:
+            return self.untrimmed.with_dials(dials).with_offsets(self._vos_v)
         return self._variant(
             ("dials", *sorted(dials.items())),
             lambda: Circuit(
@@ -326,6 +333,37 @@ class Circuit:
                 for element in self.elements
             ),
         )
+
+    @property
+    def untrimmed(self) -> Circuit:
+        """The circuit that this one is but for input offsets, if with_offsets() made this one; else this one."""
+        untrimmed: Circuit = self.__dict__.get("_untrimmed", self)
+        return untrimmed
+
+    @property
+    def _vos_v(self) -> dict[str, float]:
+        return {amp.name: amp.model.vos_v for amp in self.of(OpAmp)}
+
+    def with_offsets(self, vos_v: Mapping[str, float]) -> Circuit:
+        """The same circuit with other input offsets, in V, of the op-amps named in vos_v.
+
+        Nothing that does not depend on offsets is checked or computed again. Raises CircuitError for an op-amp that is
+        not there, and for an offset that is not finite.
+        """
+        _check_known("op-amp", vos_v, self.of(OpAmp))
+        trimmed = object.__new__(Circuit)
+        object.__setattr__(
+            trimmed,
+            "elements",
+            tuple(
+                replace(element, model=replace(element.model, vos_v=vos_v[element.name]))
+                if isinstance(element, OpAmp) and element.name in vos_v
+                else element
+                for element in self.elements
+            ),
+        )
+        trimmed.__dict__.update(_untrimmed=self.untrimmed, nodes=self.nodes, inputs=self.inputs)
+        return trimmed
 
     def _variant(self, settings: object, make: Callable[[], Circuit]) -> Circuit:
         """This circuit with other settings: one of the last few, or a new one."""

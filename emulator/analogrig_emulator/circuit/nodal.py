@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,20 +48,63 @@ def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
 
     Raises CircuitError naming the node where the circuit is singular.
     """
-    return circuit.derive(Nodal).at({})
+    return analyse(circuit).at({})
+
+
+def analyse(circuit: Circuit) -> Nodal:
+    """Nodal analysis of a circuit, made once. Circuits that differ in offsets alone share all that allows it.
+
+    Raises CircuitError for a circuit that exceeds the limits of the engine.
+    """
+    return circuit.derive(Nodal if circuit.untrimmed is circuit else _trimmed)
+
+
+def _trimmed(circuit: Circuit) -> Nodal:
+    untrimmed = analyse(circuit.untrimmed)
+    return Nodal(circuit, untrimmed if untrimmed.can_be_trimmed else None)
 
 
 _KEPT_SYSTEMS = 16
+
+_Place: TypeAlias = tuple[tuple[float, ...], tuple[bool, ...]]
+"""Dials of all pots and positions of all switches."""
+
+_T = TypeVar("_T")
+
+
+def _keep(kept: dict[_Place, _T], place: _Place, value: _T) -> _T:
+    """Store a value in the place of the oldest if there are _KEPT_SYSTEMS. Return it."""
+    if len(kept) >= _KEPT_SYSTEMS:
+        del kept[next(iter(kept))]
+    kept[place] = value
+    return value
 
 
 class Nodal:
     """Equations of one circuit with all but pots and switches entered, so that turning a pot is cheap.
 
     The last state spaces are kept: returning to earlier dials costs nothing.
+    untrimmed: analysis of a circuit that differs in offsets alone, with can_be_trimmed.
     Raises CircuitError for a circuit that exceeds the limits of the engine.
     """
 
-    def __init__(self, circuit: Circuit) -> None:
+    _laws: _Laws
+
+    def __init__(self, circuit: Circuit, untrimmed: Nodal | None = None) -> None:
+        if untrimmed is None:
+            self._build(circuit)
+        else:
+            vars(self).update(vars(untrimmed))
+            self._poles = circuit.of(OpAmp)
+            offset = self._laws.offset.copy()
+            offset[self._laws.poles] = [amp.model.vos_v for amp in self._poles]
+            self._laws = replace(self._laws, offset=offset)
+        self._circuit = circuit
+        self._untrimmed = untrimmed
+        self._kept: dict[_Place, PiecewiseLinear] = {}
+        self._trims: dict[_Place, Trim] = {}
+
+    def _build(self, circuit: Circuit) -> None:
         self._circuit = circuit
         self._pots = circuit.of(Pot)
         self._switches = circuit.of(Switch)
@@ -95,7 +139,6 @@ class Nodal:
         self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
         self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
         self._enter(circuit)
-        self._kept: dict[object, PiecewiseLinear] = {}
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
         """State space with pots at `dials` and switches at `closed`; the others are as in the netlist.
@@ -103,17 +146,24 @@ class Nodal:
         Raises PotError for a dial off its track, CircuitError for a singular circuit.
         """
         closed = closed or {}
-        place = (
+        place = self._place(dials, closed)
+        if place in self._kept:
+            return self._kept[place]
+        if self._untrimmed is None:
+            return _keep(self._kept, place, self._system(dials, closed))
+        system, trim = self._untrimmed.with_trim(dials, closed)
+        return _keep(self._kept, place, trim.apply(system, self._laws.offset[self._laws.poles]))
+
+    @property
+    def can_be_trimmed(self) -> bool:
+        """True if offsets enter nothing but the drives of their own op-amps."""
+        return len(self._poles) == len(self._circuit.of(OpAmp))
+
+    def _place(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> _Place:
+        return (
             tuple([dials.get(pot.name, pot.dial) for pot in self._pots]),
             tuple([closed.get(switch.name, switch.closed) for switch in self._switches]),
         )
-        system = self._kept.get(place)
-        if system is None:
-            system = self._system(dials, closed)
-            if len(self._kept) >= _KEPT_SYSTEMS:
-                del self._kept[next(iter(self._kept))]
-            self._kept[place] = system
-        return system
 
     def _system(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> PiecewiseLinear:
         solution = self._solution(dials, closed)
@@ -132,17 +182,26 @@ class Nodal:
             v_phi=self._spread(voltages),
         )
 
-    def with_trim(self, dials: Mapping[str, float]) -> tuple[PiecewiseLinear, Trim]:
+    def with_trim(
+        self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None
+    ) -> tuple[PiecewiseLinear, Trim]:
         """State space of at(), and the trim by which op-amp offsets enter it.
 
         Raises like at(), and CircuitError for an op-amp without a pole.
         """
-        if len(self._poles) != len(self._circuit.of(OpAmp)):
+        if not self.can_be_trimmed:
             raise CircuitError("the offset of an op-amp without a pole enters every node: it cannot be trimmed")
-        laws, solution = self._laws, self._solution(dials, {})
+        closed = closed or {}
+        system, place = self.at(dials, closed), self._place(dials, closed)
+        if place not in self._trims:
+            _keep(self._trims, place, self._trim(dials, closed))
+        return system, self._trims[place]
+
+    def _trim(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Trim:
+        laws, solution = self._laws, self._solution(dials, closed)
         apart_v = (solution[laws.plus] - solution[laws.minus])[laws.poles, self._columns - 1]
         slew_kinks = dict(zip(laws.drive_of_kink[laws.slews].tolist(), laws.slews.tolist(), strict=True))
-        return self.at(dials), Trim(
+        return Trim(
             amps=tuple(amp.name for amp in self._poles),
             apart_v=apart_v,
             gain_rate=laws.gain[laws.poles, 0],
@@ -316,6 +375,16 @@ class Trim:
     apart_v: Matrix
     gain_rate: Matrix
     rows: tuple[tuple[int, int | None], ...]
+
+    def apply(self, system: PiecewiseLinear, offsets_v: Matrix) -> PiecewiseLinear:
+        """The state space of the trim, with the op-amps' offsets offsets_v, (amps,) V."""
+        abc, cde = system.abc.copy(), system.cde.copy()
+        for rate, (row, kink) in zip((self.apart_v + offsets_v) * self.gain_rate, self.rows, strict=True):
+            if kink is None:
+                abc[row, -1] = rate
+            else:
+                cde[kink, -1] = rate
+        return system.with_drives(abc, cde)
 
 
 _STAMP = np.array((1.0, 1.0, -1.0, -1.0))

@@ -11,7 +11,7 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from numbers import Integral
 from typing import NamedTuple
 
@@ -131,8 +131,20 @@ class Layout(NamedTuple):
         parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
         block = np.concatenate(parts)
         starts = tuple(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
-        address = block.ctypes.data
-        return cls(block, starts, library.System(*(address + start for start in starts)))
+        return cls._placed(block, starts)
+
+    def with_drives(self, abc: Matrix, cde: Matrix) -> Layout:
+        """The same layout with other abc and cde."""
+        block = self.block.copy()
+        for start, matrix in ((self.starts[0], abc), (self.starts[2], cde)):
+            first = start // block.itemsize
+            block[first : first + matrix.size] = matrix.ravel()
+        return Layout._placed(block, self.starts)
+
+    @classmethod
+    def _placed(cls, block: Matrix, starts: tuple[int, ...]) -> Layout:
+        start_of_block = block.ctypes.data
+        return cls(block, starts, library.System(*(start_of_block + start for start in starts)))
 
 
 @functools.lru_cache(maxsize=64)
@@ -149,7 +161,8 @@ class PiecewiseLinear:
 
     abc: (n, n+m+1) in 1/s and V/s; g: (n, q); cde: (q, n+m+1); w_phi: P, (q, q); lmn: (nodes, n+m+1), dimensionless but
     for its last column in V; v_phi: R, (nodes, q).
-    states, inputs, nodes: names; ground is not among the nodes.
+    states, inputs, nodes: names; ground is not among the nodes. origin: state space with the same matrices but abc and
+    cde, whose layouts are made into those of this one.
     """
 
     states: tuple[str, ...]
@@ -162,10 +175,15 @@ class PiecewiseLinear:
     w_phi: Matrix
     lmn: Matrix
     v_phi: Matrix
+    origin: PiecewiseLinear | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for matrix in (self.abc, self.g, self.cde, self.w_phi, self.lmn, self.v_phi):
             matrix.setflags(write=False)  # the layouts are copies
+
+    def with_drives(self, abc: Matrix, cde: Matrix) -> PiecewiseLinear:
+        """The same state space with other abc and cde."""
+        return replace(self, abc=abc, cde=cde, origin=self.origin or self)
 
     @functools.cached_property
     def layouts(self) -> dict[tuple[str, ...], Layout]:
@@ -175,7 +193,10 @@ class PiecewiseLinear:
     def layout(self, outputs: tuple[str, ...]) -> Layout:
         """Layout for the engine, with these nodes as outputs. Raises CircuitError for an unknown node."""
         if outputs not in self.layouts:
-            self.layouts[outputs] = Layout.of(self, outputs)
+            if self.origin is None:
+                self.layouts[outputs] = Layout.of(self, outputs)
+            else:
+                self.layouts[outputs] = self.origin.layout(outputs).with_drives(self.abc, self.cde)
         return self.layouts[outputs]
 
     def readings(self, nodes: Sequence[str]) -> Matrix:

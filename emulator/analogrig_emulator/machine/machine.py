@@ -38,7 +38,7 @@ from analogrig_emulator.circuit.circuit import (
     label,
 )
 from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
-from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.nodal import Nodal, analyse
 from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
@@ -120,7 +120,7 @@ class AnalogComputer:
         if not 0 <= lamp_delay_s < math.inf:
             raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
         # First: it rejects a circuit that is too large at once.
-        self._nodals = {Mode.OPERATE: circuit.derive(Nodal)}
+        self._nodals = {Mode.OPERATE: analyse(circuit)}
         if missing := [node for node in readings if node not in circuit.nodes]:
             raise CircuitError(f"readings: no node is called {missing[0]!r}; there are {', '.join(circuit.nodes)}")
         self._patched = circuit

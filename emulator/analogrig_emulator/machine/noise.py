@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import GROUND, Circuit, OpAmp, Pot, Resistor
 from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
-from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.nodal import analyse
 from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
 from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import PiecewiseLinear
@@ -76,7 +76,7 @@ class _Sources:
     """Sources of noise in one circuit. Its last propagations are kept: returning to earlier dials costs nothing."""
 
     def __init__(self, circuit: Circuit) -> None:
-        self._nodal = circuit.derive(Nodal)
+        self._nodal = analyse(circuit)
         self._tracks_ohm = [(pot.name, pot.track_ohm) for pot in circuit.of(Pot)]
         self._amps = circuit.of(OpAmp)
         self._fixed_ohm = [resistor.ohm for resistor in circuit.of(Resistor)]
@@ -133,7 +133,7 @@ class CircuitNoise:
         sample_rate_hz: float = 20e3,
     ) -> None:
         self._conditions = _Conditions(tuple(outputs), op_amps, temperature_c + _ZERO_C_K, 1.0 / sample_rate_hz)
-        self._sources = circuit.derive(_Sources)
+        self._sources = circuit.untrimmed.derive(_Sources)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
         self.turn({})
         self._x = np.zeros(len(self.transition))

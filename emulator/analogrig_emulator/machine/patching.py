@@ -49,8 +49,12 @@ def patches(circuit: Circuit) -> dict[str, Patch]:
     open, an amplifier without feedback of its own (a loop through other amplifiers does not count), and an input or an
     amplifier that nothing feeds. (Circuit already rejects an open amplifier input: its node floats.)
     """
+    return dict(circuit.untrimmed.derive(_patches_by_wiring))
+
+
+def _patches_by_wiring(circuit: Circuit) -> dict[str, Patch]:
     wires = tuple((type(element), element.name, element.nodes) for element in circuit.elements)
-    return dict(_patches(_Wiring(wires, circuit)))
+    return _patches(_Wiring(wires, circuit))
 
 
 @dataclass(frozen=True)

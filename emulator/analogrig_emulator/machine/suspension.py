@@ -57,10 +57,14 @@ class SuspensionComputer:
     ) -> None:
         self.program = _program(program)
         self.sample_rate_hz = sample_rate_hz
-        models = _models(opamp, self.program.amplifiers, rng, offset_v)
+        model, count = _model(opamp, offset_v), self.program.amplifiers
+        offsets_v = None if rng is None else drawn_offsets_v(model, count, rng, offset_v).tolist()
         if components.is_perfect and isinstance(self.program, Hashable):
-            circuit, self._pots = _nominal(self.program, tuple(models))
+            circuit, self._pots = _nominal(self.program, model)
+            if offsets_v is not None:
+                circuit = circuit.with_offsets({f"U{i}": vos_v for i, vos_v in enumerate(offsets_v, 1)})
         else:
+            models = [replace(model, vos_v=vos_v) for vos_v in offsets_v or [model.vos_v] * count]
             circuit, self._pots = _wired(self.program, models, components)
         self._signs = self.program.channel_signs
         self.machine = AnalogComputer(
@@ -222,9 +226,9 @@ def _wired(program: Program, models: Sequence[OpAmpModel], components: Component
 
 
 @functools.lru_cache(maxsize=8)
-def _nominal(program: Program, models: tuple[OpAmpModel, ...]) -> tuple[Circuit, _LoadedPots]:
+def _nominal(program: Program, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
     """The same with perfect components. Equal machines share their circuit, and with it its equations."""
-    return _wired(program, models, NOMINAL)
+    return _wired(program, [model] * program.amplifiers, NOMINAL)
 
 
 def _pots(program: Program, circuit: Circuit, components: Components) -> _LoadedPots:
@@ -244,13 +248,10 @@ def _program(program: str | Program) -> Program:
     return PROGRAMS[program]
 
 
-def _models(opamp: str | OpAmpModel, count: int, rng: np.random.Generator | None, offset_v: float) -> list[OpAmpModel]:
+def _model(opamp: str | OpAmpModel, offset_v: float) -> OpAmpModel:
     if not 0 <= offset_v < math.inf:
         raise CircuitError(f"offset_v must be finite and not negative, got {offset_v!r}")
-    model = preset(opamp) if isinstance(opamp, str) else opamp
-    if rng is None:
-        return [model] * count
-    return [replace(model, vos_v=vos_v) for vos_v in drawn_offsets_v(model, count, rng, offset_v).tolist()]
+    return preset(opamp) if isinstance(opamp, str) else opamp
 
 
 def drawn_offsets_v(model: OpAmpModel, count: int, rng: np.random.Generator, offset_v: float) -> NDArray[np.float64]:
