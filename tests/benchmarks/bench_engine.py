@@ -1,4 +1,4 @@
-"""Speed of the emulator, beside ngspice on the same circuit.
+"""Speed of the emulator, beside ngspice and gnucap on the same circuit.
 
 python -m tests.benchmarks engine
 
@@ -49,6 +49,7 @@ from analogrig_emulator.circuit.spice import Accuracy
 from analogrig_emulator.machine.suspension import BLOCK_SAMPLES
 from tests.emulator.conftest import _read_raw
 
+from . import gnucap
 from .figure import Figure
 
 THESIS_TWEAKS: tuple[PotTurn, ...] = (
@@ -423,6 +424,34 @@ def ngspice_figures() -> Iterator[Figure]:
     yield own_error()
 
 
+GNUCAP_SETTINGS = tuple(
+    itertools.starmap(
+        gnucap.Setting,
+        itertools.product(("trap", "gear"), (1e-3, 1e-4, 1e-6), (7.0, 1.0), (50e-6, 25e-6, 12e-6, 8e-6)),
+    )
+)
+
+
+def gnucap_figures() -> Iterator[Figure]:
+    """The stream beside gnucap at its best."""
+    samples, circuit = 800, SuspensionComputer("front").circuit
+    edges, exact = Excitation().edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ), exact_v(samples, ())
+
+    def simulate_once(setting: gnucap.Setting) -> Simulated:
+        spent_s, rows = gnucap.run(gnucap.deck(setting, circuit, edges, samples, RATE_HZ))
+        at_samples_v = np.interp(np.arange(samples) / RATE_HZ, *rows.T)
+        return Simulated(spent_s, float(np.abs(at_samples_v - exact).max()) / LSB_V)
+
+    found = {setting: simulate_once(setting) for setting in GNUCAP_SETTINGS}
+    accurate = [setting for setting, run in found.items() if run.error_lsb <= TOLERATED_LSB]
+    winner = min(accurate, key=lambda setting: found[setting].spent_s)
+    spent_s, own_s = min(simulate_once(winner).spent_s for _ in range(REPEATS)), stream_s()
+    name = "square wave of 800 samples in a stream"
+    label = f"best of {len(found)}: {winner}; {found[winner].error_lsb:.3f} LSB"
+    yield Figure(f"gnucap, {name}", 1e3 * spent_s, "ms", label)
+    yield Figure(f"emulator, {name}, machine included", 1e3 * own_s, "ms", "gnucap", spent_s / own_s)
+
+
 def _group_figure(name: str, settings: Sequence[Setting], found: Mapping[Setting, Simulated]) -> Figure:
     best = fastest({setting: found[setting] for setting in settings})
     if not best:
@@ -446,3 +475,5 @@ def figures() -> Iterator[Figure]:
     yield Figure("emulator, noisy trial", 1e3 * noisy_s, "ms", "the quiet trial", spent_s / noisy_s)
     if shutil.which("ngspice") is not None:
         yield from ngspice_figures()
+    if shutil.which("gnucap") is not None:
+        yield from gnucap_figures()
