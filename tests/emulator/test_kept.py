@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import gc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -100,6 +102,17 @@ def test_a_machine_with_other_offsets_is_that_of_a_netlist_with_them(program: st
         assert shared.layout(shared.nodes[:3]).block.tobytes() == own.layout(own.nodes[:3]).block.tobytes()
     with pytest.raises(CircuitError, match="no op-amp is called 'U99'"):
         nominal.with_offsets({"U99": 0.0})
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy])
+def test_circuits_and_state_spaces_that_were_played_can_be_copied(again: Callable[[Any], Any]) -> None:
+    computer = SuspensionComputer("front", rng=np.random.default_rng(1))
+    played(computer)
+    circuit = again(computer.machine.wiring)
+    assert circuit == computer.machine.wiring
+    system = again(piecewise_linear(computer.machine.wiring))
+    assert system.abc.tobytes() == piecewise_linear(circuit).abc.tobytes()
+    assert not system.abc.flags.writeable
 
 
 def test_state_spaces_that_are_shared_cannot_be_written() -> None:

@@ -264,6 +264,10 @@ class Circuit:
         _check_loops(self.elements)
         _check_feedback(self.elements)
 
+    def __reduce__(self) -> tuple[type[Circuit], tuple[tuple[Element, ...]]]:
+        """Pickle and copy the netlist alone, not what was computed from it."""
+        return Circuit, (self.elements,)
+
     @functools.cached_property
     def nodes(self) -> tuple[str, ...]:
         """Every node but ground, in order of appearance."""

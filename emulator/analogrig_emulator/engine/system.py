@@ -11,9 +11,9 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,6 +180,10 @@ class PiecewiseLinear:
     def __post_init__(self) -> None:
         for matrix in (self.abc, self.g, self.cde, self.w_phi, self.lmn, self.v_phi):
             matrix.setflags(write=False)  # the layouts are copies
+
+    def __reduce__(self) -> tuple[type[PiecewiseLinear], tuple[Any, ...]]:
+        """Pickle and copy the fields alone, not the layouts."""
+        return PiecewiseLinear, tuple(getattr(self, each.name) for each in fields(self))
 
     def with_drives(self, abc: Matrix, cde: Matrix) -> PiecewiseLinear:
         """The same state space with other abc and cde."""
