@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from analogrig.answers import Samples
 from analogrig.bench import Bench, direct_bench
 from analogrig.judging.information import change_information, first_at_level
-from analogrig.judging.statistics import rate_interval
+from analogrig.judging.statistics import lower_rate, upper_rate
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
@@ -150,10 +150,13 @@ def _first_alarms(candidate: Candidate, level: float, seeds: Sequence[int], effo
 
 
 def _arl0(first_alarms: NDArray[np.int64], effort: Effort) -> tuple[float, tuple[float, float], int, int]:
-    """ARL0, its confidence interval, number of alarms and exposure in samples."""
+    """ARL0, its confidence interval, number of alarms and exposure in samples.
+
+    First alarms of fresh devices are independent, whatever bursts follow them.
+    """
     alarms = int(np.count_nonzero(first_alarms < effort.run_n))
     exposure = int(first_alarms.sum()) + alarms
-    low, high = rate_interval(alarms, exposure, CONFIDENCE)
+    low, high = (bound(alarms, exposure, 0.5 * (1.0 + CONFIDENCE)) for bound in (lower_rate, upper_rate))
     return _inverse(alarms / exposure), (_inverse(high), _inverse(low)), alarms, exposure
 
 

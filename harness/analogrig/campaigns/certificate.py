@@ -4,6 +4,9 @@ A plant that does not change is played in runs of one length, with consecutive s
 in which the trigger was armed (analogrig.judging.exposure). Every alarm is a false one. Rates that would take too long
 to observe are estimated by branches with louder noise (analogrig.campaigns.rare). Each of these estimates comes from a
 play of its own.
+
+Alarms may come in bursts. All bounds cover bursts of ``Question.burst`` alarms on average, or of more where the counts
+of the plays show them (analogrig.judging.bursts).
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,21 +27,19 @@ from analogrig.campaigns.workers import Workers
 from analogrig.datasheet import Datasheet
 from analogrig.devices.catalogue_description import has_snapshots
 from analogrig.errors import ConfigurationError
-from analogrig.judging.statistics import (
-    ConfidenceSequence,
-    Decision,
-    Design,
-    SequentialTest,
-    lower_rate,
-    mean_bounds,
-    poisson_mean,
-    upper_rate,
-)
+from analogrig.judging.bursts import BURST, ConfidenceSequence, Design, bound_rate, upper_count
+from analogrig.judging.statistics import Decision, mean_bounds, one_sided
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
 IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
-"""Approximate samples in a run: in this process, or over a line."""
+"""Fewest samples in a run: in this process, or over a line."""
+
+LONGEST_RUN_N = 1_000_000
+"""Samples in a run beyond which it is not prolonged to the mean time between alarms at the limit.
+
+A shorter run would never show an alarm that comes this long after each start.
+"""
 
 WORTH_A_WORKER_N = 500_000
 """Samples that a process plays in about the time that another takes to start."""
@@ -46,8 +47,11 @@ WORTH_A_WORKER_N = 500_000
 WORTH_A_WORKER_ESTIMATES = 16
 """Estimates of a rare rate that a process plays in about the time that another takes to start."""
 
-APART = 10.0
-"""Ratio of limit to true rate at which the sequential test certifies quickest."""
+MOST_FAR = 0.1
+"""Rate per sample from which on no certificate is given."""
+
+MOST_ALARMS = 1000
+"""Largest number of alarms allowed, and largest mean number of alarms of a burst."""
 
 MOST_LONGER = 3.0
 """Largest length of a sequential test, as a multiple of the length of a fixed one."""
@@ -79,8 +83,10 @@ class Question:
     far: float
     confidence: float
     first_seed: int = 0
-    allowed: int = 5
+    allowed: int = 10
     """Most alarms with which a test of fixed length certifies."""
+    burst: float = BURST
+    """Mean number of alarms of a burst that the bounds cover; 1: alarms are taken as independent."""
     sequential: bool = False
     rare: int | None = None
     """Number of estimates of a rare rate; None: count alarms as they occur."""
@@ -92,12 +98,13 @@ class Question:
 
     def _problem(self) -> str:
         """Reason that the question cannot be answered; empty if it can."""
-        if not 0.0 < self.far * APART < 1.0:
-            return f"far must be more than 0 and less than {1.0 / APART:g} per sample, not {self.far:g}"
+        if not 0.0 < self.far < MOST_FAR:
+            return f"far must be more than 0 and less than {MOST_FAR:g} per sample, not {self.far:g}"
         if not 0.5 < self.confidence < 1.0:
             return f"confidence must be more than 0.5 and less than 1, not {self.confidence:g}"
-        if not 0 <= self.allowed <= 1000:
-            return f"allowed must be 0 to 1000, not {self.allowed}"
+        for name, least in (("allowed", 0), ("burst", 1)):
+            if not least <= getattr(self, name) <= MOST_ALARMS:
+                return f"{name} must be {least} to {MOST_ALARMS}, not {getattr(self, name):g}"
         if not self.datasheet.alarms:
             return "the device has no trigger: it raises no alarm, whatever comes"
         if self.scenario.tweaks:
@@ -106,7 +113,7 @@ class Question:
 
     def _length_problem(self) -> str:
         """Reason that the test would take more than a year of playing; empty if it is short enough."""
-        needed = poisson_mean(self.allowed, self.confidence) / self.far
+        needed = upper_count(self.allowed, self.confidence, self.burst) / self.far
         if needed <= BENCH_YEAR_N or (self.is_in_process and needed <= IN_PROCESS_YEAR_N):
             return ""
         year_n = IN_PROCESS_YEAR_N if self.is_in_process else BENCH_YEAR_N
@@ -150,7 +157,7 @@ class Question:
     @functools.cached_property
     def design_n(self) -> int:
         """Samples of the test of fixed length."""
-        return Design(self.far, self.confidence, self.allowed).trials
+        return Design(self.far, self.confidence, self.allowed, self.burst).trials
 
 
 @dataclass(frozen=True)
@@ -164,7 +171,12 @@ class Certificate:
     samples: int
     """Number of samples in which the trigger was armed; for a rare rate, of samples played."""
     rate: tuple[float, float] = (0.0, 1.0)
-    """One-sided bounds: exact for a fixed length, of a mean for a rare rate. A sequential test yields none."""
+    """Two one-sided bounds, each at the confidence of the question; as one interval they would be wrong twice as often.
+
+    A sequential test yields none.
+    """
+    basis: str = ""
+    """Assumption and data behind the bounds; empty if nothing was bounded."""
 
 
 def certify(
@@ -182,17 +194,19 @@ def certify(
     most = math.ceil(question.design_n * (MOST_LONGER if question.sequential else 1.0))
     run_n = _run_n(question, most)
     work = functools.partial(count_run, question, run_n)
+    counts: list[Count] = []
     alarms = samples = 0
     try:
         for count in _in_order(workers, work, question.first_seed):
+            counts.append(count)
             alarms, samples = alarms + count.alarms, samples + count.armed
             if progress is not None:
                 progress(samples, most, alarms)
             if count.fault:
                 return Certificate("inconclusive", count.fault, alarms, samples)
-            answer = _sequential(question, alarms, samples) if question.sequential else None
+            answer = _sequential(question, counts) if question.sequential else None
             if samples >= most:
-                answer = answer or _at_the_end(question, alarms, samples)
+                answer = answer or _at_the_end(question, counts)
             if answer is not None:
                 return answer
     finally:
@@ -254,30 +268,45 @@ def _in_order(workers: Workers, work: Any, first_seed: int) -> Iterator[Count]:
 
 def _run_n(question: Question, most: int) -> int:
     """Run length of which a whole number makes up a test of fixed length."""
-    about = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
-    runs = math.ceil(most / about)
+    least = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
+    least = max(least, min(math.ceil(1.0 / question.far), LONGEST_RUN_N))
+    runs = max(1, most // least)
     return math.ceil(most / runs) + question.datasheet.warm_up_n + LEAD_IN_N
 
 
-def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
+def _at_the_end(question: Question, counts: Sequence[Count]) -> Certificate:
     """Outcome of the test of fixed length, or of a sequential one that has not decided."""
-    counted = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}"
+    alarms, armed = _columns(counts)
+    bounds = bound_rate(alarms, armed, question.confidence, question.burst)
+    counted = f"{number_of(sum(alarms), 'alarm')} in {number_of(sum(armed), 'sample')}"
     if question.sequential:
-        return Certificate("inconclusive", f"{counted}, and still undecided", alarms, samples)
-    low = lower_rate(alarms, samples, question.confidence)
-    high = upper_rate(alarms, samples, question.confidence)
-    reason = f"{counted}: the rate is {low:.3g} to {high:.3g}"
-    return Certificate(_answer(question.far, low, high), reason, alarms, samples, (low, high))
+        return Certificate(
+            "inconclusive", f"{counted}, and still undecided", sum(alarms), sum(armed), basis=bounds.basis
+        )
+    reason = f"{counted}: the rate is {one_sided(bounds.low, bounds.high, question.confidence)}"
+    answer = _answer(question.far, bounds.low, bounds.high)
+    return Certificate(answer, reason, sum(alarms), sum(armed), (bounds.low, bounds.high), bounds.basis)
 
 
-def _sequential(question: Question, alarms: int, samples: int) -> Certificate | None:
-    """Outcome of the sequential tests; None while undecided.
+def _sequential(question: Question, counts: Sequence[Count]) -> Certificate | None:
+    """Outcome of the sequential test; None while undecided.
 
-    Wald's test certifies. A confidence sequence refutes; it eventually does so for any rate above the limit.
+    A confidence sequence decides, with the error probability 1 - confidence on either side.
     """
-    error, far = 1.0 - question.confidence, question.far
-    reason = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}, and no more were needed"
-    if SequentialTest(far / APART, far, error, error, trials=samples, events=alarms).decision is Decision.BELOW:
-        return Certificate("certified", reason, alarms, samples)
-    known = ConfidenceSequence(question.confidence, far, trials=samples, events=alarms)
-    return Certificate("refuted", reason, alarms, samples) if known.decision(far) is Decision.ABOVE else None
+    alarms, armed = _columns(counts)
+    both_sides = 2.0 * question.confidence - 1.0
+    known = ConfidenceSequence(both_sides, question.burst, trials=sum(armed), events=sum(alarms))
+    if known.decision(question.far) is Decision.OPEN:
+        return None
+    bounds = bound_rate(alarms, armed, question.confidence, question.burst)
+    decided = dataclasses.replace(known, burst=bounds.burst).decision(question.far)
+    if decided is Decision.OPEN:
+        return None
+    counted = f"{number_of(sum(alarms), 'alarm')} in {number_of(sum(armed), 'sample')}"
+    answer: Answer = "certified" if decided is Decision.BELOW else "refuted"
+    return Certificate(answer, f"{counted}, and no more were needed", sum(alarms), sum(armed), basis=bounds.basis)
+
+
+def _columns(counts: Sequence[Count]) -> tuple[list[int], list[int]]:
+    """Alarms and armed samples of each run."""
+    return [count.alarms for count in counts], [count.armed for count in counts]

@@ -53,7 +53,7 @@ class Tally:
         for name, count in counts(rows).items():
             self._counts[cell][name] += count
         if (stop := self._stop) is not None:
-            known = RATES[stop.quantity].sequence(self._counts[cell], stop.confidence, stop.rate)
+            known = RATES[stop.quantity].sequence(self._counts[cell], stop.confidence)
             self.ended[cell] = known.decision(stop.rate) is not Decision.OPEN
 
     def total(self) -> dict[str, int]:

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from analogrig import config
 from analogrig.campaigns.plan import Cell, Plan
-from analogrig.campaigns.rows import RATES, Row, changes, check_rows, counts, is_valid
+from analogrig.campaigns.rows import RATES, Rate, Row, changes, check_rows, counts, is_valid
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.judging.bursts import dispersion
 from analogrig.plant import PARAMETERS
 from analogrig.storage import replace_file
 from analogrig.wording import number_of
@@ -129,7 +130,7 @@ class Summary:
         latencies = sorted(change.latency_n for change in found if change.latency_n is not None)
         bounds = [each.bound_n for each in found if each.latency_n is not None and each.bound_n is not None]
         errors = [each["errors"] for each in sound if each["errors"]]
-        rates = {name: rate.sequence(counted, CONFIDENCE).bounds for name, rate in RATES.items()}
+        rates = {name: _bounds(rate, sound) for name, rate in RATES.items()}
         return cls(
             **counted,
             trials=len(rows),
@@ -149,3 +150,10 @@ class Summary:
             },
             doubt=next((f"seed {each['seed']}: {each.get('why', '')}" for each in rows if not is_valid(each)), ""),
         )
+
+
+def _bounds(rate: Rate, sound: Sequence[Row]) -> tuple[float, float]:
+    """Bounds of a rate over valid trials; they cover the bursts that its counts by trial show."""
+    by_trial = [counts([each]) for each in sound]
+    shown = dispersion([each[rate.events] for each in by_trial], [each[rate.exposure] for each in by_trial])
+    return rate.sequence(counts(sound), CONFIDENCE, shown.burst).bounds

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from analogrig.config import MOST_NUMBER
+from analogrig.judging.bursts import BURST, ConfidenceSequence
 from analogrig.judging.exposure import exposure
-from analogrig.judging.statistics import ConfidenceSequence
 from analogrig.judging.verdict import ChangeVerdict, Verdict
 from analogrig.plant import MAX_SAMPLES, PARAMETERS
 from analogrig.run import Run
@@ -133,20 +133,18 @@ class Rate:
     exposure: str
     unit: str
     """Unit of the exposure, in words."""
-    expected: float
-    """Rate at which the bounds are tightest."""
+    burst: float
+    """Mean number of events of a burst that the bounds cover."""
 
-    def sequence(
-        self, counted: Mapping[str, int], confidence: float, around: float | None = None
-    ) -> ConfidenceSequence:
-        """Confidence sequence for the rate; ``around`` overrides the rate at which its bounds are tightest."""
-        expected = self.expected if around is None else around
-        return ConfidenceSequence(confidence, expected, trials=counted[self.exposure], events=counted[self.events])
+    def sequence(self, counted: Mapping[str, int], confidence: float, burst: float = 1.0) -> ConfidenceSequence:
+        """Confidence sequence for the rate; ``burst``: mean number of events of a burst, where more were observed."""
+        burst = max(burst, self.burst)
+        return ConfidenceSequence(confidence, burst, trials=counted[self.exposure], events=counted[self.events])
 
 
 RATES = {
     rate.events: rate
-    for rate in (Rate("missed", "visible", "changes", 0.05), Rate("false_alarms", "armed", "samples", 1e-6))
+    for rate in (Rate("missed", "visible", "changes", 1.0), Rate("false_alarms", "armed", "samples", BURST))
 }
 
 

@@ -39,9 +39,16 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--allowed",
         type=int,
-        default=5,
+        default=10,
         metavar="N",
         help="most alarms with which a test of fixed length passes (default: %(default)d)",
+    )
+    command.add_argument(
+        "--burst",
+        type=float,
+        default=5.0,
+        metavar="N",
+        help="mean number of alarms of a burst that the bounds cover (default: %(default)g; 1: independent alarms)",
     )
     command.add_argument("--sequential", action="store_true", help="stop as soon as the data decide at --confidence")
     command.add_argument(
@@ -85,6 +92,7 @@ def _run(arguments: argparse.Namespace) -> int:
         far=arguments.far,
         confidence=arguments.confidence,
         allowed=arguments.allowed,
+        burst=arguments.burst,
         sequential=arguments.sequential,
         rare=arguments.rare,
         first_seed=arguments.seed,
@@ -107,12 +115,14 @@ def _sentence(question: Question, answer: Certificate) -> str:
     return (
         f"{question.device['name']} on {question.rig['name']}: at most {question.far:g} false alarms per sample,"
         f" confidence {question.confidence:g} ({way}): {answer.outcome.upper()}\n  {answer.reason}"
+        + (f"\n  bounds for {answer.basis}" if answer.basis else "")
     )
 
 
 def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
     asked = {
-        name: getattr(question, name) for name in ("far", "confidence", "allowed", "sequential", "rare", "first_seed")
+        name: getattr(question, name)
+        for name in ("far", "confidence", "allowed", "burst", "sequential", "rare", "first_seed")
     }
     names = {"rig": question.rig["name"], "dut": question.device["name"], "scenario": question.scenario.name}
     return {**names, **asked, **vars(answer)}

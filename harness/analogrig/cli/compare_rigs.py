@@ -104,8 +104,8 @@ def _text(found: RigComparison) -> str:
 
     lines = [found.sentence, "", *_signal_lines(found), *_latency_lines(found)]
     for name, of in zip("AB", found.false_alarms, strict=True):
-        rates = f"{of.least:.2g} to {of.most:.2g} per sample"
-        lines.append(f"  false alarms on {name}: {of.alarms} in {number_of(of.samples, 'sample')} ({rates})")
+        rates = f"{of.least:.2g} to {of.most:.2g} per sample at {found.confidence:g}, for {of.basis}"
+        lines.append(f"  false alarms on {name}: {of.alarms} in {number_of(of.armed, 'armed sample')} ({rates})")
     lines += [f"  not compared: {why}" for why in found.invalid]
     return "\n".join([*lines, "", differences_text(found.verdicts)])
 

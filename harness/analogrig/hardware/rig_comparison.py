@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.campaigns.comparison import Comparison, compare
 from analogrig.campaigns.rows import Row, changes, row
-from analogrig.judging.statistics import mean_interval, rate_interval, upper_rate
+from analogrig.judging.bursts import bound_rate
+from analogrig.judging.statistics import mean_interval, upper_rate
 from analogrig.judging.verdict import judge
 from analogrig.run import CHANNELS, MEASURED, Run
 from analogrig.scenario import Scenario
@@ -80,18 +81,22 @@ class LatencyDifference:
 
 @dataclass(frozen=True)
 class FalseAlarms:
-    """False alarms of one rig, with bounds of their rate per sample."""
+    """False alarms of one rig, with a two-sided confidence interval of their rate per sample."""
 
     alarms: int
-    samples: int
+    armed: int
+    """Samples in which the trigger was armed."""
     least: float
     most: float
+    basis: str
+    """Assumption and data behind the interval."""
 
     @classmethod
     def of(cls, rows: Sequence[Row], confidence: float) -> Self:
         """Sum over plays."""
-        alarms, samples = (sum(each[name] for each in rows) for name in ("false_alarms", "samples"))
-        return cls(alarms, samples, *rate_interval(alarms, samples, confidence))
+        alarms, armed = ([each[name] for each in rows] for name in ("false_alarms", "armed"))
+        bounds = bound_rate(alarms, armed, 0.5 * (1.0 + confidence))
+        return cls(sum(alarms), sum(armed), bounds.low, bounds.high, bounds.basis)
 
 
 @dataclass(frozen=True)

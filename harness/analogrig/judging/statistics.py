@@ -1,25 +1,21 @@
-"""Confidence bounds and tests for event rates: fixed sample size, and sequential.
+"""Confidence bounds and tests for rates of independent events and for means.
 
-Clopper-Pearson bounds and ``Design`` require a sample size fixed in advance. A test that may stop early needs a
-``SequentialTest`` (two rates, fixed error probabilities) or a ``ConfidenceSequence`` (bounds valid at all times at
-once). ``mean_bounds`` bounds a rate that is estimated, not counted (analogrig.campaigns.rare). Sources: Clopper and
-Pearson, Biometrika 26 (1934); Wald, Sequential Analysis (1947); Robbins, Annals of Mathematical Statistics 41 (1970).
+Clopper-Pearson bounds require a sample size fixed in advance. A ``SequentialTest`` (two rates, fixed error
+probabilities) may stop early. ``mean_bounds`` bounds a rate that is estimated, not counted (analogrig.campaigns.rare).
+Sources: Clopper and Pearson, Biometrika 26 (1934); Wald, Sequential Analysis (1947).
 
-False alarms are counted as events among samples. The estimator restarts after each, so they are nearly independent.
+Trials are independent plays, diagnoses or machines. False alarms among samples are not: analogrig.judging.bursts.
 """
 
 from __future__ import annotations
 
-import bisect
 import enum
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-
-MOST_EVENTS = 10**9
 
 LEAST_FOR_MEAN = 8
 """Fewest estimates that ``mean_bounds`` accepts."""
@@ -44,7 +40,7 @@ def upper_rate(events: int, trials: int, confidence: float) -> float:
 
     :raises ValueError: impossible counts, or ``confidence`` not between 0 and 1.
     """
-    _check(events, trials, confidence)
+    check_trials(events, trials, confidence)
     if events == trials:
         return 1.0
     from scipy.special import betaincinv
@@ -54,26 +50,12 @@ def upper_rate(events: int, trials: int, confidence: float) -> float:
 
 def lower_rate(events: int, trials: int, confidence: float) -> float:
     """Lower confidence bound of a rate per trial; errors as ``upper_rate``."""
-    _check(events, trials, confidence)
+    check_trials(events, trials, confidence)
     if events == 0:
         return 0.0
     from scipy.special import betaincinv
 
     return float(betaincinv(events, trials - events + 1, 1.0 - confidence))
-
-
-def poisson_mean(events: int, confidence: float) -> float:
-    """Upper confidence bound of a Poisson mean: limit of ``trials * upper_rate`` for many trials; errors as there."""
-    _check(events, MOST_EVENTS, confidence)
-    from scipy.special import gammaincinv
-
-    return float(gammaincinv(events + 1, confidence))
-
-
-def rate_interval(events: int, trials: int, confidence: float) -> tuple[float, float]:
-    """Two-sided confidence interval of a rate (Clopper and Pearson); errors as ``upper_rate``."""
-    one_sided = 0.5 * (1.0 + confidence)
-    return lower_rate(events, trials, one_sided), upper_rate(events, trials, one_sided)
 
 
 def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, float]:
@@ -88,7 +70,7 @@ def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, f
     count = len(estimates)
     if count < LEAST_FOR_MEAN:
         raise ValueError(f"there must be at least {LEAST_FOR_MEAN} estimates, not {count}")
-    _check(0, count, confidence)
+    check_trials(0, count, confidence)
     from scipy.special import stdtrit
 
     mean = math.fsum(estimates) / count
@@ -101,37 +83,16 @@ def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, f
     return max(low, 0.0), high
 
 
+def one_sided(low: float, high: float, confidence: float) -> str:
+    """Two one-sided bounds in words that do not pass for one interval, which would be wrong twice as often."""
+    return f"at least {low:.3g} and at most {high:.3g}, each one-sided at {confidence:.6g}"
+
+
 def _invert_hall(quantile: float, skewness: float) -> float:
     """Inverse of Hall's transformation: Student's quantile, corrected for the skewness of the mean."""
     if abs(skewness) < LEAST_SKEWNESS:
         return quantile
     return 3.0 / skewness * (math.cbrt(1.0 + skewness * (quantile - skewness / 6.0)) - 1.0)
-
-
-@dataclass(frozen=True)
-class Design:
-    """Test of fixed length, passed with at most ``allowed`` events. ValueError: a value is out of range."""
-
-    rate: float
-    """Claimed upper limit of the rate."""
-    confidence: float
-    allowed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.rate < 1.0:
-            raise ValueError(f"rate must be between 0 and 1, not {self.rate:g}")
-        _check(self.allowed, MOST_EVENTS, self.confidence)
-
-    @property
-    def trials(self) -> int:
-        """Fewest trials that prove the claim: the upper bound with ``allowed`` events is at most ``rate``."""
-        least = high = self.allowed + 2
-        while not self._proves(high):
-            high *= 2
-        return bisect.bisect_left(range(high), 1, lo=max(least, high // 2), key=self._proves)
-
-    def _proves(self, trials: int) -> bool:
-        return upper_rate(self.allowed, trials, self.confidence) <= self.rate
 
 
 def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, float]:
@@ -140,7 +101,7 @@ def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, f
     :raises ValueError: fewer than two values, or ``confidence`` not between 0 and 1.
     """
     sample = np.asarray(values, dtype=np.float64)
-    _check(0, len(sample), confidence)
+    check_trials(0, len(sample), confidence)
     if len(sample) < 2:
         raise ValueError("there must be at least two values, not one")
     from scipy.special import stdtrit
@@ -177,7 +138,7 @@ class SequentialTest:
 
     def add(self, trials: int, events: int) -> Decision:
         """Add the counts of more trials; return the decision."""
-        _check_counts(events, trials)
+        check_counts(events, trials)
         self.trials += trials
         self.events += events
         return self.decision
@@ -199,80 +160,16 @@ class SequentialTest:
         return Decision.OPEN
 
 
-@dataclass
-class ConfidenceSequence:
-    """Confidence sequence of a rate: bounds valid after every trial at once (Robbins' mixture over Beta(a, b)).
-
-    By Ville's inequality the true rate ever leaves the bounds with a probability of at most 1 - confidence. The bounds
-    are tightest near ``expected_rate``. ValueError: a value is out of range.
-    """
-
-    confidence: float
-    expected_rate: float
-    trials: int = 0
-    events: int = 0
-    _a: float = field(init=False, default=0.5)
-    _b: float = field(init=False, default=0.0)
-
-    def __post_init__(self) -> None:
-        _check(0, 1, self.confidence)
-        if not 0.0 < self.expected_rate < 1.0:
-            raise ValueError(f"expected_rate must be between 0 and 1, not {self.expected_rate:g}")
-        self._b = self._a * (1.0 - self.expected_rate) / self.expected_rate
-
-    def add(self, trials: int, events: int) -> tuple[float, float]:
-        """Add the counts of more trials; return the bounds."""
-        _check_counts(events, trials)
-        self.trials += trials
-        self.events += events
-        return self.bounds
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """Interval of the rates whose martingale is below 1 / (1 - confidence)."""
-        if self.trials == 0:
-            return 0.0, 1.0
-        most_likely = self.events / self.trials
-        low = 0.0 if self.events == 0 else self._bisect_bound(most_likely, 0.0)
-        high = 1.0 if self.events == self.trials else self._bisect_bound(most_likely, 1.0)
-        return low, high
-
-    def decision(self, rate: float) -> Decision:
-        """Decision whether the true rate is below or above ``rate``."""
-        low, high = self.bounds
-        return Decision.BELOW if high <= rate else Decision.ABOVE if low > rate else Decision.OPEN
-
-    def _bisect_bound(self, inside: float, outside: float) -> float:
-        """Rate at which the martingale reaches its limit, by bisection between ``inside`` and ``outside``."""
-        for _ in range(200):
-            middle = 0.5 * (inside + outside)
-            if middle in (inside, outside):
-                break
-            if self._log_martingale(middle) < -math.log1p(-self.confidence):
-                inside = middle
-            else:
-                outside = middle
-        return outside
-
-    def _log_martingale(self, rate: float) -> float:
-        """Logarithm of the mixture likelihood over the likelihood of ``rate``."""
-        failures = self.trials - self.events
-        mixed = _log_beta(self._a + self.events, self._b + failures) - _log_beta(self._a, self._b)
-        return mixed - self.events * math.log(rate) - failures * math.log1p(-rate)
-
-
-def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
-
-
-def _check(events: int, trials: int, confidence: float) -> None:
-    _check_counts(events, trials)
+def check_trials(events: int, trials: int, confidence: float) -> None:
+    """:raises ValueError: impossible counts, or ``confidence`` not between 0 and 1."""
+    check_counts(events, trials)
     if trials < 1:
         raise ValueError("there must be at least one trial")
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence must be between 0 and 1, not {confidence:g}")
 
 
-def _check_counts(events: int, trials: int) -> None:
+def check_counts(events: int, trials: int) -> None:
+    """:raises ValueError: more events than trials, or fewer than none."""
     if not 0 <= events <= trials:
         raise ValueError(f"there cannot be {events} events in {trials} trials")

@@ -13,6 +13,7 @@ from analogrig.campaigns.results import CONFIDENCE, Results, Summary
 from analogrig.campaigns.rows import RATES
 from analogrig.errors import ConfigurationError
 from analogrig.identity import Identity
+from analogrig.judging.bursts import BURST
 from analogrig.reporting.page import FOLDER, assemble_page
 from analogrig.reporting.tables import provenance
 from analogrig.storage import replace_file
@@ -28,6 +29,9 @@ _DEEPEST = (0, 114, 178)
 """Blue of Okabe and Ito for the largest value; a value of zero is white."""
 
 MOST_MAPS = 40
+
+_BOUNDS = f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended, for bursts of {BURST:g} false alarms on average"
+"""Note on the bounds in the tables."""
 
 
 def _labelled(results: Results) -> list[tuple[dict[str, str], Summary]]:
@@ -105,7 +109,7 @@ def text(results: Results) -> str:
         rows.append([*("all" if name == names[0] else "" for name in names), *_numbers(total)])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
-    notes = [f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"]
+    notes = [f"{_BOUNDS}; latency, p95 and bound in samples"]
     if total.inconclusive:
         notes.append(f"{number_of(total.inconclusive, 'trial')} inconclusive, such as {total.doubt}")
     return "\n".join(
@@ -240,7 +244,7 @@ def _table(results: Results) -> str:
     head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in names)
     head += "".join(f'<th scope="col" class="number">{column.title}</th>' for column in COLUMNS)
     rows = "".join(f"<tr>{_row(list(each.values()), summary)}</tr>" for each, summary in cells)
-    caption = f"Bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency and bound in samples from the change"
+    caption = f"{_BOUNDS.capitalize()}; latency and bound in samples from the change"
     return (
         f'<div class="scroll"><table class="numbers"><caption>{caption}</caption>'
         f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"

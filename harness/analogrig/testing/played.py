@@ -17,8 +17,8 @@ from typing import Concatenate
 import numpy as np
 from numpy.typing import ArrayLike
 
+from analogrig.judging.bursts import BURST, Design, bound_rate
 from analogrig.judging.exposure import exposure
-from analogrig.judging.statistics import Design, upper_rate
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChangeVerdict, Verdict, judge
 from analogrig.run import Run
 from analogrig.scenario import Statement
@@ -84,8 +84,8 @@ class Played:
     def detects(self, within: float | None = None) -> Finding:
         """Finding: every detectable change raised an alarm before the next change.
 
-        :param within: and not later than so many times its information bound (and the bound's own sample); None: than
-            the scenario's ``[expect]`` says.
+        :param within: and not later than ``within`` times its information bound, rounded, plus one sample (for the
+            sample of the bound itself); None: not later than the scenario's ``[expect]`` allows.
         """
         if not self.verdict.tweaks:
             return Finding(holds=False, why="nothing has changed, so nothing could be detected")
@@ -181,47 +181,49 @@ def _failure_at_instant(tweak: ChangeVerdict, within: float | None) -> str:
     if tweak.latency_n is None:
         return f"{tweak.what} at {tweak.sample} was missed (bound {tweak.bound_n})"
     if within is None:
-        late, limit = tweak.late, tweak.deadline_n
+        late, allowed = tweak.late, f"{tweak.deadline_n}"
     else:
-        limit = round(within * (tweak.bound_n or 0)) + 1
-        late = tweak.latency_n > limit
+        bound_n = tweak.bound_n or 0
+        limit_n = round(within * bound_n) + 1
+        late, allowed = tweak.latency_n > limit_n, f"{limit_n} ({within:g} x bound {bound_n} + 1)"
     latency = number_of(tweak.latency_n or 0, "sample")
-    return f"{tweak.what} at {tweak.sample}: {latency}, allowed {limit}" if late else ""
+    return f"{tweak.what} at {tweak.sample}: {latency}, allowed {allowed}" if late else ""
 
 
-def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
+def rate_below(rate: float, played: Iterable[Played], *, confidence: float, burst: float = BURST) -> Finding:
     """Finding: with ``confidence`` (0 to 1) the false-alarm rate is below ``rate`` alarms per sample.
 
     The number of plays must be fixed beforehand. The finding does not hold if one of them is not valid. A play counts
     once, with the samples in which its trigger was armed (``analogrig.judging.exposure``).
 
-    :raises ValueError: ``rate`` or ``confidence`` is out of range.
+    :param burst: mean number of alarms of a burst that the bound covers; 1: alarms are taken as independent.
+    :raises ValueError: ``rate``, ``confidence`` or ``burst`` is out of range.
     """
     plays = list({_samples_of(each.run): each for each in played}.values())
-    finding = _rate_below(rate, plays, confidence)
+    finding = _rate_below(rate, plays, confidence, burst)
     if plays:
-        finding = dataclasses.replace(finding, statement=_of_all(plays, rate, confidence), run=plays[0].run)
+        finding = dataclasses.replace(finding, statement=_of_all(plays, rate, confidence, burst), run=plays[0].run)
         plays[0].note(finding)
     return finding
 
 
-def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Finding:
+def _rate_below(rate: float, plays: Sequence[Played], confidence: float, burst: float) -> Finding:
     invalid = [each.verdict.reasons[0] for each in plays if not each.verdict.valid]
     if invalid:
         of = number_of(len(plays), "play")
         return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {of}, such as: {invalid[0]}")
-    events = sum(len(each.verdict.false_alarms) for each in plays)
-    samples = sum(exposure(each.run).armed for each in plays)
-    if not samples:
+    alarms = [len(each.verdict.false_alarms) for each in plays]
+    armed = [exposure(each.run).armed for each in plays]
+    if not any(armed):
         why = exposure(plays[0].run).lack_of_evidence if plays else "there is none"
         return Finding(holds=False, why=f"no alarm could be raised in any of {number_of(len(plays), 'play')}: {why}")
-    bound = upper_rate(events, samples, confidence)
-    why = f"{number_of(events, 'false alarm')} in {number_of(samples, 'sample')}"
-    why += f": the rate is below {bound:.3g} per sample with {confidence:.4%} confidence"
-    if bound > rate:
-        needed = Design(rate=rate, confidence=confidence, allowed=events).trials
+    bounds = bound_rate(alarms, armed, confidence, burst)
+    why = f"{number_of(sum(alarms), 'false alarm')} in {number_of(sum(armed), 'sample')}"
+    why += f": the rate is below {bounds.high:.3g} per sample with {confidence:.4%} confidence, for {bounds.basis}"
+    if bounds.high > rate:
+        needed = Design(rate, confidence, sum(alarms), bounds.burst).trials
         why += f"; to show {rate:g} with so many alarms takes {number_of(needed, 'sample')}"
-    return Finding(bound <= rate, why)
+    return Finding(bounds.high <= rate, why)
 
 
 def _samples_of(run: Run) -> tuple[str, bytes]:
@@ -229,7 +231,7 @@ def _samples_of(run: Run) -> tuple[str, bytes]:
     return str(run.conditions.dut["name"]), hashlib.sha256(run.codes.tobytes()).digest()
 
 
-def _of_all(plays: Sequence[Played], rate: float, confidence: float) -> Statement | None:
+def _of_all(plays: Sequence[Played], rate: float, confidence: float, burst: float) -> Statement | None:
     """Statement about all plays; None if a scenario and its first seed do not describe them all."""
     conditions = [each.run.conditions for each in plays]
     first = conditions[0]
@@ -237,4 +239,5 @@ def _of_all(plays: Sequence[Played], rate: float, confidence: float) -> Statemen
         each.seed != first.seed + number or each.scenario != first.scenario for number, each in enumerate(conditions)
     ):
         return None
-    return Statement("rate_of_plays_below", {"rate": rate, "confidence": confidence, "plays": len(plays)})
+    arguments = {"rate": rate, "confidence": confidence, "plays": len(plays), "burst": burst}
+    return Statement("rate_of_plays_below", arguments)

@@ -14,5 +14,5 @@ def test_every_change_of_20_percent_is_detected_and_learned(hil_play, seed):
 
 
 def test_false_alarm_rate_is_below_1_in_10_000_samples(hil_play):
-    plays = [hil_play("healthy", seed=seed) for seed in range(2)]  # 40,000 samples
+    plays = [hil_play("healthy", seed=seed) for seed in range(8)]  # 160,000 samples
     assert rate_below(1e-4, plays, confidence=0.95)

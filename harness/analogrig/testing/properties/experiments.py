@@ -24,8 +24,9 @@ from analogrig.devices.description import DeviceDescription
 from analogrig.devices.device import Device
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, ConfigurationError
+from analogrig.judging.bursts import BURST, lower_count
 from analogrig.judging.exposure import Exposure, exposure
-from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds
+from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds, one_sided
 from analogrig.judging.verdict import judge, unreported
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
@@ -94,10 +95,10 @@ def _check_valid(*plays: Played) -> None:
 
 @experiment
 def rate_of_plays_below(
-    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plays: int
+    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plays: int, burst: float = BURST
 ) -> Finding:
     """Finding of ``analogrig.testing.played.rate_below`` for a given number of plays."""
-    return rate_below(rate, _play_all(play, scenario, seed, plays), confidence=confidence)
+    return rate_below(rate, _play_all(play, scenario, seed, plays), confidence=confidence, burst=burst)
 
 
 @experiment
@@ -131,7 +132,10 @@ def false_alarms_at_most(
 def false_alarms_of_plants_rarer(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plants: int, samples_each: int
 ) -> Finding:
-    """Finding: over random plants, the lower confidence limit of the false-alarm rate is at most ``rate``."""
+    """Finding: over random plants, the lower confidence limit of the false-alarm rate is at most ``rate``.
+
+    It covers bursts of BURST alarms on average. Plants may differ in their rates, which is no burst.
+    """
     from analogrig.testing.strategies import random_suspensions
 
     bench = _direct_bench(play, f"takes {plants * samples_each} samples: analogrig campaign")
@@ -141,7 +145,7 @@ def false_alarms_of_plants_rarer(
     if nothing := next((each.lack_of_evidence for each in shown if each.lack_of_evidence), ""):
         raise Inconclusive(nothing)
     count, samples = sum(map(len, alarms)), sum(each.armed for each in shown)
-    low = lower_rate(count, samples, confidence)
+    low = lower_count(count, confidence, BURST) / samples
     why = f"{count} false alarms in {samples} samples: the rate is at least {low:.2g} per sample, allowed {rate:g}"
     if _MOST_UNARMED * samples < plants * samples_each:
         raise Inconclusive(f"the trigger was armed in {samples} of {plants * samples_each} samples")
@@ -166,7 +170,7 @@ def rare_false_alarms_rarer(
         pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
     rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
     low, high = mean_bounds(rates, confidence)
-    why = f"{np.mean(rates):.2g} false alarms per sample (between {low:.2g} and {high:.2g}), allowed {rate:g}"
+    why = f"{np.mean(rates):.2g} false alarms per sample, {one_sided(low, high, confidence)}, allowed {rate:g}"
     if low <= rate:
         return Finding(holds=True, why=why)
     return _witness(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)

@@ -1,0 +1,264 @@
+"""Bounds of event rates that hold although events come in bursts.
+
+Bursts are taken as independent. Each event of a burst is followed by another one with probability 1 - 1/burst, so that
+``burst`` is the mean number of events of a burst; 1 makes all events independent. Counts then follow the Polya-Aeppli
+distribution (Johnson, Kemp and Kotz, Univariate Discrete Distributions, 2005, section 9.7). Its variance is
+2 burst - 1 times its mean. Rare events of a stationary process form such independent bursts, and 1/burst is their
+extremal index (Hsing, Huesler and Leadbetter, Probability Theory and Related Fields 78, 1988).
+
+No data replace the assumption on bursts (Bahadur and Savage, Annals of Mathematical Statistics 27, 1956). Why, and what
+it costs: harness/docs/decisions/045-bursts.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.judging.statistics import Decision, check_counts, check_trials
+from analogrig.wording import number_of
+
+BURST = 5.0
+"""Mean number of false alarms in a burst that every bound of a false-alarm rate covers, unless another is set."""
+
+SIGNIFICANT = 0.01
+"""Significance level of the test for overdispersion."""
+
+_DRAWS = 999
+"""Number of simulated counts in the test for overdispersion."""
+
+_MOST_BLOCKS = 1000
+"""Largest number of blocks in that test; more plays are merged, neighbours with neighbours."""
+
+_SIGMAS, _LEAST_WIDTH = 12.0, 60
+"""Half width of a sum over numbers of bursts: in standard deviations, and in bursts. The rest is below 1e-30."""
+
+_TERMS = np.arange(16.0)
+_WEIGHTS: NDArray[np.float64] = 1.0 / ((_TERMS + 1.0) * (_TERMS + 2.0))
+"""(16,) weights of a mixture; their sum is below 1. The first terms suit few events, the last ones 1e8 of them."""
+
+_TILTS: NDArray[np.float64] = 4.0 * np.exp2(-_TERMS)
+"""(16,) exponents of the martingales that bound a rate from above."""
+
+_SHARES: NDArray[np.float64] = 0.9 * np.exp2(-_TERMS)
+"""(16,) tilts of the martingales that bound a rate from below, relative to the largest with a finite mean."""
+
+
+# ---------------------------------------------------------------------------------------------------- fixed sample size
+
+
+def upper_count(events: int, confidence: float, burst: float = 1.0) -> float:
+    """Upper confidence bound of the expected number of events, one-sided; Garwood's (1936) for ``burst`` 1.
+
+    :raises ValueError: a negative number of events, ``confidence`` not between 0 and 1, or ``burst`` below 1.
+    """
+    _check(events, confidence, burst)
+    return _rising_root(lambda mean: 1.0 - confidence - _probabilities(events, mean, burst)[0])
+
+
+def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
+    """Lower confidence bound of the expected number of events; otherwise as ``upper_count``."""
+    _check(events, confidence, burst)
+    if events == 0:
+        return 0.0
+    return _rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
+
+
+def _probabilities(events: int, mean: float, burst: float) -> tuple[float, float]:
+    """Probabilities of at most ``events`` events and of more, where ``mean`` are expected.
+
+    k bursts have at most n events if at least k of n independent events are the last one of their burst.
+    """
+    from scipy.special import bdtr, bdtrc, gammaln, xlogy
+
+    bursts = mean / burst
+    width = int(_SIGMAS * math.sqrt(bursts)) + _LEAST_WIDTH
+    number = np.arange(max(0, int(bursts) - width), int(bursts) + width + 1)
+    poisson = np.exp(xlogy(number, bursts) - bursts - gammaln(number + 1.0))
+    some = (number > 0) & (number <= events)
+    at_most, more = (number == 0).astype(np.float64), (number > events).astype(np.float64)
+    at_most[some] = bdtrc(number[some] - 1.0, events, 1.0 / burst)
+    more[some] = bdtr(number[some] - 1.0, events, 1.0 / burst)
+    return float(poisson @ at_most), float(poisson @ more)
+
+
+def _rising_root(function: Callable[[float], float]) -> float:
+    """Root above 0 of a rising function that is negative at 0."""
+    from scipy.optimize import brentq
+
+    high = 1.0
+    while function(high) < 0.0:
+        high *= 2.0
+    return float(brentq(function, 0.0, high, xtol=1e-300, rtol=1e-12))
+
+
+@dataclass(frozen=True)
+class Design:
+    """Test of fixed length, passed with at most ``allowed`` events. ValueError: a value is out of range."""
+
+    rate: float
+    """Claimed upper limit of the rate."""
+    confidence: float
+    allowed: int = 0
+    burst: float = BURST
+    """Mean number of events of a burst."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.rate < 1.0:
+            raise ValueError(f"rate must be between 0 and 1, not {self.rate:g}")
+        _check(self.allowed, self.confidence, self.burst)
+
+    @property
+    def trials(self) -> int:
+        """Fewest trials that prove the claim: the upper bound with ``allowed`` events is at most ``rate``."""
+        return math.ceil(upper_count(self.allowed, self.confidence, self.burst) / self.rate)
+
+
+# ------------------------------------------------------------------------------------------------------- overdispersion
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """Index of dispersion of counts over blocks, with its test against independent events."""
+
+    blocks: int
+    events: int
+    index: float
+    """Variance over mean of the counts, for equal blocks; 1 is expected of independent events."""
+    p: float
+    """Probability of so large an index if events are independent."""
+
+    @property
+    def burst(self) -> float:
+        """Mean number of events of a burst by the method of moments; 1 unless the index is significant."""
+        return max(1.0, 0.5 * (self.index + 1.0)) if self.p <= SIGNIFICANT else 1.0
+
+    def __str__(self) -> str:
+        where = f"{number_of(self.events, 'alarm')} in {number_of(self.blocks, 'block')} of plays"
+        if self.events < 2 or self.blocks < 2:
+            return f"{where}, too few for a test"
+        return f"{where}, index of dispersion {self.index:.3g}, p = {self.p:.2g}"
+
+
+def dispersion(events: Sequence[int], trials: Sequence[int]) -> Dispersion:
+    """Dispersion of the counts of plays of ``trials`` each (Fisher, Biometrics 6, 1950).
+
+    Given their total, counts of independent events are multinomial. The p-value counts such draws with at least the
+    observed index (Dwass, Annals of Mathematical Statistics 28, 1957); the draws have a fixed seed.
+    """
+    counted = np.array([(each, length) for each, length in zip(events, trials, strict=True) if length], np.int64)
+    blocks, total = min(len(counted), _MOST_BLOCKS), sum(events)
+    if blocks < 2 or total < 2:
+        return Dispersion(blocks, total, 1.0, 1.0)
+    counted = np.add.reduceat(counted, np.arange(blocks) * len(counted) // blocks)
+    share = counted[:, 1] / counted[:, 1].sum()
+
+    def index(counts: NDArray[np.int64]) -> float:
+        return float(np.sum((counts - total * share) ** 2 / (total * share))) / (blocks - 1)
+
+    observed, rng = index(counted[:, 0]), np.random.default_rng(0)
+    larger = sum(index(rng.multinomial(total, share)) >= observed * (1.0 - 1e-12) for _ in range(_DRAWS))
+    return Dispersion(blocks, total, observed, (1 + larger) / (1 + _DRAWS))
+
+
+@dataclass(frozen=True)
+class RateBounds:
+    """One-sided confidence bounds of a rate. As one interval, they have twice the error probability."""
+
+    low: float
+    high: float
+    burst: float
+    """Mean number of events of a burst that they cover."""
+    basis: str
+    """Assumption and data behind ``burst``, as a noun phrase."""
+
+
+def bound_rate(events: Sequence[int], trials: Sequence[int], confidence: float, burst: float = BURST) -> RateBounds:
+    """One-sided bounds of a rate per trial from counts over independent plays.
+
+    They cover bursts of ``burst`` events on average, or of more if the counts are dispersed as by more.
+
+    :raises ValueError: no trials, impossible counts, ``confidence`` not between 0 and 1, or ``burst`` below 1.
+    """
+    total, length = sum(events), sum(trials)
+    check_trials(total, length, confidence)
+    found = dispersion(events, trials)
+    covered = max(burst, found.burst)
+    low, high = (bound(total, confidence, covered) / length for bound in (lower_count, upper_count))
+    return RateBounds(min(low, 1.0), min(high, 1.0), covered, _basis(burst, found))
+
+
+def _basis(burst: float, found: Dispersion) -> str:
+    if found.burst > burst:
+        return f"bursts of {found.burst:.3g} alarms on average, observed ({found})"
+    assumed = f"bursts of {burst:g} alarms on average" if burst > 1.0 else "independent alarms"
+    return f"{assumed}, assumed ({found})"
+
+
+# ------------------------------------------------------------------------------------------------------------- anytime
+
+
+@dataclass
+class ConfidenceSequence:
+    """Confidence sequence of a rate: bounds valid after every trial at once. ValueError: a value is out of range.
+
+    With u > 0 and 1/k = burst + 1/(exp(u) - 1), exp(rate k trials - u events) is a supermartingale for every rate that
+    is not below ``rate``; u < 0 serves the other side. A mixture over u bounds the rate by Ville's inequality (Howard,
+    Ramdas, McAuliffe and Sekhon, Annals of Statistics 49, 2021). Each side has half of the error probability.
+    """
+
+    confidence: float
+    burst: float = BURST
+    """Mean number of events of a burst; also valid for any bursts of at most so many."""
+    trials: int = 0
+    events: int = 0
+
+    def __post_init__(self) -> None:
+        _check(self.events, self.confidence, self.burst)
+
+    def add(self, trials: int, events: int) -> tuple[float, float]:
+        """Add the counts of more trials; return the bounds."""
+        check_counts(events, trials)
+        self.trials += trials
+        self.events += events
+        return self.bounds
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Interval of the rates at which neither martingale has reached 2 / (1 - confidence)."""
+        if self.trials == 0:
+            return 0.0, 1.0
+        limit = math.log(2.0 / (1.0 - self.confidence))
+        low = 0.0
+        if self._log_excess(0.0) > limit:
+            low = _rising_root(lambda count: limit - self._log_excess(count))
+        high = _rising_root(lambda count: self._log_shortfall(count) - limit)
+        return min(low / self.trials, 1.0), min(high / self.trials, 1.0)
+
+    def decision(self, rate: float) -> Decision:
+        """Decision whether the true rate is below or above ``rate``."""
+        low, high = self.bounds
+        return Decision.BELOW if high <= rate else Decision.ABOVE if low > rate else Decision.OPEN
+
+    def _log_shortfall(self, count: float) -> float:
+        """Logarithm of the martingale that grows if fewer than the expected ``count`` events occur."""
+        gains = count / (self.burst + 1.0 / np.expm1(_TILTS))
+        return float(np.logaddexp.reduce(np.log(_WEIGHTS) + gains - _TILTS * self.events))
+
+    def _log_excess(self, count: float) -> float:
+        """Logarithm of the martingale that grows if more than the expected ``count`` events occur."""
+        losses = count * _SHARES / (self.burst * (1.0 - _SHARES))
+        return float(np.logaddexp.reduce(np.log(_WEIGHTS) - np.log1p(-_SHARES / self.burst) * self.events - losses))
+
+
+def _check(events: int, confidence: float, burst: float) -> None:
+    if events < 0:
+        raise ValueError(f"there cannot be {number_of(events, 'event')}")
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must be between 0 and 1, not {confidence:g}")
+    if not 1.0 <= burst < math.inf:
+        raise ValueError(f"burst must be 1 or more, not {burst:g}")
