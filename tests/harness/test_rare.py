@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from analogrig.bench import direct_bench
 from analogrig.campaigns import rare
 from analogrig.campaigns.certificate import Question, certify, estimate_once
 from analogrig.campaigns.plan import rig_table
-from analogrig.campaigns.rare import PLAY_N, false_alarm_rate
+from analogrig.campaigns.rare import FOLLOWED_N, PLAY_N, false_alarm_rate
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
 from analogrig.devices.catalogue_description import CatalogueDescription, has_snapshots
@@ -52,22 +53,45 @@ def mean_rate(arl0: float, plays: int, branches: int) -> tuple[float, float]:
     return float(np.mean(rates)), float(np.std(rates, ddof=1)) / math.sqrt(plays)
 
 
-def waited_for(arl0: float, plays: int) -> tuple[float, float]:
-    """First alarms per sample of plays up to the first, with the standard error of a count."""
-    first = device(arl0).estimator.warm_up_n + 16
-    bench = direct_bench(emulator(), device(arl0), alarms_only=True)
-    played = dataclasses.replace(HEALTHY, samples=first + PLAY_N)
-    alarms = [bench.play(played, seed).alarm_index for seed in range(1000, 1000 + plays)]
-    ends = [int(each[each >= first][0]) + 1 if (each >= first).any() else played.samples for each in alarms]
-    events, samples = sum(end < played.samples for end in ends), sum(end - first for end in ends)
-    return events / samples, math.sqrt(events) / samples
+def waited_for(device: CatalogueDescription, plays: int) -> tuple[float, float, NDArray[np.int64]]:
+    """First alarms per sample of plays up to the first, with the standard error of a count; later alarms of each."""
+    first = device.estimator.warm_up_n + 16
+    bench = direct_bench(emulator(), device, alarms_only=True)
+    played = dataclasses.replace(HEALTHY, samples=first + PLAY_N + FOLLOWED_N)
+    alarms = [bench.play(played, seed).alarm_index - first for seed in range(1000, 1000 + plays)]
+    firsts = [min(each[each >= 0].tolist(), default=PLAY_N) for each in alarms]
+    events, samples = sum(each < PLAY_N for each in firsts), sum(min(each + 1, PLAY_N) for each in firsts)
+    later = [
+        np.count_nonzero((each > start) & (each <= start + FOLLOWED_N))
+        for each, start in zip(alarms, firsts, strict=True)
+        if start < PLAY_N
+    ]
+    return events / samples, math.sqrt(events) / samples, np.array(later)
 
 
 def test_rate_is_that_of_alarms_that_were_waited_for() -> None:
-    """A device with one false alarm in about 65,000 samples."""
-    (rate, error), (waited, off) = mean_rate(1000.0, plays=16, branches=500), waited_for(1000.0, plays=250)
+    """A device with one false alarm in about 65,000 samples, none of which come in bursts."""
+    (rate, error), (waited, off, _) = mean_rate(1000.0, plays=16, branches=500), waited_for(device(1000.0), plays=250)
     assert abs(rate - waited) < SURELY * math.hypot(error, off)
     assert math.hypot(error, off) < 0.2 * waited
+
+
+def test_alarms_after_an_alarm_are_as_many_as_those_that_were_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device that takes the noise for too small: some 0.7 alarms in the 1024 samples after one."""
+    keen = device(1000.0)
+    keen = dataclasses.replace(keen, estimator=dataclasses.replace(keen.estimator, noise_variance=0.9))
+
+    def rates() -> NDArray[np.float64]:
+        return np.array([false_alarm_rate(emulator(), keen, HEALTHY, seed, 300).rate for seed in range(16)])
+
+    every = rates()
+    monkeypatch.setattr(rare, "FOLLOWED_N", 0)
+    first = rates()
+    _, _, waited = waited_for(keen, plays=100)
+    ratio, expected = every.sum() / first.sum() - 1.0, waited.mean()
+    error = np.std(every - (1.0 + ratio) * first) / first.mean() / math.sqrt(len(first))
+    assert abs(ratio - expected) < SURELY * math.hypot(error, waited.std() / math.sqrt(len(waited)))
+    assert 0.3 < expected < 1.2
 
 
 def test_rate_does_not_depend_on_how_loud_the_branches_are(monkeypatch: pytest.MonkeyPatch) -> None:

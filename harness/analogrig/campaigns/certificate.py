@@ -5,8 +5,8 @@ in which the trigger was armed (analogrig.judging.exposure). Every alarm is a fa
 to observe are estimated by branches with louder noise (analogrig.campaigns.rare). Each of these estimates comes from a
 play of its own.
 
-Alarms may come in bursts. All bounds cover bursts of ``Question.burst`` alarms on average, or of more where the counts
-of the plays show them (analogrig.judging.bursts).
+Alarms may come in bursts. Bounds of counted alarms cover bursts of ``Question.burst`` alarms on average, or of more
+where the counts of the plays show them (analogrig.judging.bursts). For a rare rate, bursts are measured.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any, Literal
 from analogrig.bench import can_be_direct
 from analogrig.campaigns.plan import Case, device_of, open_table
 from analogrig.campaigns.plays import Count, close_devices, count_alarms
-from analogrig.campaigns.rare import LEAD_IN_N, Estimate, false_alarm_rate
+from analogrig.campaigns.rare import FOLLOWED_N, LEAD_IN_N, Estimate, false_alarm_rate
 from analogrig.campaigns.workers import Workers
 from analogrig.datasheet import Datasheet
 from analogrig.devices.catalogue_description import has_snapshots
@@ -231,10 +231,11 @@ def _certify_rare(question: Question, count: int, workers: Workers) -> Certifica
     rates = [each.rate for each in estimates]
     low, high = mean_bounds(rates, question.confidence)
     reason = (
-        f"the rate is {math.fsum(rates) / count:.3g}, {low:.3g} to {high:.3g}, from {number_of(count, 'estimate')},"
-        f" {number_of(samples, 'sample')}"
+        f"the rate is {math.fsum(rates) / count:.3g}, {one_sided(low, high, question.confidence)},"
+        f" from {number_of(count, 'estimate')}, {number_of(samples, 'sample')}"
     )
-    return Certificate(_answer(question.far, low, high), reason, alarms, samples, (low, high))
+    basis = f"bursts that end within {FOLLOWED_N} samples of their first alarm, measured"
+    return Certificate(_answer(question.far, low, high), reason, alarms, samples, (low, high), basis)
 
 
 def estimate_once(question: Question, seed: int) -> Estimate:

@@ -1,20 +1,24 @@
 """Rate of rare false alarms, by importance sampling: branches off a play with louder noise, weighted by likelihood.
 
-The rate is a mean over the samples of a play: the probability that the trigger's statistic is on the ground, 0, and
-climbs to an alarm without returning. Branches estimate it. They start from states of the play with the statistic on the
-ground, drawn uniformly, and continue up to an alarm or back to the ground. Their displacement has noise of its own, a
-few times as strong as the card's. A branch that ends in an alarm is weighted by the likelihood ratio of its noise. The
-mean is unbiased for any loudness (importance sampling; Siegmund, Annals of Statistics 4, 1976, for sequential tests).
-With twice the noise the likelihood ratio is nearly the statistic itself: all weights are about exp(-ceiling), and few
-branches suffice, however rare the alarms are. A mixture of LOUDER keeps single weights from being large (the balance
-heuristic of Veach and Guibas, SIGGRAPH 1995; Owen and Zhou, JASA 95, 2000). Plays of other seeds give the bounds of the
-mean: ``statistics.mean_bounds``. Why not splitting: harness/docs/decisions/024-importance-sampling.md.
+The rate of first alarms is a mean over the samples of a play: the probability that the trigger's statistic is on the
+ground, 0, and climbs to an alarm without returning. Branches estimate it. They start from states of the play with the
+statistic on the ground, drawn uniformly, and continue up to an alarm or back to the ground. Their displacement has
+noise of its own, a few times as strong as the card's. A branch that ends in an alarm is weighted by the likelihood
+ratio of its noise. The mean is unbiased for any loudness (importance sampling; Siegmund, Annals of Statistics 4, 1976,
+for sequential tests). With twice the noise the likelihood ratio is nearly the statistic itself: all weights are about
+exp(-ceiling), and few branches suffice, however rare the alarms are. A mixture of LOUDER keeps single weights from
+being large (the balance heuristic of Veach and Guibas, SIGGRAPH 1995; Owen and Zhou, JASA 95, 2000).
+
+Alarms may come in bursts. Some branches continue after their alarm with the card's noise, and the alarms of the next
+FOLLOWED_N samples count as well. Plays of other seeds give the bounds of the mean: ``statistics.mean_bounds``. Why not
+splitting: harness/docs/decisions/024-importance-sampling.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +39,10 @@ from analogrig.scenario import Scenario
 BRANCHES_N = 2_000
 """Number of branches off each play."""
 
-PLAY_N, TAIL_N = 20_000, 2_000
+FOLLOWED, FOLLOWED_N = 32, 1024
+"""Largest number of alarms of a play after which further ones are counted, and the samples in which they are."""
+
+PLAY_N, TAIL_N = 20_000, 2_000 + FOLLOWED_N
 """Samples of a play from which branches go off; and after them, into which they may go."""
 
 LOUDER = np.array([1.6, 2.0, 2.6])
@@ -57,7 +64,7 @@ class Estimate(NamedTuple):
     """Estimate from one play."""
 
     rate: float
-    """Alarms per sample; 0 if no branch ended in one."""
+    """Alarms per sample, with those that follow within FOLLOWED_N; 0 if no branch ended in one."""
     alarms: int
     """Number of branches that ended in an alarm."""
     samples: int
@@ -76,7 +83,7 @@ class _Branches(NamedTuple):
     log_ratios: NDArray[np.float64]
     """(b, len(LOUDER)): log-likelihood ratios of the branch's noise, each of the louder noises against the card's."""
 
-    def at(self, rows: NDArray[np.bool_]) -> _Branches:
+    def at(self, rows: NDArray[Any]) -> _Branches:
         return _Branches(self.kept[rows], self.following[rows], self.louder[rows], self.log_ratios[rows])
 
     @property
@@ -89,9 +96,9 @@ class _Branches(NamedTuple):
 def false_alarm_rate(
     rig: EmulatorRig, device: CatalogueDescription, scenario: Scenario, seed: int, branches: int = BRANCHES_N
 ) -> Estimate:
-    """Unbiased estimate of first alarms per sample of a warm estimator, from one play.
+    """Unbiased estimate of the alarms per sample of a warm estimator, from one play.
 
-    Valid for rates well below 1 / PLAY_N: a play ends with its first alarm.
+    Valid for rates well below 1 / PLAY_N, and for bursts that end within FOLLOWED_N samples.
 
     :param scenario: one without changes; its number of samples does not matter.
     :raises ConfigurationError: the trigger has no ground to come back to; or as Rig.perform.
@@ -137,12 +144,29 @@ class _Climbs:
         off = np.sort(self._rng.choice(ground, min(count, len(ground)), replace=False))
         louder = LOUDER[self._rng.permutation(len(off)) % len(LOUDER)]
         going = _Branches(self._kept_at(off), off + 1, louder, np.zeros((len(off), len(LOUDER))))
-        weights: list[float] = []
+        every: list[_Branches] = []
         while len(going.kept):
             arrived, going = self._go_on(going)
-            weights += arrived.weights
-        rate = len(ground) / length * math.fsum(weights) / len(off)
-        return Estimate(rate, len(weights), self._samples)
+            every.append(arrived)
+        weights = [weight for arrived in every for weight in arrived.weights]
+        alarms = math.fsum(weights) + self._later_alarms(every, weights)
+        return Estimate(len(ground) / length * alarms / len(off), len(weights), self._samples)
+
+    def _later_alarms(self, every: Sequence[_Branches], weights: Sequence[float]) -> float:
+        """Weighted number of alarms in the FOLLOWED_N samples after those of the branches, from some of these."""
+        if not weights:
+            return 0.0
+        arrived = _Branches(*map(np.concatenate, zip(*every, strict=True)))
+        chosen = self._rng.choice(len(weights), min(FOLLOWED, len(weights)), replace=False)
+        going = arrived.at(chosen)._replace(louder=np.ones(len(chosen)))
+        later = np.zeros(len(chosen))
+        for _ in range(FOLLOWED_N // _STRETCH_N):
+            signals, _ = self._louder(going)
+            _, alarm, kept = self._estimator.branch(going.kept, *signals)
+            self._samples += alarm.size
+            later += alarm.sum(axis=1)
+            going = going._replace(kept=kept, following=going.following + _STRETCH_N)
+        return float(np.asarray(weights)[chosen] @ later) * len(weights) / len(chosen)
 
     def _ground(self, first: int) -> tuple[NDArray[np.intp], int]:
         """Samples after which the statistic is on the ground, up to the first alarm, and the number of samples
@@ -183,6 +207,10 @@ class _Climbs:
         ratios = 0.5 * (1.0 - LOUDER**-2) * drawn[:, :, None] ** 2 - np.log(LOUDER)
         log_ratios = going.log_ratios[:, None, :] + np.cumsum(ratios, axis=1)
         last = np.minimum(arrives, _STRETCH_N - 1)
+        for ends in np.unique(last[arrives < _STRETCH_N]):  # the rest of the stretch after an alarm does not count
+            rows = arrives == ends
+            cut = slice(ends + 1)
+            _, _, kept[rows] = self._estimator.branch(going.kept[rows], u[rows, cut], y[rows, cut], valid[rows, cut])
         after = _Branches(kept, going.following + last + 1, going.louder, log_ratios[np.arange(len(last)), last])
         arrived = (arrives < _STRETCH_N) & (arrives <= comes_back)
         still = (arrives == _STRETCH_N) & (comes_back == _STRETCH_N)

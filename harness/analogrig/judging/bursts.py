@@ -156,13 +156,12 @@ def dispersion(events: Sequence[int], trials: Sequence[int]) -> Dispersion:
         return Dispersion(blocks, total, 1.0, 1.0)
     counted = np.add.reduceat(counted, np.arange(blocks) * len(counted) // blocks)
     share = counted[:, 1] / counted[:, 1].sum()
-
-    def index(counts: NDArray[np.int64]) -> float:
-        return float(np.sum((counts - total * share) ** 2 / (total * share))) / (blocks - 1)
-
-    observed, rng = index(counted[:, 0]), np.random.default_rng(0)
-    larger = sum(index(rng.multinomial(total, share)) >= observed * (1.0 - 1e-12) for _ in range(_DRAWS))
-    return Dispersion(blocks, total, observed, (1 + larger) / (1 + _DRAWS))
+    drawn = np.random.default_rng(0).multinomial(total, share, size=_DRAWS)
+    observed, *indices = (
+        (np.vstack((counted[:, 0], drawn)) - total * share) ** 2 @ (1.0 / (total * share)) / (blocks - 1)
+    )
+    larger = np.count_nonzero(indices >= observed * (1.0 - 1e-12))
+    return Dispersion(blocks, total, float(observed), (1 + larger) / (1 + _DRAWS))
 
 
 @dataclass(frozen=True)
@@ -232,17 +231,23 @@ class ConfidenceSequence:
         """Interval of the rates at which neither martingale has reached 2 / (1 - confidence)."""
         if self.trials == 0:
             return 0.0, 1.0
-        limit = math.log(2.0 / (1.0 - self.confidence))
         low = 0.0
-        if self._log_excess(0.0) > limit:
-            low = _rising_root(lambda count: limit - self._log_excess(count))
-        high = _rising_root(lambda count: self._log_shortfall(count) - limit)
+        if self._log_excess(0.0) > self._limit:
+            low = _rising_root(lambda count: self._limit - self._log_excess(count))
+        high = _rising_root(lambda count: self._log_shortfall(count) - self._limit)
         return min(low / self.trials, 1.0), min(high / self.trials, 1.0)
 
     def decision(self, rate: float) -> Decision:
-        """Decision whether the true rate is below or above ``rate``."""
-        low, high = self.bounds
-        return Decision.BELOW if high <= rate else Decision.ABOVE if low > rate else Decision.OPEN
+        """Decision whether the true rate is below or above ``rate``: on which side of it the bounds lie."""
+        count = rate * self.trials
+        if self._log_shortfall(count) >= self._limit:
+            return Decision.BELOW
+        return Decision.ABOVE if self._log_excess(count) > self._limit else Decision.OPEN
+
+    @property
+    def _limit(self) -> float:
+        """Logarithm of the value that each martingale reaches with at most half of the error probability."""
+        return math.log(2.0 / (1.0 - self.confidence))
 
     def _log_shortfall(self, count: float) -> float:
         """Logarithm of the martingale that grows if fewer than the expected ``count`` events occur."""
