@@ -134,7 +134,7 @@ def _claim(claim: Table) -> str:
 def _data(data: Table, instructions: Table) -> str:
     rows = [_texts((NAMES[key], *_quality(each), instructions[key])) for key, each in data["schemes"].items()]
     if data["bound_n"]:
-        rows.append(_texts(("bound of any detector", _list(data["bound_n"]), *[""] * 6)))
+        rows.append(_texts(("first-order bound", _list(data["bound_n"]), *[""] * 6)))
     return f"<h3>{text(data['name'][0].upper() + data['name'][1:])}</h3>{table('', heading(_QUALITY), rows)}"
 
 

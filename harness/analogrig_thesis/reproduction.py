@@ -108,7 +108,7 @@ def reproduce() -> Reproduction:
 def compare(simulation: Simulation, circuit: CircuitRuns) -> Table:
     """Quality of all schemes on the same data: the question of section 5.6; deterministic.
 
-    ``data``: quality by key of the scheme, and the least mean latency of any detector with a false alarm in 100,000
+    ``data``: quality by key of the scheme, and the first-order bound of the mean latency at a false alarm in 100,000
     samples by change. ``seeds``: figures over many seeds. ``instructions``: of the C a sample on x86-64, counted by
     tests/thesis/cost.py.
     """

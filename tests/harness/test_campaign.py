@@ -33,7 +33,7 @@ from analogrig.devices.library import LIBRARY
 from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
-from analogrig.judging.statistics import ConfidenceSequence
+from analogrig.judging.bursts import ConfidenceSequence
 from analogrig.judging.verdict import judge
 from analogrig.reporting.campaign import text
 from analogrig.rigs.description import open_rig
@@ -380,7 +380,7 @@ def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None
 
 
 def test_samples_of_the_warm_up_do_not_end_a_cell(tmp_path: Path) -> None:
-    """At most 0.01 a sample at 90 % takes some 600 without an alarm; of 160 samples at most 10 are armed."""
+    """At most 0.01 a sample at 90 % takes some 1800 without an alarm; of 160 samples at most 10 are armed."""
     stop = '[stop]\nquantity = "false_alarms"\nrate = 0.01\nconfidence = 0.9\n'
     plan = planned(tmp_path, f"trials = 20\nchunk = 1\nsamples = 160\n{stop}")
     summary = conduct(plan, ThisProcess(), tmp_path / "out.json").total()
@@ -492,7 +492,7 @@ def test_summary_counts_what_is_valid_and_nothing_else() -> None:
     assert (found.trials, found.passed, found.failed, found.inconclusive) == (4, 2, 1, 1)
     assert (found.samples, found.false_alarms, found.visible, found.missed, found.late) == (3000, 2, 3, 1, 1)
     assert found.armed == 3 * 850
-    assert found.false_alarm_rate == ConfidenceSequence(0.95, 1e-6, trials=3 * 850, events=2).bounds
+    assert found.false_alarm_rate == ConfidenceSequence(0.95, 5.0, trials=3 * 850, events=2).bounds
     assert (found.latency_n, found.latency_p95_n, found.bound_n) == (6.0, 8.0, 4.0)
     assert found.error["M"] == pytest.approx(0.03)
     assert found.miss_rate[0] < 1 / 3 < found.miss_rate[1]

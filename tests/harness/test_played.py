@@ -53,4 +53,6 @@ def test_rate_counts_the_same_play_once_and_says_how_many_samples_it_takes() -> 
     again = Played(made_run(np.zeros(1000), [(0, FRONT)]))
     finding = rate_below(1e-5, [once, again], confidence=0.999)
     assert finding.why.startswith(rate_below(1e-5, [once], confidence=0.999).why)
-    assert finding.why.endswith("; to show 1e-05 with so many alarms takes 690773 samples")
+    assert finding.why.endswith("; to show 1e-05 with so many alarms takes 3453878 samples")
+    alone = rate_below(1e-5, [once], confidence=0.999, burst=1.0)
+    assert alone.why.endswith("; to show 1e-05 with so many alarms takes 690776 samples")

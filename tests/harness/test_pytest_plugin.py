@@ -247,7 +247,7 @@ def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
     result = run(user, "--hil-dut", "inproc", "--hil-rig", "noisy.toml", "--junitxml", "junit.xml")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
-        ["E*<no: K at 300: * samples, allowed 1>*", "play it again with: analogrig run --scenario *"]
+        ["E*<no: K at 300: * samples, allowed 1 (0 x bound * + 1)>*", "play it again with: analogrig run --scenario *"]
     )
     (line,) = [line for line in result.outlines if line.startswith("play it again with: ")]
     monkeypatch.chdir(user.path)

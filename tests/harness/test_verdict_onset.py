@@ -210,7 +210,7 @@ def test_detection_limit_is_checked_for_every_instant() -> None:
     assert "INCONCLUSIVE: K between 395 and 402" in played.detects(within=7.0).why
     assert "INCONCLUSIVE: K between 395 and 402" in played.detects(within=1.0).why
     late = Played(learned(between(395, 400, 402), alarms=[408]))
-    assert late.detects(within=1.0).why == "K at 400: 8 samples, allowed 2"
+    assert late.detects(within=1.0).why == "K at 400: 8 samples, allowed 2 (1 x bound 1 + 1)"
 
 
 def test_run_with_a_possibly_false_alarm_is_not_quiet() -> None:

@@ -95,7 +95,7 @@ def tweaks(verdict: Verdict) -> str:
     """Table of the changes of the plant, with latency, bound and result."""
     if not verdict.tweaks:
         return "<p>The plant did not change in this run.</p>"
-    assumed = f"the bound assumes one false alarm in {verdict.arl0:,.0f} samples"
+    assumed = f"the bound is of first order, for one false alarm in {verdict.arl0:,.0f} samples"
     caption = f"Latency and bound in samples from the change; {assumed}"
     if any(tweak.alternatives for tweak in verdict.tweaks):
         caption += "; a range if the instant was estimated from the samples"

@@ -1,0 +1,147 @@
+"""Bounds of rates of events in bursts: against closed forms, published figures, simulation and dispersion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analogrig.judging.bursts import (
+    ConfidenceSequence,
+    Design,
+    bound_rate,
+    dispersion,
+    lower_count,
+    upper_count,
+)
+from analogrig.judging.statistics import Decision
+
+
+@pytest.mark.parametrize(
+    ("confidence", "allowed", "trials"),
+    [
+        *((0.95, allowed, n) for allowed, n in ((0, 299_573), (1, 474_386), (2, 629_579), (5, 1_051_303))),
+        *((0.999, allowed, n) for allowed, n in ((0, 690_775), (1, 923_341), (2, 1_122_887), (5, 1_645_474))),
+    ],
+)
+def test_length_for_independent_events_is_that_of_the_exact_bound(confidence: float, allowed: int, trials: int) -> None:
+    """Compare with tables of the Poisson distribution."""
+    assert Design(1e-5, confidence, allowed, burst=1.0).trials == pytest.approx(trials, rel=1e-5)
+
+
+@pytest.mark.parametrize("events", [0, 1, 7, 1000])
+def test_bounds_for_independent_events_are_garwoods(events: int) -> None:
+    """Garwood, Biometrika 28 (1936): quantiles of chi-squared."""
+    assert upper_count(events, 0.975) == pytest.approx(stats.chi2.ppf(0.975, 2 * events + 2) / 2.0, rel=1e-9)
+    expected = stats.chi2.ppf(0.025, 2 * events) / 2.0 if events else 0.0
+    assert lower_count(events, 0.975) == pytest.approx(expected, rel=1e-9)
+
+
+def test_no_event_excludes_only_rates_at_which_a_burst_was_due() -> None:
+    """P(no burst) = exp(-n rate / burst), whatever the sizes of the bursts."""
+    assert upper_count(0, 0.999, 5.0) == pytest.approx(5.0 * math.log(1000.0), rel=1e-9)
+
+
+@pytest.mark.parametrize(("burst", "events"), [(1.0, 3), (2.0, 6), (5.0, 11), (5.0, 0)])
+def test_bounds_are_reached_with_the_error_probability(burst: float, events: int) -> None:
+    """Counts of geometric bursts at either bound: binomial with 40,000 draws, false failure 1e-9 each."""
+    rng, n, error = np.random.default_rng(1), 40_000, 0.05
+    for mean, is_low in ((upper_count(events, 0.95, burst), True), (lower_count(events, 0.95, burst), False)):
+        bursts = rng.poisson(mean / burst, n)
+        more = np.array([int(each) and int(rng.negative_binomial(each, 1.0 / burst)) for each in bursts]) + bursts
+        count = np.count_nonzero(more <= events if is_low else more >= events)
+        if events or is_low:
+            low, high = stats.binom.interval(1.0 - 1e-9, n, error)
+            assert low <= count <= high
+
+
+def test_counts_of_plays_with_bursts_are_overdispersed_and_widen_the_bounds() -> None:
+    rng, plays = np.random.default_rng(2), 50
+    bursts = 20 * rng.poisson(0.4, plays)
+    found = dispersion(bursts.tolist(), [1000] * plays)
+    assert found.p <= 0.001
+    assert found.index == pytest.approx(np.var(bursts, ddof=1) / np.mean(bursts))
+    bounds = bound_rate(bursts.tolist(), [1000] * plays, 0.95)
+    assert bounds.burst == pytest.approx(0.5 * (found.index + 1.0)) and bounds.burst > 5.0
+    assert bounds.high == upper_count(int(bursts.sum()), 0.95, bounds.burst) / (1000 * plays)
+    assert "observed" in bounds.basis
+
+
+def test_independent_counts_are_called_overdispersed_as_seldom_as_the_level_says() -> None:
+    """1000 devices with 8 alarms in 16 plays of unequal length: binomial, false failure 1e-6."""
+    rng, exposure = np.random.default_rng(3), [1000, 3000] * 8
+    counts = rng.multinomial(8, np.array(exposure) / sum(exposure), size=1000)
+    wrong = sum(dispersion(each.tolist(), exposure).p <= 0.01 for each in counts)
+    assert wrong <= stats.binom.isf(1e-6, 1000, 0.01)
+
+
+def test_many_plays_are_merged_and_show_the_same_dispersion() -> None:
+    rng = np.random.default_rng(4)
+    counts = 5 * rng.poisson(0.01, 20_000)
+    found = dispersion(counts.tolist(), [10] * len(counts))
+    assert (found.blocks, found.events) == (1000, counts.sum())
+    assert found.index == pytest.approx(5.0, rel=0.25)
+    assert dispersion([1, 0], [9, 9]).burst == dispersion([], []).burst == 1.0
+
+
+def test_confidence_sequence_keeps_its_coverage_at_all_times() -> None:
+    """Evaluate the bounds after every five trials, where bounds for a fixed length would fail far more often."""
+    rng = np.random.default_rng(11)
+    left = left_fixed = 0
+    for _ in range(60):
+        sequence = ConfidenceSequence(0.9, burst=1.0)
+        outside = outside_fixed = False
+        for events in rng.binomial(5, 0.1, 30).tolist():
+            low, high = sequence.add(5, events)
+            outside |= not low <= 0.1 <= high
+            fixed = (bound(sequence.events, 0.95) / sequence.trials for bound in (lower_count, upper_count))
+            outside_fixed |= not next(fixed) <= 0.1 <= next(fixed)
+        left += outside
+        left_fixed += outside_fixed
+    assert left <= 60 * 0.1 + 4.7 * math.sqrt(60 * 0.09)
+    assert left_fixed > 2 * left
+
+
+@pytest.mark.parametrize("burst", [1.0, 2.0, 5.0])
+def test_confidence_sequence_keeps_its_error_on_each_side_for_events_in_bursts(burst: float) -> None:
+    """1000 series of 300 trials with geometric bursts: 5 % on either side at 90 %; binomial, false failure 1e-6."""
+    rng, rate = np.random.default_rng(12), 0.2
+    bursts = rng.poisson(rate / burst, (1000, 300))
+    events = bursts + np.where(bursts > 0, rng.negative_binomial(np.maximum(bursts, 1), 1.0 / burst), 0)
+    wrong = dict.fromkeys(Decision, 0)
+    for series in events.cumsum(axis=1)[:, 9::10]:
+        looks = [ConfidenceSequence(0.9, burst, 10 * i + 10, int(n)).decision(rate) for i, n in enumerate(series)]
+        wrong[next((each for each in looks if each is not Decision.OPEN), Decision.OPEN)] += 1
+    assert max(wrong[Decision.BELOW], wrong[Decision.ABOVE]) <= stats.binom.isf(1e-6, 1000, 0.05)
+    assert wrong[Decision.BELOW] > 0
+
+
+@pytest.mark.parametrize("events", [0, 3, 400])
+def test_decision_is_on_which_side_of_the_bounds_the_rate_lies(events: int) -> None:
+    sequence = ConfidenceSequence(0.999, trials=100_000, events=events)
+    low, high = sequence.bounds
+    assert sequence.decision(1.001 * high) is Decision.BELOW
+    assert sequence.decision(0.999 * high) is Decision.OPEN
+    if low:
+        assert sequence.decision(1.001 * low) is Decision.OPEN
+        assert sequence.decision(0.999 * low) is Decision.ABOVE
+    assert ConfidenceSequence(0.999).bounds == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: upper_count(-1, 0.9), "there cannot be -1 events"),
+        (lambda: upper_count(0, 1.0), "confidence must be between 0 and 1, not 1"),
+        (lambda: lower_count(0, 0.9, 0.5), "burst must be 1 or more, not 0.5"),
+        (lambda: Design(0.0, 0.9), "rate must be between 0 and 1, not 0"),
+        (lambda: bound_rate([0], [0], 0.9), "there must be at least one trial"),
+        (lambda: bound_rate([2], [1], 0.9), "there cannot be 2 events in 1 trials"),
+        (lambda: ConfidenceSequence(0.9, math.nan), "burst must be 1 or more, not nan"),
+    ],
+)
+def test_values_out_of_range_are_refused(call: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()  # type: ignore[operator]
