@@ -20,6 +20,7 @@ from typing import Any
 from . import (
     bench_adapters,
     bench_calibration,
+    bench_certificates,
     bench_detection,
     bench_detectors,
     bench_engine,
@@ -44,6 +45,7 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "statistics": bench_statistics.figures,
     "isolation": bench_isolation.figures,
     "trials": bench_trials.figures,
+    "certificates": bench_certificates.figures,
     "calibration": bench_calibration.figures,
     "self-test": bench_self_test.figures,
     "onset": bench_onset.figures,

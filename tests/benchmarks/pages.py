@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_detectors
+from . import bench_certificates, bench_detectors
 
 FOLDER = Path("harness/docs/evidence")
 
@@ -18,6 +18,7 @@ TITLES: Mapping[str, str] = {
     "statistics": "Detection delay and false alarms of simulated plants",
     "isolation": "Isolation",
     "trials": "Closed-loop trials and certificates",
+    "certificates": "Error probabilities of certificates",
     "calibration": "Calibration of drawn rigs",
     "self-test": "Self-test of drawn rigs",
     "onset": "Dating of changes",
@@ -26,10 +27,10 @@ TITLES: Mapping[str, str] = {
 }
 """Page titles by the name of the benchmark."""
 
-CROSSED = {"detectors"}
+CROSSED = {"certificates", "detectors"}
 """Benchmarks whose figures are named ROW: COLUMN, and whose page is a table of these."""
 
-NOTES: Mapping[str, str] = {"detectors": bench_detectors.NOTE}
+NOTES: Mapping[str, str] = {"certificates": bench_certificates.NOTE, "detectors": bench_detectors.NOTE}
 """Paragraphs below the tables."""
 
 

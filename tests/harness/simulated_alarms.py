@@ -107,8 +107,8 @@ COVERED: Mapping[str, Kind] = {
 """Kinds of alarms that the assumption of a certificate covers."""
 
 BEYOND: Mapping[str, Kind] = {
-    "beyond the assumption: bursts of twenty": in_bursts(_of(20), 20.0),
-    "beyond the assumption: each alarm followed by 0.8 others, Poisson": in_bursts(_branching(5.0), 5.0),
+    "bursts of twenty, not covered": in_bursts(_of(20), 20.0),
+    "0.8 alarms after each alarm on average, Poisson, not covered": in_bursts(_branching(5.0), 5.0),
 }
 """Kinds of alarms that it does not cover."""
 
