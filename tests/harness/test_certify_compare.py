@@ -25,10 +25,10 @@ from analogrig.cli import main
 from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.judging.bursts import BURST
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import PotChange, Scenario
-
-from .simulated_alarms import COVERED, SimulatedPlays, certificates, in_bursts
+from tests.harness.simulated_alarms import COVERED, SimulatedPlays, certificates, in_bursts
 
 # -------------------------------------------------------------------------------------------------------- certificates
 
@@ -129,7 +129,7 @@ def test_sequential_test_needs_fewer_samples_for_a_good_device_than_the_fixed_on
 
 
 def test_sequential_test_certifies_a_device_without_alarms_in_the_run_in_which_that_is_certain() -> None:
-    """Between ln(1 / 0.1) and, with the half weight of the quickest martingale, ln(2 / 0.1), in units of burst / rate."""
+    """Between ln(1 / 0.1) and, with the half weight of the quickest martingale, ln(2 / 0.1), times burst / rate."""
     for burst in (1.0, 5.0):
         (answer,) = outcomes(0.0, 1, sequential=True, burst=burst)
         assert answer.outcome == "certified"
@@ -232,7 +232,8 @@ def test_command_tells_outcome_by_its_status(tmp_path: Path, capsys: pytest.Capt
     options = ["--far", "1e-3", "--confidence", "0.99", "--json"]
     assert main(["certify", "--dut", "inproc", "--allowed", "0", *options]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert (said["outcome"], said["far"], said["alarms"]) == ("certified", 1e-3, 0)
+    assert (said["outcome"], said["far"], said["alarms"], said["burst"]) == ("certified", 1e-3, 0, BURST)
+    assert "assumed" in said["basis"]
     assert main(["certify", "--dut", noisy_device(tmp_path, 20.0), "--sequential", *options]) == 1
     assert main(["certify", "--dut", "serial:/dev/absent", *options]) == 3
     assert main(["certify", "--dut", "inproc", "--far", "2"]) == 2

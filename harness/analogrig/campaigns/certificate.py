@@ -32,13 +32,11 @@ from analogrig.judging.statistics import Decision, mean_bounds, one_sided
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
-IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
-"""Fewest samples in a run: in this process, or over a line."""
+IN_PROCESS_RUN_N, BENCH_RUN_N = (100_000, 1_000_000), (20_000, 100_000)
+"""Approximate samples in a run, in this process or over a line: usual length, and greatest.
 
-LONGEST_RUN_N = 1_000_000
-"""Samples in a run beyond which it is not prolonged to the mean time between alarms at the limit.
-
-A shorter run would never show an alarm that comes this long after each start.
+A run lasts at least 1 / far samples up to the greatest length. A shorter one would never show an alarm that comes this
+long after every start.
 """
 
 WORTH_A_WORKER_N = 500_000
@@ -269,9 +267,8 @@ def _in_order(workers: Workers, work: Any, first_seed: int) -> Iterator[Count]:
 
 def _run_n(question: Question, most: int) -> int:
     """Run length of which a whole number makes up a test of fixed length."""
-    least = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
-    least = max(least, min(math.ceil(1.0 / question.far), LONGEST_RUN_N))
-    runs = max(1, most // least)
+    usual, greatest = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
+    runs = max(1, most // max(usual, min(math.ceil(1.0 / question.far), greatest)))
     return math.ceil(most / runs) + question.datasheet.warm_up_n + LEAD_IN_N
 
 
