@@ -232,7 +232,8 @@ def _certify_rare(question: Question, count: int, workers: Workers) -> Certifica
         f"the rate is {math.fsum(rates) / count:.3g}, {one_sided(low, high, question.confidence)},"
         f" from {number_of(count, 'estimate')}, {number_of(samples, 'sample')}"
     )
-    basis = f"bursts that end within {FOLLOWED_N} samples of their first alarm, measured"
+    burst = math.fsum(rates) / math.fsum(each.bursts for each in estimates)
+    basis = f"bursts of {burst:.3g} alarms on average, measured over {FOLLOWED_N} samples after their first alarm"
     return Certificate(_answer(question.far, low, high), reason, alarms, samples, (low, high), basis)
 
 

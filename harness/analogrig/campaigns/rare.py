@@ -65,6 +65,8 @@ class Estimate(NamedTuple):
 
     rate: float
     """Alarms per sample, with those that follow within FOLLOWED_N; 0 if no branch ended in one."""
+    bursts: float
+    """First alarms per sample."""
     alarms: int
     """Number of branches that ended in an alarm."""
     samples: int
@@ -140,7 +142,7 @@ class _Climbs:
     def estimate(self, first: int, count: int) -> Estimate:
         ground, length = self._ground(first)
         if not len(ground):
-            return Estimate(0.0, 0, self._samples)
+            return Estimate(0.0, 0.0, 0, self._samples)
         off = np.sort(self._rng.choice(ground, min(count, len(ground)), replace=False))
         louder = LOUDER[self._rng.permutation(len(off)) % len(LOUDER)]
         going = _Branches(self._kept_at(off), off + 1, louder, np.zeros((len(off), len(LOUDER))))
@@ -149,8 +151,9 @@ class _Climbs:
             arrived, going = self._go_on(going)
             every.append(arrived)
         weights = [weight for arrived in every for weight in arrived.weights]
-        alarms = math.fsum(weights) + self._later_alarms(every, weights)
-        return Estimate(len(ground) / length * alarms / len(off), len(weights), self._samples)
+        part = len(ground) / length / len(off)
+        bursts, later = math.fsum(weights), self._later_alarms(every, weights)
+        return Estimate(part * (bursts + later), part * bursts, len(weights), self._samples)
 
     def _later_alarms(self, every: Sequence[_Branches], weights: Sequence[float]) -> float:
         """Weighted number of alarms in the FOLLOWED_N samples after those of the branches, from some of these."""
