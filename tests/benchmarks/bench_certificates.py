@@ -48,12 +48,14 @@ BELOW: Mapping[str, tuple[Kind, float]] = {
 """Devices that deserve a certificate."""
 
 NOTE = f"""\
-Each cell is the share of {DEVICES} simulated devices that is certified for {FAR:g} false alarms per sample,
-with its {CONFIDENCE:.0%} confidence interval. The devices of the first rows raise alarms at exactly this rate.
-At most 10, 5, 1 and 0.1 % of them may be certified. Rows `not covered` break the assumption of
-bursts of five alarms on average, which no data replace. The rows of devices below the limit show the
-power. `burst 1` takes alarms as independent, apart from bursts that the counts of the plays show.
-Seeds 0 to {DEVICES - 1}. The last column counts refuted devices at 95 %."""
+Each cell is the share of {DEVICES} simulated devices that is certified for {FAR:g} false alarms per
+sample, with its {CONFIDENCE:.0%} confidence interval. The seeds are 0 to {DEVICES - 1}. The devices of the first
+rows raise alarms at exactly this rate: at most 10, 5, 1 and 0.1 % of them may be certified.
+
+Rows `not covered` break the assumption of bursts of five alarms on average, which no data replace.
+The last rows are devices below the limit, and show the power. The column `burst 1` takes alarms as
+independent, apart from bursts that the counts of the plays show. The column `refuted` counts
+devices that are called worse than the limit."""
 
 
 def figures() -> Iterator[Figure]:
