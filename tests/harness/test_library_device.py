@@ -619,7 +619,7 @@ def test_campaign_and_certificate_of_a_library(own: Path, tmp_path: Path, capsys
     assert "campaign plan: 1 cell, 2 trials, 3200 samples: FAILED" in capsys.readouterr().out
     command = ["certify", "--far", "1e-2", "--confidence", "0.9", "--dut", f"library:{own}", "--workers", "2"]
     assert main(command) == 0
-    assert "CERTIFIED\n  0 alarms in 1760 samples" in capsys.readouterr().out
+    assert "CERTIFIED\n  0 alarms in " in capsys.readouterr().out
 
 
 REFUSING = """

@@ -125,8 +125,8 @@ class RigComparison:
         shown = [f"{each.quantity} is {each.word}" for each in self.verdicts.differences if each.shown]
         return (
             f"{self.b} follows {self.a} within {displacement.rms_most_lsb:.2g} LSB (displacement, rms, without noise)"
-            f" and {latency} samples (mean latency), each with {self.confidence:.0%} confidence, in {self.plays} plays of"
-            f" {self.scenario}; in the verdicts {', '.join(shown) or 'no difference is shown'}."
+            f" and {latency} samples (mean latency), each with {self.confidence:.0%} confidence, in"
+            f" {self.plays} plays of {self.scenario}; in the verdicts {', '.join(shown) or 'no difference is shown'}."
         )
 
 
