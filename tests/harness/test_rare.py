@@ -185,7 +185,7 @@ def test_rare_rate_certifies_refutes_or_stays_open() -> None:
     worker = Remembering()
     certified = certify(asked(far=1e-5, **settings), worker)
     assert certified.outcome == "certified"
-    assert certified.basis.startswith("bursts of 1 alarms on average, measured")
+    assert certified.basis.startswith("a mean burst size of 1, measured")
     assert 1e-8 < certified.rate[0] < certified.rate[1] < 1e-6
     assert certify(asked(far=sum(certified.rate) / 2.0, **settings), worker).outcome == "inconclusive"
     assert certify(asked(far=1e-9, **settings), worker).outcome == "refuted"

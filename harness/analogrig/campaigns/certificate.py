@@ -233,7 +233,7 @@ def _certify_rare(question: Question, count: int, workers: Workers) -> Certifica
         f" from {number_of(count, 'estimate')}, {number_of(samples, 'sample')}"
     )
     burst = math.fsum(rates) / math.fsum(each.bursts for each in estimates)
-    basis = f"bursts of {burst:.3g} alarms on average, measured over {FOLLOWED_N} samples after their first alarm"
+    basis = f"a mean burst size of {burst:.3g}, measured over {FOLLOWED_N} samples after the first alarm"
     return Certificate(_answer(question.far, low, high), reason, alarms, samples, (low, high), basis)
 
 
