@@ -28,7 +28,7 @@ SHORT = Scenario(samples=300, excitation=Excitation(low_v=0.1, high_v=9.9), name
 FAULTS_EACH, LEAST_VALID_KINDS = 4, 4
 CERTIFIED = Design(rate=1e-5, confidence=0.999, allowed=10)
 CERTIFIED_RUN_N = 100_000
-PLANTS_N, PLANTS_RUN_N = 40, 20_000
+PLANTS_N, PLANTS_RUN_N = 40, 60_000
 HEAVY = PlantChoice("front", mass_kg=150.0, damping_n_s_per_m=1668.5, stiffness_n_per_m=29_000.0)
 HEAVY_RATE, HEAVY_ESTIMATES_N, HEAVY_BRANCHES_N = 0.1 * CERTIFIED.rate, 32, 1000
 """A tenth of the promise: where innovations are white, the trigger's bound leaves a hundredth (7e-8 here). A prefilter
