@@ -126,11 +126,12 @@ class Summary:
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Summary:
         counted, sound = counts(rows), list(filter(is_valid, rows))
+        by_trial = [counts([each]) for each in sound]
         found = [change for each in sound for change in changes(each)]
         latencies = sorted(change.latency_n for change in found if change.latency_n is not None)
         bounds = [each.bound_n for each in found if each.latency_n is not None and each.bound_n is not None]
         errors = [each["errors"] for each in sound if each["errors"]]
-        rates = {name: _bounds(rate, sound) for name, rate in RATES.items()}
+        rates = {name: _bounds(rate, counted, by_trial) for name, rate in RATES.items()}
         return cls(
             **counted,
             trials=len(rows),
@@ -152,8 +153,7 @@ class Summary:
         )
 
 
-def _bounds(rate: Rate, sound: Sequence[Row]) -> tuple[float, float]:
+def _bounds(rate: Rate, counted: Mapping[str, int], by_trial: Sequence[Mapping[str, int]]) -> tuple[float, float]:
     """Bounds of a rate over valid trials; they cover the bursts that its counts by trial show."""
-    by_trial = [counts([each]) for each in sound]
     shown = dispersion([each[rate.events] for each in by_trial], [each[rate.exposure] for each in by_trial])
-    return rate.sequence(counts(sound), CONFIDENCE, shown.burst).bounds
+    return rate.sequence(counted, CONFIDENCE, shown.burst).bounds

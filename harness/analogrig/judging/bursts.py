@@ -179,7 +179,7 @@ class RateBounds:
 def bound_rate(events: Sequence[int], trials: Sequence[int], confidence: float, burst: float = BURST) -> RateBounds:
     """One-sided bounds of a rate per trial from counts over independent plays.
 
-    They cover bursts of ``burst`` events on average, or of more if the counts are dispersed as by more.
+    They cover bursts of ``burst`` events on average, or larger ones where the dispersion of the counts shows them.
 
     :raises ValueError: no trials, impossible counts, ``confidence`` not between 0 and 1, or ``burst`` below 1.
     """
