@@ -57,6 +57,20 @@ def test_bounds_are_reached_with_the_error_probability(burst: float, events: int
             assert low <= count <= high
 
 
+@pytest.mark.parametrize("events", [1, 3, 10])
+def test_bounds_also_hold_for_smaller_bursts_than_assumed(events: int) -> None:
+    smaller = np.linspace(1.0, 5.0, 9)
+    assert max(upper_count(events, 0.95, each) for each in smaller) == upper_count(events, 0.95, 5.0)
+    for burst in smaller:
+        least = lower_count(events, 0.95, 5.0)
+        count = stats.poisson(least / burst)
+        more = sum(
+            count.pmf(k) * (1.0 if k >= events else stats.nbinom.sf(events - 1 - k, k, 1.0 / burst))
+            for k in range(1, 60)
+        )
+        assert more <= 0.05 * (1.0 + 1e-6)
+
+
 def test_counts_of_plays_with_bursts_are_overdispersed_and_widen_the_bounds() -> None:
     rng, plays = np.random.default_rng(2), 50
     bursts = 20 * rng.poisson(0.4, plays)
@@ -90,7 +104,7 @@ def test_confidence_sequence_keeps_its_coverage_at_all_times() -> None:
     """Evaluate the bounds after every five trials, where bounds for a fixed length would fail far more often."""
     rng = np.random.default_rng(11)
     left = left_fixed = 0
-    for _ in range(60):
+    for _ in range(40):
         sequence = ConfidenceSequence(0.9, burst=1.0)
         outside = outside_fixed = False
         for events in rng.binomial(5, 0.1, 30).tolist():
@@ -100,7 +114,7 @@ def test_confidence_sequence_keeps_its_coverage_at_all_times() -> None:
             outside_fixed |= not next(fixed) <= 0.1 <= next(fixed)
         left += outside
         left_fixed += outside_fixed
-    assert left <= 60 * 0.1 + 4.7 * math.sqrt(60 * 0.09)
+    assert left <= 40 * 0.1 + 4.7 * math.sqrt(40 * 0.09)
     assert left_fixed > 2 * left
 
 

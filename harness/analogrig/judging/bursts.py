@@ -61,11 +61,26 @@ def upper_count(events: int, confidence: float, burst: float = 1.0) -> float:
 
 
 def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
-    """Lower confidence bound of the expected number of events; otherwise as ``upper_count``."""
+    """Lower confidence bound of the expected number of events; otherwise as ``upper_count``.
+
+    It is the least one over all bursts of at most ``burst`` events on average: one alarm excludes few rates if it came
+    alone. The upper bound rises with the bursts.
+    """
+    from scipy.optimize import minimize_scalar
+
     _check(events, confidence, burst)
     if events == 0:
         return 0.0
-    return _rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
+
+    def bound(burst: float) -> float:
+        return _rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
+
+    inside = (
+        minimize_scalar(bound, bounds=(1.0, burst), method="bounded", options={"xatol": 0.05}).fun
+        if burst > 1.0
+        else math.inf
+    )
+    return float(min(bound(1.0), bound(burst), inside))
 
 
 def _probabilities(events: int, mean: float, burst: float) -> tuple[float, float]:
