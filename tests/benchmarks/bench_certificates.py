@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 from analogrig.campaigns.certificate import Question
@@ -23,6 +24,8 @@ DEVICES = 1000
 
 FAR = 1e-5
 """Limit of the certificates, in false alarms per sample."""
+
+PROCESSES = 2
 
 CONFIDENCE = 0.99
 """Confidence of the two-sided intervals of the table."""
@@ -58,16 +61,23 @@ independent, apart from bursts that the counts of the plays show. The column `re
 devices that are called worse than the limit."""
 
 
+KINDS = {**{name: (kind, FAR) for name, kind in {**COVERED, **BEYOND}.items()}, **BELOW}
+"""Every kind of device, with its false-alarm rate."""
+
+
 def figures() -> Iterator[Figure]:
     """Certified and refuted shares of each kind of device."""
-    at_limit = {name: (kind, FAR) for name, kind in {**COVERED, **BEYOND}.items()}
-    for name, (kind, rate) in {**at_limit, **BELOW}.items():
-        for setting, values in SETTINGS.items():
-            outcomes = certificates(_question(values), kind, rate, DEVICES)
-            yield _share(f"{name}: {setting}", outcomes, "certified")
-            if setting == REFUTED:
-                refuted = _share(f"{name}: refuted, {setting}", outcomes, "refuted")
-        yield refuted
+    with ProcessPoolExecutor(PROCESSES) as pool:
+        for measured in pool.map(_figures, KINDS):
+            yield from measured
+
+
+def _figures(name: str) -> list[Figure]:
+    """Figures of one kind of device."""
+    kind, rate = KINDS[name]
+    outcomes = {setting: certificates(_question(values), kind, rate, DEVICES) for setting, values in SETTINGS.items()}
+    shares = [_share(f"{name}: {setting}", found, "certified") for setting, found in outcomes.items()]
+    return [*shares, _share(f"{name}: refuted, {REFUTED}", outcomes[REFUTED], "refuted")]
 
 
 def _question(settings: Mapping[str, Any]) -> Question:
