@@ -85,7 +85,7 @@ def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, f
 
 def one_sided(low: float, high: float, confidence: float) -> str:
     """Two one-sided bounds in words that do not pass for one interval, which would be wrong twice as often."""
-    return f"at least {low:.3g} and at most {high:.3g}, each one-sided at {confidence:.6g}"
+    return f"at least {low:.3g} and at most {high:.3g}, each one-sided with error {1.0 - confidence:.2g}"
 
 
 def _invert_hall(quantile: float, skewness: float) -> float:
