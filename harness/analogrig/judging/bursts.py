@@ -75,12 +75,11 @@ def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
     def bound(burst: float) -> float:
         return _rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
 
-    inside = (
-        minimize_scalar(bound, bounds=(1.0, burst), method="bounded", options={"xatol": 0.05}).fun
-        if burst > 1.0
-        else math.inf
-    )
-    return float(min(bound(1.0), bound(burst), inside))
+    at_most = bound(burst)
+    if at_most <= bound(1.0 + 0.95 * (burst - 1.0)):  # it falls with the bursts before it rises
+        return at_most
+    least = minimize_scalar(bound, bounds=(1.0, burst), method="bounded", options={"xatol": 0.05}).fun
+    return float(min(bound(1.0), least))
 
 
 def _probabilities(events: int, mean: float, burst: float) -> tuple[float, float]:
