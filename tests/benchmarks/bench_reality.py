@@ -1,0 +1,312 @@
+"""The shipped device under the conditions that users meet: false alarms, misfits, missed changes and delays.
+
+python -m tests.benchmarks.bench_reality [--rows NAME,...] [--quick] [--jobs N]
+
+``--quick`` plays a fifth of the healthy samples and a third of the changes, for a look at the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.answers import Answers, Samples
+from analogrig.devices.direct import DirectDevice
+from analogrig.devices.inproc import InprocDevice
+from analogrig.estimator_config import DEFAULT_ARL0
+from analogrig.judging.information import first_at_level
+from analogrig.run import Channel
+
+from .conditions import CARD, CONDITIONS, FORCE, PARAMETERS, Array, Change, Condition, Played, Simulated
+from .figure import Figure
+
+CONFIDENCE = 0.99
+
+CLUSTER_N = 500
+"""Alarms at most so many samples apart are one cluster."""
+
+ONSET_N, ONSET_SPAN_N = 2500, 400
+"""Earliest sample of a change, and span of the instants."""
+
+MISFIT_N = 2000
+"""Samples within which a misfit must be reported."""
+
+FACTORS = (1.2, 0.8)
+
+HEALTHY_SEED, CHANGE_SEED = 1_000, 500_000
+"""First seeds."""
+
+JOBS = 2
+
+NOTE = f"""\
+TODO
+"""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Numbers of runs of a row."""
+
+    runs: int = 100
+    """Healthy runs."""
+    run_n: int = 10_000
+    """Samples of each."""
+    trials: int = 30
+    """Runs of each parameter and direction."""
+
+
+QUICK = Effort(runs=20, trials=10)
+
+
+# ----------------------------------------------------------------------------------------------------------- the device
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Report of the device that its model does not describe the samples."""
+
+    kind: str
+    sample: int
+
+
+def shipped() -> DirectDevice:
+    """Device ``inproc`` as shipped, without its line."""
+    device = InprocDevice(name="shipped").direct(alarms_only=True)
+    assert isinstance(device, DirectDevice)
+    low_v, lsb_v = CARD.ranges_v[FORCE][0], float(CARD.lsb_v[FORCE])
+    device.prepare({"force": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
+    return device
+
+
+def settling_n(device: DirectDevice) -> int:
+    """Samples from the start after which the promise on false alarms holds: the header states them."""
+    return int(device.description()["estimator"]["warm_up_n"])
+
+
+def first_misfit(answers: Answers) -> Misfit | None:
+    """First misfit that the device reports; raises LookupError as long as it reports none at all."""
+    del answers
+    raise LookupError
+
+
+def answers_to(device: DirectDevice, played: Played) -> Answers:
+    """Answers of the device, started anew, to a run."""
+    device.start()
+    (answers,) = device.play([Samples(0, played.u, played.y, played.valid)])  # type: ignore[arg-type]
+    return answers
+
+
+# ------------------------------------------------------------------------------------------------------- false alarms
+
+
+@dataclass(frozen=True)
+class FalseAlarms:
+    """False alarms of some runs."""
+
+    exposure_n: int
+    """Armed samples."""
+    by_run: tuple[int, ...]
+    """Alarms of each run."""
+    clusters: tuple[int, ...]
+    """Alarms of each cluster."""
+
+    @property
+    def alarms(self) -> int:
+        return sum(self.by_run)
+
+    def upper_rate(self, confidence: float = CONFIDENCE) -> float:
+        """Upper confidence bound of the rate per sample that holds for alarms in bursts.
+
+        Gamma quantile of a Poisson count, with the count and the mean in units of the dispersion (McCullagh and
+        Nelder, Generalized Linear Models, 6.2.3). The dispersion is the larger one of that of the clusters, as of a
+        compound Poisson process, and that between the runs.
+        """
+        from scipy.special import gammaincinv
+
+        dispersion = max(1.0, self._dispersion_of_clusters(), self._dispersion_of_runs())
+        return float(dispersion * gammaincinv(self.alarms / dispersion + 1.0, confidence) / self.exposure_n)
+
+    def _dispersion_of_clusters(self) -> float:
+        """Variance over mean of the number of alarms if clusters come independently."""
+        sizes = np.array(self.clusters, dtype=float)
+        return float(np.sum(sizes**2) / np.sum(sizes)) if len(sizes) else 1.0
+
+    def _dispersion_of_runs(self) -> float:
+        """Variance over mean of the number of alarms in a run."""
+        counts = np.array(self.by_run, dtype=float)
+        return float(counts.var(ddof=1) / counts.mean()) if counts.any() and len(counts) > 1 else 1.0
+
+
+def count_false_alarms(alarms: Sequence[Sequence[int]], exposures_n: Sequence[int]) -> FalseAlarms:
+    """Counts of runs with alarms at these samples."""
+    clusters: list[int] = []
+    for run in alarms:
+        gaps = np.diff(np.asarray(run, dtype=np.int64), prepend=-10 * CLUSTER_N)
+        starts = np.flatnonzero(gaps > CLUSTER_N)
+        clusters += np.diff(np.append(starts, len(run))).tolist()
+    return FalseAlarms(sum(exposures_n), tuple(len(run) for run in alarms), tuple(clusters))
+
+
+def _healthy(condition: Condition, effort: Effort) -> Iterator[Figure]:
+    """Figures of the runs without a change."""
+    device = shipped()
+    settled = settling_n(device)
+    alarms, exposures_n, misfits = [], [], []
+    is_reported = True
+    seeds = range(HEALTHY_SEED, HEALTHY_SEED + effort.runs)
+    for played in condition.play(seeds, effort.run_n, [None] * effort.runs):
+        answers = answers_to(device, played)
+        alarms.append([alarm.index for alarm in answers.alarms if alarm.index >= settled])
+        exposures_n.append(int(played.valid[settled:].sum()))
+        try:
+            misfits.append(first_misfit(answers))
+        except LookupError:
+            is_reported = False
+    yield from _false_alarm_figures(count_false_alarms(alarms, exposures_n))
+    if is_reported:
+        yield _misfit_figure(condition, misfits)
+    else:
+        yield Figure("MISFIT", math.nan, "not reported")
+
+
+def _false_alarm_figures(found: FalseAlarms) -> Iterator[Figure]:
+    """False alarms per 1e5 samples and their upper bound."""
+    per_1e5 = 1e5 / found.exposure_n
+    counts = f"{found.alarms} in {len(found.clusters)} clusters"
+    yield Figure("false alarms per 1e5", found.alarms * per_1e5, "", counts)
+    yield Figure("99 % bound", found.upper_rate() * 1e5, "")
+
+
+def _misfit_figure(condition: Condition, misfits: Sequence[Misfit | None]) -> Figure:
+    """Share of the runs with a misfit within MISFIT_N samples, and with the right kind."""
+    timely = [each.kind for each in misfits if each is not None and each.sample < MISFIT_N]
+    right = sum(kind in condition.kinds for kind in timely)
+    counts = ", ".join(f"{kind}: {timely.count(kind)}" for kind in sorted(set(timely)))
+    remark = f"{counts or 'none'}; right kind: {right}" if condition.kinds else counts
+    return Figure("MISFIT", 100.0 * len(timely) / len(misfits), "% of the runs", remark)
+
+
+# ------------------------------------------------------------------------------------------------------------- changes
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Delays and bounds of detected changes, (n,) samples each, and the number of others."""
+
+    delay_n: NDArray[np.float64]
+    bound_n: NDArray[np.float64]
+    missed: int
+    hidden: int
+    """Changes without an alarm whose information does not reach the bound's level within the horizon."""
+
+    def ratio(self) -> tuple[float, float]:
+        """Mean delay over mean bound, and its standard error by the delta method; NaN for fewer than two."""
+        if len(self.delay_n) < 2:
+            return math.nan, math.nan
+        ratio = self.delay_n.mean() / self.bound_n.mean()
+        spread = (self.delay_n - ratio * self.bound_n).std(ddof=1)
+        return float(ratio), float(spread / math.sqrt(len(self.delay_n)) / self.bound_n.mean())
+
+
+def delays_of(alarms: Sequence[Sequence[int]], onsets: Sequence[int], bounds_n: Sequence[int | None]) -> Delays:
+    """Delays of the first alarms after each onset; the runs end at the horizon."""
+    pairs, missed, hidden = [], 0, 0
+    for run, onset, bound_n in zip(alarms, onsets, bounds_n, strict=True):
+        delay_n = next((index - onset for index in run if index > onset), None)
+        if delay_n is not None and bound_n is not None:
+            pairs.append((delay_n, bound_n))
+        elif delay_n is None and bound_n is not None:
+            missed += 1
+        elif delay_n is None:
+            hidden += 1
+    delay, bound = np.array(pairs, dtype=float).reshape(-1, 2).T
+    return Delays(delay, bound, missed, hidden)
+
+
+def _changed(condition: Condition, effort: Effort) -> Iterator[Figure]:
+    """Figures of the runs with a change."""
+    device = shipped()
+    what = [(name, factor) for name in PARAMETERS for factor in FACTORS] * effort.trials
+    rng = np.random.default_rng(CHANGE_SEED)
+    onsets = (ONSET_N + rng.integers(0, ONSET_SPAN_N, len(what))).tolist()
+    alarms, bounds_n = [], []
+    samples = ONSET_N + ONSET_SPAN_N + condition.horizon_n
+    changes = [Change(name, factor, onset) for (name, factor), onset in zip(what, onsets, strict=True)]
+    seeds = range(CHANGE_SEED, CHANGE_SEED + len(changes))
+    for onset, played in zip(onsets, condition.play(seeds, samples, changes), strict=True):
+        end = onset + 1 + condition.horizon_n
+        alarms.append([alarm.index for alarm in answers_to(device, played).alarms if alarm.index < end])
+        bounds_n.append(first_at_level(played.information[onset + 1 : end], math.log(DEFAULT_ARL0)))
+    found = delays_of(alarms, onsets, bounds_n)
+    hidden = f"of {len(what)}" + (f", {found.hidden} not detectable" if found.hidden else "")
+    yield Figure("missed", found.missed, hidden)
+    ratio, error = found.ratio()
+    yield Figure("delay over bound", ratio, f"+- {error:.2g}")
+
+
+# --------------------------------------------------------------------------------------------------------------- table
+
+
+def measure(name: str, effort: Effort) -> list[Figure]:
+    """Figures of one row."""
+    condition = CONDITIONS[name]
+    found = [*_healthy(condition, effort), *_changed(condition, effort)]
+    row = condition.text + (" (simulated)" if isinstance(condition.source, Simulated) else "")
+    return [dataclasses.replace(each, name=f"{name}, {row}: {each.name}") for each in found]
+
+
+def figures(effort: Effort = Effort(), names: Sequence[str] = (), jobs: int = JOBS) -> Iterator[Figure]:
+    """Figures of the named rows, or of all, in the order of the table."""
+    names = names or tuple(CONDITIONS)
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        for row in [pool.submit(measure, name, effort) for name in names]:
+            yield from row.result()
+
+
+def arguments(words: Sequence[str]) -> tuple[Effort, Sequence[str], int]:
+    """Effort, names of rows and number of processes of a command line; ends the program if it is wrong."""
+    parser = argparse.ArgumentParser(prog="make bench ARGS=reality")
+    parser.add_argument("--rows", default="", help="comma-separated names of rows, or their beginnings")
+    parser.add_argument("--quick", action="store_true", help="few runs; nothing is written")
+    parser.add_argument("--jobs", type=int, default=JOBS, help="number of processes (default %(default)s)")
+    given = parser.parse_args(words)
+    wanted = [each for each in given.rows.split(",") if each]
+    for each in wanted:
+        if not any(name.startswith(each) for name in CONDITIONS):
+            parser.error(f"no row is called {each}; there are {', '.join(CONDITIONS)}")
+    names = [name for name in CONDITIONS if any(name.startswith(each) for each in wanted)]
+    return QUICK if given.quick else Effort(), names, given.jobs
+
+
+def lines(found: Iterator[Figure]) -> Iterator[str]:
+    """One line of text for each row of the table."""
+    row, cells = "", []
+    for figure in found:
+        name, _, column = figure.name.partition(": ")
+        if name != row:
+            if cells:
+                yield f"{row:<70} {' | '.join(cells)}"
+            row, cells = name, []
+        value = " ".join(each for each in (f"{figure.value:.4g}", figure.unit, figure.compared_with) if each)
+        cells.append(f"{column} {value}")
+    if cells:
+        yield f"{row:<70} {' | '.join(cells)}"
+
+
+def main(words: Sequence[str]) -> None:
+    """Print the rows; bench.json and the page keep those of ``make bench ARGS=reality``."""
+    for line in lines(figures(*arguments(words))):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
