@@ -1,6 +1,9 @@
 """Benchmarks, all or those named: print one table, write build/bench.json and the evidence pages of the site.
 
-python -m tests.benchmarks [NAME ...]
+python -m tests.benchmarks [NAME [OPTION ...] ...]
+
+Options follow the name of a benchmark that has some: "reality --rows hum,drift", "statistics random-plants". With
+--quick nothing is written.
 
 bench.json is a list of {theme, name, value, unit, compared_with, ratio, bounds, measured}; earlier figures of other
 names stay. ``measured`` is date and commit.
@@ -28,6 +31,7 @@ from . import (
     bench_link,
     bench_onset,
     bench_properties,
+    bench_reality,
     bench_self_test,
     bench_statistics,
     bench_trials,
@@ -37,7 +41,7 @@ from .figure import Figure
 
 RESULTS = Path("build/bench.json")
 
-BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
+BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "engine": bench_engine.figures,
     "link": bench_link.figures,
     "adapters": bench_adapters.figures,
@@ -51,7 +55,11 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "onset": bench_onset.figures,
     "properties": bench_properties.figures,
     "detectors": bench_detectors.figures,
+    "reality": bench_reality.figures_of,
 }
+
+OPTIONED = {"reality", "statistics"}
+"""Benchmarks that take options."""
 
 
 def keep(theme: str, measured: Sequence[Figure], path: Path = RESULTS) -> list[dict[str, Any]]:
@@ -73,16 +81,30 @@ def _when() -> str:
     return f"{datetime.now(UTC):%Y-%m-%d} {told}".strip()
 
 
-def main(names: Sequence[str]) -> None:
-    unknown = [name for name in names if name not in BENCHES]
-    if unknown:
-        sys.exit(f"no benchmark is called {', '.join(unknown)}; there are {', '.join(BENCHES)}")
-    for name in names or BENCHES:
+def requests(words: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Benchmarks that a command line names, all if none, with their options.
+
+    Ends the program if a word is neither a benchmark nor an option of the one before.
+    """
+    named: list[tuple[str, list[str]]] = []
+    for word in words:
+        if word in BENCHES:
+            named.append((word, []))
+        elif named and named[-1][0] in OPTIONED:
+            named[-1][1].append(word)
+        else:
+            sys.exit(f"no benchmark is called {word}; there are {', '.join(BENCHES)}")
+    return named or [(name, []) for name in BENCHES]
+
+
+def main(words: Sequence[str]) -> None:
+    for name, options in requests(words):
         measured = []
-        for figure in BENCHES[name]():
+        for figure in BENCHES[name](*options):
             print(figure, flush=True)
             measured.append(figure)
-        pages.write(name, keep(name, measured))
+        if "--quick" not in options:
+            pages.write(name, keep(name, measured))
 
 
 if __name__ == "__main__":

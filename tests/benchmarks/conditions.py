@@ -7,7 +7,6 @@ plant, and the table marks the row.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -163,9 +162,7 @@ class Emulated:
             first = change.sample + 1
             variance = self.card.noise_lsb[DISPLACEMENT] ** 2
             information[first:] = accumulate(seen[first:] * valid[first:], variance, self.correlation)
-        return Played(
-            codes[:, FORCE].astype(np.float64), codes[:, DISPLACEMENT].astype(np.float64), valid, information
-        )
+        return Played(codes[:, FORCE].astype(np.float64), codes[:, DISPLACEMENT].astype(np.float64), valid, information)
 
     def _inputs_lsb(self, seed: int, samples: int, turns: Sequence[PotTurn], change: Change | None) -> Array:
         """Inputs of the card without its noise, (samples, channels) LSB."""
@@ -542,20 +539,23 @@ ISSUE: Sequence[Condition] = (
     Condition("190hz", "generator on a clock of its own, 190 Hz", Emulated(square(190.0, ppm=0.0)), ("edges",)),
     Condition("any-instants", "edges at random instants", Emulated(random_instants), ("edges",)),
     *(
-        Condition(f"hum-{n}", f"hum of {n} LSB at 50 Hz on the displacement", Emulated(SQUARE, disturb=hum(n)), ("hum",))
+        Condition(
+            f"hum-{n}", f"hum of {n} LSB at 50 Hz on the displacement", Emulated(SQUARE, disturb=hum(n)), ("hum",)
+        )
         for n in (1, 3, 10)
     ),
     Condition(
-        "drift-.01", "displacement drifts 0.01 code a sample", Emulated(SQUARE, doubled(), disturb=drift(0.01)), ("drift",)
+        "drift-.01",
+        "displacement drifts 0.01 code a sample",
+        Emulated(SQUARE, doubled(), disturb=drift(0.01)),
+        ("drift",),
     ),
     Condition(
         "drift-.1", "displacement drifts 0.1 code a sample", Emulated(SQUARE, doubled(), disturb=drift(0.1)), ("drift",)
     ),
     Condition("ar-.9", "autoregressive noise, 0.9, 1 LSB", Emulated(SQUARE, correlation=0.9), ("noise",)),
     *(
-        Condition(
-            f"cubic-{percent:g}", f"cubic spring of {percent:g} %", Simulated(percent / 100.0), ("non-linear",)
-        )
+        Condition(f"cubic-{percent:g}", f"cubic spring of {percent:g} %", Simulated(percent / 100.0), ("non-linear",))
         for percent in (0.3, 1.0, 5.0, 20.0)
     ),
     Condition("small", "excitation of 3 % of the range", Emulated(square(part_of_range=0.03)), ("excitation",)),
@@ -569,29 +569,50 @@ ISSUE: Sequence[Condition] = (
 
 OWN: Sequence[Condition] = (
     Condition("ppm-20", "generator on a clock of its own, 20 ppm", Emulated(square(ppm=20.0))),
+    Condition("ppm-200", "generator on a clock of its own, 200 ppm", Emulated(square(ppm=200.0)), ("edges",)),
     Condition("bits-10", "10 bits", Emulated(SQUARE, dataclasses.replace(CARD, bits=10))),
     Condition("bits-18", "18 bits", Simulated(bits=18)),
-    Condition(
-        "fast", "plant with a pole of 0.3: card at 2.2 kHz", Emulated(square(21.8), at_rate(2180.0))
-    ),
+    Condition("fast", "plant with a pole of 0.3, card at 2.2 kHz", Emulated(square(21.8), at_rate(2180.0))),
     Condition("prbs", "pseudorandom binary sequence, bits of 25 samples", Emulated(random_bits)),
-    Condition("dac-5", "random steps of a 5-bit generator", Emulated(continuous(sine, steps=1, levels=32)), ("excitation",)),
+    Condition(
+        "dac-5",
+        "sine of 200 Hz in steps of a 5-bit generator",
+        Emulated(continuous(sine, steps=1, levels=32)),
+        ("excitation",),
+    ),
     Condition("inl", "converter with INL of 2 LSB", Emulated(SQUARE, _bent_card()), ("non-linear",)),
     Condition("real", "real parts 15 K too warm, DT2821 card", Emulated(SQUARE, _real_card(), components=real_parts)),
     Condition("skewed", "displacement taken 10 us after force", Emulated(SQUARE, _skewed_card())),
     Condition(
-        "jitter", "aperture jitter of 0.5 us", Emulated(SQUARE, dataclasses.replace(CARD, aperture_jitter_s=5e-7)), ("edges",)
+        "jitter",
+        "aperture jitter of 0.5 us",
+        Emulated(SQUARE, dataclasses.replace(CARD, aperture_jitter_s=5e-7)),
+        ("edges",),
     ),
     Condition("warming", "K falls by 2 % in 10,000 samples", Emulated(SQUARE, wander=warming(-0.02)), ("drift",)),
-    Condition("two-mass", "suspension on its tyre: four poles", Emulated(SQUARE, program="two-mass"), ("noise",)),
+    Condition("two-mass", "suspension on its tyre, four poles", Emulated(SQUARE, program="two-mass"), ("noise",)),
     Condition(
-        "loop-100", "ground loop: 2 LSB at 100 Hz on both channels",
-        Emulated(SQUARE, disturb=hum(2.0, 100.0, (FORCE, DISPLACEMENT))), ("hum",),
+        "loop-100",
+        "ground loop of 2 LSB at 100 Hz on both channels",
+        Emulated(SQUARE, disturb=hum(2.0, 100.0, (FORCE, DISPLACEMENT))),
+        ("hum",),
     ),
-    Condition("impulses", "impulses of 20 LSB on 0.1 % of the samples", Emulated(SQUARE, disturb=impulses(0.001, 20.0)), ("noise",)),
+    Condition(
+        "impulses",
+        "impulses of 20 LSB on 0.1 % of the samples",
+        Emulated(SQUARE, disturb=impulses(0.001, 20.0)),
+        ("noise",),
+    ),
     Condition("backlash", "backlash of 3 LSB of the sensor", Emulated(SQUARE, disturb=backlash(3.0)), ("non-linear",)),
-    Condition("rising", "noise that rises from 1 to 3 LSB", Emulated(SQUARE, disturb=rising_noise(0.0, 2.83)), ("noise",)),
-    Condition("proportional", "noise of 1 LSB and 0.1 % of the displacement", Emulated(SQUARE, disturb=proportional_noise(0.001)), ("noise",)),
+    Condition(
+        "rising", "noise that rises from 1 to 3 LSB", Emulated(SQUARE, disturb=rising_noise(0.0, 2.83)), ("noise",)
+    ),
+    Condition(
+        "proportional",
+        "noise of 1 LSB and 0.1 % of the displacement",
+        Emulated(SQUARE, disturb=proportional_noise(0.001)),
+        ("noise",),
+    ),
     Condition("blocks", "blocks of 32 samples are missing, 5 %", Emulated(SQUARE, arrives=missing(0.05, 32))),
     Condition("clipped", "displacement below 0.1 V clips", Emulated(SQUARE, _ranged(0.1, 10.1))),
     Condition("near-end", "range ends 8 LSB above the largest displacement", Emulated(SQUARE, _ranged(-4.01, 5.99))),

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_certificates, bench_detectors
+from . import bench_certificates, bench_detectors, bench_reality
 
 FOLDER = Path("harness/docs/evidence")
 
@@ -24,13 +24,18 @@ TITLES: Mapping[str, str] = {
     "onset": "Dating of changes",
     "properties": "False failures of the shipped properties",
     "detectors": "Detectors at the same measured ARL0",
+    "reality": "The shipped device under the conditions that users meet",
 }
 """Page titles by the name of the benchmark."""
 
-CROSSED = {"certificates", "detectors"}
+CROSSED = {"certificates", "detectors", "reality"}
 """Benchmarks whose figures are named ROW: COLUMN, and whose page is a table of these."""
 
-NOTES: Mapping[str, str] = {"certificates": bench_certificates.NOTE, "detectors": bench_detectors.NOTE}
+NOTES: Mapping[str, str] = {
+    "certificates": bench_certificates.NOTE,
+    "detectors": bench_detectors.NOTE,
+    "reality": bench_reality.NOTE,
+}
 """Paragraphs below the tables."""
 
 
