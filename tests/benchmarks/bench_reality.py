@@ -19,15 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers, Samples
-from analogrig.devices.direct import DirectDevice
-from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import DEFAULT_ARL0
 from analogrig.judging.information import first_at_level
-from analogrig.run import Channel
 
-from .conditions import CARD, CONDITIONS, FORCE, PARAMETERS, Change, Condition, Played, Simulated
+from . import silverbox
+from .conditions import CONDITIONS, PARAMETERS, Change, Condition, Simulated
 from .figure import Figure
+from .shipped import Misfit, answers_to, first_misfit, settling_n, shipped
 
 CONFIDENCE = 0.99
 
@@ -39,6 +37,9 @@ ONSET_N, ONSET_SPAN_N = 2500, 400
 
 MISFIT_N = 2000
 """Samples within which a misfit must be reported."""
+
+ROWS = (*CONDITIONS, silverbox.ROW)
+"""Names of the rows."""
 
 FACTORS = (1.2, 0.8)
 
@@ -91,44 +92,6 @@ class Effort:
 
 
 QUICK = Effort(runs=20, trials=10)
-
-
-# ----------------------------------------------------------------------------------------------------------- the device
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """Report of the device that its model does not describe the samples."""
-
-    kind: str
-    sample: int
-
-
-def shipped() -> DirectDevice:
-    """Device ``inproc`` as shipped, without its line."""
-    device = InprocDevice(name="shipped").direct(alarms_only=True)
-    assert isinstance(device, DirectDevice)
-    low_v, lsb_v = CARD.ranges_v[FORCE][0], float(CARD.lsb_v[FORCE])
-    device.prepare({"force": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
-    return device
-
-
-def settling_n(device: DirectDevice) -> int:
-    """Samples from the start after which the promise on false alarms holds: the header states them."""
-    return int(device.description()["estimator"]["warm_up_n"])
-
-
-def first_misfit(answers: Answers) -> Misfit | None:
-    """First misfit that the device reports; raises LookupError as long as it reports none at all."""
-    del answers
-    raise LookupError
-
-
-def answers_to(device: DirectDevice, played: Played) -> Answers:
-    """Answers of the device, started anew, to a run."""
-    device.start()
-    (answers,) = device.play([Samples(0, played.u, played.y, played.valid)])  # type: ignore[arg-type]
-    return answers
 
 
 # ------------------------------------------------------------------------------------------------------- false alarms
@@ -301,7 +264,9 @@ def play_changes(condition: Condition, effort: Effort) -> Delays:
 
 
 def measure(name: str, effort: Effort) -> list[Figure]:
-    """Figures of one row."""
+    """Figures of one row; those of the Silverbox, of all its rows."""
+    if name == silverbox.ROW:
+        return list(silverbox.figures())
     condition = CONDITIONS[name]
     healthy, changes = play_healthy(condition, effort), play_changes(condition, effort)
     reasons = ", ".join(_faults(condition, healthy, changes))
@@ -322,7 +287,7 @@ def _faults(condition: Condition, healthy: Healthy, changes: Delays) -> Iterator
 
 def figures(effort: Effort = Effort(), names: Sequence[str] = (), jobs: int = JOBS) -> Iterator[Figure]:
     """Figures of the named rows, or of all, in the order of the table."""
-    names = names or tuple(CONDITIONS)
+    names = names or ROWS
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         for row in [pool.submit(measure, name, effort) for name in names]:
             yield from row.result()
@@ -337,9 +302,9 @@ def arguments(words: Sequence[str]) -> tuple[Effort, Sequence[str], int]:
     given = parser.parse_args(words)
     wanted = [each for each in given.rows.split(",") if each]
     for each in wanted:
-        if not any(name.startswith(each) for name in CONDITIONS):
-            parser.error(f"no row is called {each}; there are {', '.join(CONDITIONS)}")
-    names = [name for name in CONDITIONS if any(name.startswith(each) for each in wanted)]
+        if not any(name.startswith(each) for name in ROWS):
+            parser.error(f"no row is called {each}; there are {', '.join(ROWS)}")
+    names = [name for name in ROWS if any(name.startswith(each) for each in wanted)]
     return QUICK if given.quick else Effort(), names, given.jobs
 
 
@@ -350,7 +315,7 @@ def figures_of(*words: str) -> Iterator[Figure]:
 
 def lines(found: Iterator[Figure]) -> Iterator[str]:
     """One line of text for each row of the table."""
-    row, cells = "", []
+    row, cells = "", list[str]()
     for figure in found:
         name, _, column = figure.name.partition(": ")
         if name != row:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.rigs.emulator import Stream
-from analogrig.run import CHANNELS
+from analogrig.run import CHANNELS, missing_samples
 from analogrig_emulator import (
     CARDS,
     COMPONENTS,
@@ -153,7 +153,7 @@ class Emulated:
         turns = [] if self.wander is None else [*self.wander(samples if change is None else change.sample)]
         lsb = self._inputs_lsb(seed, samples, turns, change)
         codes, clipped = self._sampled(lsb, seed)
-        valid = ~clipped[:, [FORCE, DISPLACEMENT]].any(axis=1)
+        valid = ~missing_samples(clipped)
         if self.arrives is not None:
             valid &= self.arrives(samples, self._rng(seed, 1))
         information = np.zeros(samples)
@@ -208,15 +208,18 @@ def autoregressive(white: Array, correlation: float) -> Array:
 
 
 def accumulate(seen_lsb: Array, variance_lsb2: float, correlation: float = 0.0) -> Array:
-    """Information up to each sample of a difference (n,) in noise, beside the quantisation's, of this correlation."""
-    if correlation:
-        from scipy.linalg import cholesky, solve_triangular, toeplitz
+    """Information up to each sample of a difference (n,) in first-order autoregressive noise and quantisation.
 
-        covariance = variance_lsb2 * toeplitz(correlation ** np.arange(len(seen_lsb)))
-        covariance += QUANTISATION_VARIANCE_LSB2 * np.eye(len(seen_lsb))
-        whitened = solve_triangular(cholesky(covariance, lower=True), seen_lsb, lower=True)
-    else:
-        whitened = seen_lsb / math.sqrt(variance_lsb2 + QUANTISATION_VARIANCE_LSB2)
+    A Kalman filter of the noise whitens the difference.
+    """
+    whitened = np.empty(len(seen_lsb))
+    predicted, spread = 0.0, variance_lsb2
+    for k, seen in enumerate(seen_lsb.tolist()):
+        error, variance = seen - predicted, spread + QUANTISATION_VARIANCE_LSB2
+        whitened[k] = error / math.sqrt(variance)
+        gain = spread / variance
+        predicted = correlation * (predicted + gain * error)
+        spread = correlation**2 * (1.0 - gain) * spread + (1.0 - correlation**2) * variance_lsb2
     return np.asarray(np.cumsum(whitened**2) / 2.0)
 
 

@@ -1,0 +1,160 @@
+"""Silverbox: a measured electronic mass, damper and cubic spring, as samples for the device.
+
+The record is that of Wigren and Schoukens, "Three free data sets for development and benchmarking in nonlinear system
+identification", ECC 2013; it is not part of the repository. FOLDER_SETTING names the folder of its file.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from .conditions import Array, Played
+from .figure import Figure
+from .shipped import answers_to, first_misfit, settling_n, shipped
+
+FOLDER_SETTING, FOLDER, FILE = "ANALOGRIG_SILVERBOX", "../shared/data/silverbox", "SNLS80mV.csv"
+"""Environment variable, its default, and the file in that folder."""
+
+ROW = "silverbox"
+
+RATE_HZ = 10e6 / 2**14
+
+RANGES_V = (0.2, 0.35)
+"""Largest input and output of the 12-bit card that samples the record."""
+
+CODES = 4096
+
+RESONANCE_HZ, DAMPING = 68.35, 0.0488
+"""Resonance and damping ratio of the linear part, from a fit of the multisines."""
+
+LINEAR_END, GROWTH_END = 10_000, 40_000
+"""Ends of the part that a linear model describes, and of that in which the amplitude grows in proportion to time."""
+
+PARTS = ((0, LINEAR_END, 0), (LINEAR_END, 20_000, 1), (20_000, GROWTH_END, 1))
+"""Parts of the record, (start, end), and the largest number of alarms: one for each doubling of the amplitude."""
+
+SPLICES, FIRST_SPLICE, HORIZON_N = 20, 2_500, 300
+"""Number of instants of each change, the first one, and the samples after a change in which it must be seen."""
+
+FACTORS = (1.2, 0.8)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Volts of input and output, (n,) each."""
+
+    input_v: Array
+    output_v: Array
+
+    @classmethod
+    def load(cls) -> Self:
+        """:raises FileNotFoundError: the folder lacks the file; the message names the setting."""
+        path = Path(os.environ.get(FOLDER_SETTING, FOLDER)) / FILE
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is absent: set {FOLDER_SETTING} to the folder of {FILE}")
+        input_v, output_v = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1)).T
+        return cls(input_v, output_v)
+
+    def played(self, end: int | None = None) -> Played:
+        """Codes up to a sample."""
+        u, y = (
+            np.clip(np.rint((volts[:end] / most_v + 1.0) * CODES / 2), 0, CODES - 1)
+            for volts, most_v in zip((self.input_v, self.output_v), RANGES_V, strict=True)
+        )
+        return Played(u, y, np.ones(len(u), np.bool_), np.zeros(len(u)))
+
+    def spliced(self, onset: int, factor: float, gain: float) -> Record:
+        """Record up to HORIZON_N after the change of the stiffness at a sample, by its exact linear difference."""
+        end = onset + HORIZON_N + 1
+        difference_v = gain * (respond(self.input_v[:end], onset, factor) - respond(self.input_v[:end]))
+        return Record(self.input_v[:end], self.output_v[:end] + difference_v)
+
+    def gain(self) -> float:
+        """Static gain of the linear part, by least squares with an offset."""
+        unit = respond(self.input_v[:LINEAR_END])
+        regressors = np.stack([unit, np.ones(len(unit))], axis=1)[LINEAR_END // 10 :]
+        return float(np.linalg.lstsq(regressors, self.output_v[LINEAR_END // 10 : LINEAR_END], rcond=None)[0][0])
+
+
+def respond(input_v: Array, onset: int | None = None, factor: float = 1.0) -> Array:
+    """Response of the linear part with unit static gain; from a sample on its stiffness is ``factor`` times as large.
+
+    The input is linear between the samples.
+    """
+    last = len(input_v) if onset is None else onset
+    before, after = _step(1.0), _step(factor)
+    out, (x, v) = np.empty(len(input_v)), (0.0, 0.0)
+    inputs = input_v.tolist()
+    for k, (now, following) in enumerate(zip(inputs, [*inputs[1:], inputs[-1]], strict=True)):
+        out[k] = x
+        (xx, xv, x0, x1), (vx, vv, v0, v1) = before if k < last else after
+        rise = following - now
+        x, v = xx * x + xv * v + x0 * now + x1 * rise, vx * x + vv * v + v0 * now + v1 * rise
+    return out
+
+
+def _step(factor: float) -> list[list[float]]:
+    """Rows of x and v after a sample period from x, v, the input before and its rise (first-order hold)."""
+    from scipy.linalg import expm
+
+    rate = 2.0 * math.pi * RESONANCE_HZ
+    generator = np.zeros((4, 4))
+    generator[0, 1] = 1.0
+    generator[1, :3] = -factor * rate**2, -2.0 * DAMPING * rate, rate**2
+    generator[2, 3] = RATE_HZ
+    rows: list[list[float]] = expm(generator / RATE_HZ)[:2].tolist()
+    return rows
+
+
+def figures() -> Iterator[Figure]:
+    """Alarms of the parts of the record, and changes of the stiffness that are spliced in; none without the record."""
+    try:
+        record = Record.load()
+    except FileNotFoundError as absent:
+        print(f"{ROW} is skipped: {absent}")
+        return
+    yield from _alarms(record)
+    yield from _changes(record)
+
+
+def _alarms(record: Record) -> Iterator[Figure]:
+    device = shipped()
+    answers = answers_to(device, record.played())
+    alarms = np.array([alarm.index for alarm in answers.alarms if alarm.index >= settling_n(device)], dtype=int)
+    for start, end, most in (*PARTS, (GROWTH_END, len(record.input_v), 1)):
+        found = int(np.count_nonzero((alarms >= start) & (alarms < end)))
+        row = f"{ROW}, samples {start:,} to {end:,}"
+        yield Figure(f"{row}: false alarms per 1e5", 1e5 * found / (end - start), "", f"{found} alarms")
+        reasons = "" if found <= most else "rate"
+        if end == GROWTH_END:
+            try:
+                misfit = first_misfit(answers)
+            except LookupError:
+                remark = "not reported"
+            else:
+                remark = "none" if misfit is None else f"{misfit.kind} at {misfit.sample:,}"
+            yield Figure(f"{row}: MISFIT", float("non-linear" in remark), "of 1 run", remark)
+        yield Figure(f"{row}: required", not reasons, "", reasons)
+
+
+def _changes(record: Record) -> Iterator[Figure]:
+    device, gain = shipped(), record.gain()
+    delays_n: list[int] = []
+    onsets = np.linspace(FIRST_SPLICE, GROWTH_END - HORIZON_N - 1, SPLICES).astype(int).tolist()
+    for onset in onsets:
+        for factor in FACTORS:
+            alarms = answers_to(device, record.spliced(onset, factor, gain).played()).alarms
+            delays_n += [alarm.index - onset for alarm in alarms if alarm.index > onset][:1]
+    row, trials = f"{ROW}, K spliced in at samples {onsets[0]:,} to {onsets[-1]:,}", len(onsets) * len(FACTORS)
+    missed = trials - len(delays_n)
+    yield Figure(f"{row}: missed", missed, f"of {trials}")
+    if delays_n:
+        yield Figure(f"{row}: median delay", float(np.median(delays_n)), "samples")
+    yield Figure(f"{row}: required", not missed, "", "missed" if missed else "")
