@@ -3,20 +3,38 @@
 Plants of tests.estimator_c.plants; at least 400 trials a cell, random phase and onset, fixed seeds, ARL0 = 1e5.
 
 python -m tests.benchmarks.bench_statistics [delay] [free-running] [false-alarms] [false-alarms-free-running] [accuracy]
+    [shipped] [random-plants] [random-plants-free-running]
+
+The last three play the shipped device with its default settings. Those of random plants take 1e8 samples each, and run
+only if they are named.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+import math
+import multiprocessing
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.judging.statistics import rate_interval
 from tests.estimator_c.est_driver import Estimator, compile_driver
 from tests.estimator_c.performance import (
     ARL0,
     FULL,
     FULL_FREE,
+    HORIZON_N,
+    LEARNT_N,
+    ONSET_SPAN_N,
     OWN_CLOCK,
     QUARTER,
     QUARTER_FREE,
@@ -27,9 +45,22 @@ from tests.estimator_c.performance import (
     false_alarms,
     upper_rate,
 )
-from tests.estimator_c.plants import FRONT, LIGHT, SHOCK, Excitation, random_plants
+from tests.estimator_c.plants import (
+    FRONT,
+    LIGHT,
+    PERIOD_S,
+    SHOCK,
+    Excitation,
+    Mechanics,
+    plants_of_any_speed,
+    random_plants,
+    simulate,
+)
 
+from .conditions import Played
+from .false_alarms import FalseAlarms, count_false_alarms
 from .figure import Figure
+from .shipped import answers_to, settling_n, shipped
 
 
 def changes(excitation: Excitation) -> Iterator[tuple[str, float]]:
@@ -91,20 +122,178 @@ def accuracies(estimator: Estimator, settings: Settings, trials: int, samples: i
         yield Figure(f"rms error of {name}", float(rms / bound), "Cramer-Rao bounds", remark)
 
 
+# -------------------------------------------------------------------------------------------------- the shipped device
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Single changes of the front suspension on one clock."""
+
+    name: str
+    excitation: Excitation
+    limit: float
+    """Largest ratio of the mean delay to the mean bound, over all changes."""
+    missing: float = 0.0
+    """Share of the samples that do not arrive."""
+
+
+CELLS = (
+    Cells("one clock", FULL, 1.10),
+    Cells("one clock, 5 % missing", FULL, 1.3, 0.05),
+    Cells("one clock, 20 % missing", FULL, 1.8, 0.2),
+    Cells("edges anywhere, 20 ppm", FULL_FREE, 1.2),
+)
+
+ARL0_SAMPLES = 10_000_000
+"""Samples from which an ARL0 is measured."""
+
+RUN_N, LANES = 20_000, 100
+"""Samples of a run, and runs that are simulated together."""
+
+WORST = 5
+"""Number of random plants with a row of their own."""
+
+
+def shipped_delays(trials: int = 400, samples: int = ARL0_SAMPLES) -> Iterator[Figure]:
+    """Delays of twelve changes at the measured ARL0: means over the cells, and each cell."""
+    for cells in CELLS:
+        alarms = healthy_alarms(FRONT, cells.excitation, samples, seed=500, missing=cells.missing)
+        arl0 = alarms.exposure_n / max(alarms.alarms, 1)
+        low, high = rate_interval(alarms.alarms, alarms.exposure_n, 0.95)
+        remark = f"{alarms.alarms} alarms in {alarms.exposure_n} samples"
+        bounds = (1.0 / high, 1.0 / low if low else math.inf)
+        yield Figure(f"shipped, {cells.name}: ARL0", arl0, "samples", remark, bounds=bounds)
+        every = []
+        for seed, (parameter, factor) in enumerate(itertools.product("KBM", (1.1, 0.9, 1.2, 0.8))):
+            played = play_shipped(cells, (parameter, factor), trials, seed)
+            every.append(played)
+            yield played.figure(f"shipped, {cells.name}: mean delay, {parameter}{100 * (factor - 1):+.0f}%", ARL0)
+        together = ShippedDelays.joined(every)
+        remark = f"limit {cells.limit}; "
+        yield together.figure(f"shipped, {cells.name}: mean delay, all changes", ARL0, remark)
+        yield together.figure(f"shipped, {cells.name}: mean delay, all changes, bound at the measured ARL0", arl0)
+
+
+@dataclass(frozen=True)
+class ShippedDelays:
+    """Delays of changes, and their information."""
+
+    latency_n: NDArray[np.float64]
+    """(t,); HORIZON_N for missed ones."""
+    information: NDArray[np.float64]
+    """(t, HORIZON_N) after each change."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[ShippedDelays]) -> ShippedDelays:
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("latency_n", "information")))
+
+    def figure(self, name: str, arl0: float, remark: str = "") -> Figure:
+        """Mean delay over the mean bound at an ARL0, with two standard errors either side."""
+        reached = self.information >= math.log(arl0)
+        bound_n = np.where(reached.any(axis=1), reached.argmax(axis=1) + 1, HORIZON_N)
+        ratio = float(self.latency_n.mean() / bound_n.mean())
+        spread = (self.latency_n - ratio * bound_n).std(ddof=1)
+        error = float(spread / math.sqrt(len(bound_n)) / bound_n.mean())
+        missed = int((self.latency_n >= HORIZON_N).sum())
+        means = f"{self.latency_n.mean():.2f} against {bound_n.mean():.2f} samples"
+        bounds = (ratio - 2.0 * error, ratio + 2.0 * error)
+        counts = f"at ARL0 {arl0:.3g}, {missed} missed, {len(bound_n)} trials"
+        return Figure(name, ratio, "bounds", f"{remark}{means} {counts}", bounds=bounds)
+
+
+def play_shipped(cells: Cells, change: tuple[str, float], trials: int, seed: int) -> ShippedDelays:
+    """Play a change in so many trials."""
+    rng = np.random.default_rng([seed, 2])
+    onset = rng.integers(LEARNT_N, LEARNT_N + ONSET_SPAN_N, trials)
+    samples = LEARNT_N + ONSET_SPAN_N + HORIZON_N
+    played = simulate((FRONT, FRONT.scaled(*change)), onset, cells.excitation, samples, seed)
+    valid = rng.uniform(size=played.u.shape) >= cells.missing
+    gained = np.diff(played.information, axis=1, prepend=0.0) * valid
+    device = shipped()
+    latency_n, information = np.full(trials, float(HORIZON_N)), np.empty((trials, HORIZON_N))
+    for trial, last in enumerate(onset.tolist()):
+        run = Played(played.u[trial], played.y[trial], valid[trial], gained[trial])
+        later = [alarm.index - last for alarm in answers_to(device, run).alarms if alarm.index > last]
+        latency_n[trial] = min([*later, HORIZON_N])
+        information[trial] = np.cumsum(gained[trial])[last + 1 : last + 1 + HORIZON_N]
+    return ShippedDelays(latency_n, information)
+
+
+def healthy_alarms(
+    plant: Mechanics, excitation: Excitation, samples: int, seed: int, missing: float = 0.0
+) -> FalseAlarms:
+    """False alarms of the shipped device in runs of RUN_N samples, after the settling time of each."""
+    device = shipped()
+    settled = settling_n(device)
+    alarms, exposures_n = [], []
+    for part in range(max(1, samples // (RUN_N * LANES))):
+        never = np.full(min(LANES, samples // RUN_N), RUN_N)
+        played = simulate((plant, plant), never, excitation, RUN_N, seed + 1000 * part)
+        rng = np.random.default_rng([seed, part])
+        for u, y in zip(played.u, played.y, strict=True):
+            valid = rng.uniform(size=RUN_N) >= missing
+            found = answers_to(device, Played(u, y, valid, np.zeros(RUN_N))).alarms
+            alarms.append([alarm.index for alarm in found if alarm.index >= settled])
+            exposures_n.append(int(valid[settled:].sum()))
+    return count_false_alarms(alarms, exposures_n)
+
+
+def plants_of_any_speed_alarms(
+    excitation: Excitation, count: int = 50, samples: int = 2_000_000, jobs: int = 2
+) -> Iterator[Figure]:
+    """False alarms of random plants with poles from 0.3 to 0.999: of the worst ones, and of all."""
+    plants = plants_of_any_speed(count, seed=3)
+    begun_s = time.monotonic()
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        rows = [
+            pool.submit(healthy_alarms, plant, dataclasses.replace(excitation, half_period_n=half_n), samples, 700 + i)
+            for i, (plant, half_n) in enumerate(plants)
+        ]
+        found = [row.result() for row in rows]
+    took_s = time.monotonic() - begun_s
+    name = f"shipped, {_name(excitation)}: false alarms"
+    worst = sorted(zip(plants, found, strict=True), key=lambda pair: -pair[1].alarms)[:WORST]
+    for rank, ((plant, half_n), each) in enumerate(worst, 1):
+        pole = max(abs(np.exp(pole * PERIOD_S)) for pole in plant.poles())
+        remark = f"pole {pole:.4f}, half period {half_n:g}; "
+        yield _bursts(f"{name}, random plant of any speed, worst but {rank - 1}", each, remark)
+    every = FalseAlarms(
+        sum(each.exposure_n for each in found),
+        tuple(count for each in found for count in each.by_run),
+        tuple(size for each in found for size in each.clusters),
+    )
+    yield _bursts(f"{name}, {count} random plants of any speed", every)
+    yield Figure(f"{name}, random plants of any speed, throughput", every.exposure_n / took_s, "samples/s")
+
+
+def _bursts(name: str, found: FalseAlarms, remark: str = "") -> Figure:
+    counts = f"{found.alarms} alarms in {len(found.clusters)} clusters in {found.exposure_n} samples"
+    return Figure(name, found.upper_rate() * ARL0, "of 1/ARL0", f"{remark}limit 1 at 99 % confidence: {counts}")
+
+
 PARTS: Mapping[str, Callable[[Estimator], Iterator[Figure]]] = {
     "delay": lambda estimator: delays(estimator, SHARED_CLOCK, {FULL: 1.3, QUARTER: 1.5}, 400),
     "free-running": lambda estimator: delays(estimator, OWN_CLOCK, {FULL_FREE: 1.5, QUARTER_FREE: 1.5}, 400),
     "false-alarms": lambda estimator: quietness(estimator, SHARED_CLOCK, FULL, 2_000_000),
     "false-alarms-free-running": lambda estimator: quietness(estimator, OWN_CLOCK, FULL_FREE, 2_000_000),
     "accuracy": lambda estimator: accuracies(estimator, SHARED_CLOCK, 1000),
+    "shipped": lambda _: shipped_delays(),
+    "random-plants": lambda _: plants_of_any_speed_alarms(FULL),
+    "random-plants-free-running": lambda _: plants_of_any_speed_alarms(FULL_FREE),
 }
+
+LONG = {"random-plants", "random-plants-free-running"}
+"""Parts that run only if they are named."""
 
 
 def figures(*parts: str) -> Iterator[Figure]:
-    """Figures of the named parts, or of all."""
+    """Figures of the named parts, or of all but the long ones; ends the program if there is no such part."""
+    for part in parts:
+        if part not in PARTS:
+            sys.exit(f"no part of the statistics is called {part}; there are {', '.join(PARTS)}")
     with tempfile.TemporaryDirectory() as folder:
         estimator = Estimator(compile_driver(Path(folder)))
-        for part in parts or PARTS:
+        for part in parts or (part for part in PARTS if part not in LONG):
             yield from PARTS[part](estimator)
 
 

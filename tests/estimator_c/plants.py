@@ -37,6 +37,10 @@ class Mechanics:
         name = {"M": "mass_kg", "B": "damping_n_s_per_m", "K": "stiffness_n_per_m"}[parameter]
         return replace(self, **{name: getattr(self, name) * factor})
 
+    def slowed(self, factor: float) -> Mechanics:
+        """The plant, so many times slower and as stiff."""
+        return replace(self, mass_kg=self.mass_kg * factor**2, damping_n_s_per_m=self.damping_n_s_per_m * factor)
+
     def poles(self) -> tuple[complex, complex]:
         """Per second."""
         half = self.damping_n_s_per_m / (2.0 * self.mass_kg)
@@ -76,6 +80,27 @@ def random_plants(count: int, seed: int) -> list[Mechanics]:
     stiffness = np.exp(rng.uniform(np.log(17000.0), np.log(30000.0), count))
     damping = np.exp(rng.uniform(np.log(0.4), np.log(1.2), count)) * 2.0 * np.sqrt(stiffness * mass)
     return [Mechanics(m, b, k, 2940.0) for m, b, k in zip(mass, damping, stiffness, strict=True)]
+
+
+def plants_of_any_speed(count: int, seed: int) -> list[tuple[Mechanics, float]]:
+    """Plants of ``random_plants`` at other speeds, each with a half period of the excitation, in samples.
+
+    The larger pole lies between 0.3 and 0.999, its logarithm evenly on a logarithmic scale. The half period is in
+    proportion to the time constant, as for the front suspension, within 10 and 500 samples.
+    """
+    rng = np.random.default_rng([seed, 1])
+    usual = _decay(FRONT)
+    decays = np.exp(rng.uniform(np.log(-np.log(0.999)), np.log(-np.log(0.3)), count))
+    drawn = [
+        (plant.slowed(_decay(plant) / decay), decay)
+        for plant, decay in zip(random_plants(count, seed), decays.tolist(), strict=True)
+    ]
+    return [(plant, float(np.clip(np.rint(50.0 * usual / decay), 10.0, 500.0))) for plant, decay in drawn]
+
+
+def _decay(plant: Mechanics) -> float:
+    """Negative logarithm of the magnitude of the larger pole, per sample."""
+    return -max(pole.real for pole in plant.poles()) * PERIOD_S
 
 
 @dataclass(frozen=True)
