@@ -6,7 +6,7 @@ Full range, 12 bits and 1 LSB; 400 trials a cell, random phase and onset, fixed 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tests.estimator_c.est_driver import Estimator, compile_driver
@@ -23,13 +23,16 @@ CHANGES: tuple[Change, ...] = (
 )
 
 
-def figures(trials: int = 400) -> Iterator[Figure]:
+SINGLE = tuple(change for change in CHANGES if len(change) == 1)
+
+
+def figures(trials: int = 400, changes: Sequence[Change] = CHANGES) -> Iterator[Figure]:
     """One row a change and a clock."""
     clocks = {"one clock": (SHARED_CLOCK, FULL), "edges anywhere, 20 ppm": (OWN_CLOCK, FULL_FREE)}
     with tempfile.TemporaryDirectory() as folder:
         estimator = Estimator(compile_driver(Path(folder)))
         for clock, (settings, excitation) in clocks.items():
-            for change in CHANGES:
+            for change in changes:
                 found = measure(estimator, settings, FRONT, change, excitation, trials, seed=31)
                 named = ", ".join(f"{name}{100 * (factor - 1):+.0f}%" for name, factor in change.items())
                 remark = (
@@ -41,3 +44,6 @@ def figures(trials: int = 400) -> Iterator[Figure]:
                 if len(change) == 1:
                     remark += f"; extent within {100 * found.error:.1f} %, later {100 * found.error_refined:.2f} %"
                 yield Figure(f"{clock}: isolation, {named}", found.mean_n / found.bound_n, "bounds", remark)
+                if len(change) == 1:
+                    ratio = found.mean_n / found.bound_of_pairs_n
+                    yield Figure(f"{clock}: isolation against all rivals, {named}", ratio, "bounds", "limit 2")

@@ -6,6 +6,7 @@ identification", ECC 2013; it is not part of the repository. FOLDER_SETTING name
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Iterator
@@ -45,6 +46,8 @@ SPLICES, FIRST_SPLICE, HORIZON_N = 20, 2_500, 300
 
 FACTORS = (1.2, 0.8)
 
+AT_REST = np.zeros(2)
+
 
 @dataclass(frozen=True, eq=False)
 class Record:
@@ -70,31 +73,37 @@ class Record:
         )
         return Played(u, y, np.ones(len(u), np.bool_), np.zeros(len(u)))
 
-    def spliced(self, onset: int, factor: float, gain: float) -> Record:
-        """Record up to HORIZON_N after the change of the stiffness at a sample, by its exact linear difference."""
-        end = onset + HORIZON_N + 1
-        difference_v = gain * (respond(self.input_v[:end], onset, factor) - respond(self.input_v[:end]))
-        return Record(self.input_v[:end], self.output_v[:end] + difference_v)
+    @functools.cached_property
+    def states(self) -> Array:
+        """States of the linear part with unit static gain, (n, 2)."""
+        return respond(self.input_v)
 
+    @functools.cached_property
     def gain(self) -> float:
         """Static gain of the linear part, by least squares with an offset."""
-        unit = respond(self.input_v[:LINEAR_END])
-        regressors = np.stack([unit, np.ones(len(unit))], axis=1)[LINEAR_END // 10 :]
-        return float(np.linalg.lstsq(regressors, self.output_v[LINEAR_END // 10 : LINEAR_END], rcond=None)[0][0])
+        unit, seen_v = (each[LINEAR_END // 10 : LINEAR_END] for each in (self.states[:, 0], self.output_v))
+        regressors = np.stack([unit, np.ones(len(unit))], axis=1)
+        return float(np.linalg.lstsq(regressors, seen_v, rcond=None)[0][0])
+
+    def spliced(self, onset: int, factor: float) -> Record:
+        """Record up to HORIZON_N after the change of the stiffness at a sample, by its exact linear difference."""
+        end = onset + HORIZON_N + 1
+        output_v = self.output_v[:end].copy()
+        changed = respond(self.input_v[onset:end], self.states[onset], factor)
+        output_v[onset:] += self.gain * (changed - self.states[onset:end])[:, 0]
+        return Record(self.input_v[:end], output_v)
 
 
-def respond(input_v: Array, onset: int | None = None, factor: float = 1.0) -> Array:
-    """Response of the linear part with unit static gain; from a sample on its stiffness is ``factor`` times as large.
+def respond(input_v: Array, state: Array = AT_REST, factor: float = 1.0) -> Array:
+    """States (n, 2) of the linear part with unit static gain at each sample: displacement, and velocity per second.
 
-    The input is linear between the samples.
+    The stiffness is ``factor`` times as large. The input is linear between the samples.
     """
-    last = len(input_v) if onset is None else onset
-    before, after = _step(1.0), _step(factor)
-    out, (x, v) = np.empty(len(input_v)), (0.0, 0.0)
+    (xx, xv, x0, x1), (vx, vv, v0, v1) = _step(factor)
+    out, (x, v) = np.empty((len(input_v), 2)), state.tolist()
     inputs = input_v.tolist()
     for k, (now, following) in enumerate(zip(inputs, [*inputs[1:], inputs[-1]], strict=True)):
-        out[k] = x
-        (xx, xv, x0, x1), (vx, vv, v0, v1) = before if k < last else after
+        out[k] = x, v
         rise = following - now
         x, v = xx * x + xv * v + x0 * now + x1 * rise, vx * x + vv * v + v0 * now + v1 * rise
     return out
@@ -145,12 +154,12 @@ def _alarms(record: Record) -> Iterator[Figure]:
 
 
 def _changes(record: Record) -> Iterator[Figure]:
-    device, gain = shipped(), record.gain()
+    device = shipped()
     delays_n: list[int] = []
     onsets = np.linspace(FIRST_SPLICE, GROWTH_END - HORIZON_N - 1, SPLICES).astype(int).tolist()
     for onset in onsets:
         for factor in FACTORS:
-            alarms = answers_to(device, record.spliced(onset, factor, gain).played()).alarms
+            alarms = answers_to(device, record.spliced(onset, factor).played()).alarms
             delays_n += [alarm.index - onset for alarm in alarms if alarm.index > onset][:1]
     row, trials = f"{ROW}, K spliced in at samples {onsets[0]:,} to {onsets[-1]:,}", len(onsets) * len(FACTORS)
     missed = trials - len(delays_n)
