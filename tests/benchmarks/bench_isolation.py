@@ -6,7 +6,7 @@ Full range, 12 bits and 1 LSB; 400 trials a cell, random phase and onset, fixed 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from tests.estimator_c.est_driver import Estimator, compile_driver
@@ -23,16 +23,13 @@ CHANGES: tuple[Change, ...] = (
 )
 
 
-SINGLE = tuple(change for change in CHANGES if len(change) == 1)
-
-
-def figures(trials: int = 400, changes: Sequence[Change] = CHANGES) -> Iterator[Figure]:
+def figures(trials: int = 400) -> Iterator[Figure]:
     """One row a change and a clock."""
     clocks = {"one clock": (SHARED_CLOCK, FULL), "edges anywhere, 20 ppm": (OWN_CLOCK, FULL_FREE)}
     with tempfile.TemporaryDirectory() as folder:
         estimator = Estimator(compile_driver(Path(folder)))
         for clock, (settings, excitation) in clocks.items():
-            for change in changes:
+            for change in CHANGES:
                 found = measure(estimator, settings, FRONT, change, excitation, trials, seed=31)
                 named = ", ".join(f"{name}{100 * (factor - 1):+.0f}%" for name, factor in change.items())
                 remark = (

@@ -2,7 +2,8 @@
 
 python -m tests.benchmarks.bench_reality [--rows NAME,...] [--quick] [--jobs N]
 
-``--quick`` plays a fifth of the healthy samples and a third of the changes, for a look at the table.
+The whole table takes some 5 minutes on two cores. ``--quick`` plays a fifth of the healthy samples and a third of the
+changes, for a look at it.
 """
 
 from __future__ import annotations

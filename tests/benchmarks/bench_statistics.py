@@ -3,10 +3,10 @@
 Plants of tests.estimator_c.plants; at least 400 trials a cell, random phase and onset, fixed seeds, ARL0 = 1e5.
 
 python -m tests.benchmarks.bench_statistics [delay] [free-running] [false-alarms] [false-alarms-free-running] [accuracy]
-    [single-changes] [shipped] [random-plants] [random-plants-free-running]
+    [shipped] [random-plants] [random-plants-free-running]
 
-"single-changes" is the isolation of these. The last three parts play the shipped device with its default settings. Those of random plants take 1e8 samples each, and run
-only if they are named.
+The last three parts play the shipped device with its default settings. Random plants take 1e8 samples and some 100 s on
+two cores for each clock, and run only if they are named.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ from tests.estimator_c.plants import (
     simulate,
 )
 
-from . import bench_isolation
 from .conditions import Played
 from .false_alarms import FalseAlarms, count_false_alarms
 from .figure import Figure
@@ -278,7 +277,6 @@ PARTS: Mapping[str, Callable[[Estimator], Iterator[Figure]]] = {
     "false-alarms": lambda estimator: quietness(estimator, SHARED_CLOCK, FULL, 2_000_000),
     "false-alarms-free-running": lambda estimator: quietness(estimator, OWN_CLOCK, FULL_FREE, 2_000_000),
     "accuracy": lambda estimator: accuracies(estimator, SHARED_CLOCK, 1000),
-    "single-changes": lambda _: bench_isolation.figures(changes=bench_isolation.SINGLE),
     "shipped": lambda _: shipped_delays(),
     "random-plants": lambda _: plants_of_any_speed_alarms(FULL),
     "random-plants-free-running": lambda _: plants_of_any_speed_alarms(FULL_FREE),
