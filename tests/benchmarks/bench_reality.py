@@ -27,7 +27,7 @@ from . import silverbox
 from .conditions import CONDITIONS, PARAMETERS, Change, Condition, Simulated
 from .false_alarms import CLUSTER_N, FalseAlarms, count_false_alarms
 from .figure import Figure
-from .shipped import Misfit, answers_to, first_misfit, settling_n, shipped
+from .shipped import Misfit, answers_to, reported_misfits, settling_n, shipped
 
 ONSET_N, ONSET_SPAN_N = 2500, 400
 """Earliest sample of a change, and span of the instants."""
@@ -99,16 +99,17 @@ class Healthy:
     """Result of the runs without a change."""
 
     alarms: FalseAlarms
-    misfits: Sequence[Misfit | None] | None
-    """First misfit of each run; None: the device reports none."""
+    misfits: Sequence[Sequence[Misfit]] | None
+    """Misfits in the first MISFIT_N samples of each run; None: the device reports none at all."""
 
-    def timely_kinds(self) -> list[str]:
-        """Kinds of the misfits within MISFIT_N samples."""
-        return [each.kind for each in self.misfits or () if each is not None and each.sample < MISFIT_N]
+    def kinds(self, right: Sequence[str]) -> list[str]:
+        """Kind of each run with a misfit: the right one if it is among several, else the first."""
+        by_run = [[each.kind for each in run] for run in self.misfits or () if run]
+        return [next((kind for kind in run if kind in right), run[0]) for run in by_run]
 
-    def right_share(self, kinds: Sequence[str]) -> float:
-        """Share of the runs with a misfit of one of these kinds within MISFIT_N samples."""
-        return sum(kind in kinds for kind in self.timely_kinds()) / len(self.alarms.by_run)
+    def right_share(self, right: Sequence[str]) -> float:
+        """Share of the runs with a misfit of one of these kinds."""
+        return sum(kind in right for kind in self.kinds(right)) / len(self.alarms.by_run)
 
     def figures(self, condition: Condition) -> Iterator[Figure]:
         """False alarms, their bound, and misfits."""
@@ -119,7 +120,7 @@ class Healthy:
         if self.misfits is None:
             yield Figure("MISFIT", 0.0, "% of the runs", "not reported")
             return
-        kinds = self.timely_kinds()
+        kinds = self.kinds(condition.kinds)
         counts = ", ".join(f"{kind} {kinds.count(kind)}" for kind in sorted(set(kinds)))
         right = f"right kind {100.0 * self.right_share(condition.kinds):.3g} %" if condition.kinds else ""
         remark = "; ".join(each for each in (counts, right) if each)
@@ -131,14 +132,14 @@ def play_healthy(condition: Condition, effort: Effort) -> Healthy:
     device = shipped()
     settled = settling_n(device)
     alarms, exposures_n = [], []
-    misfits: list[Misfit | None] | None = []
+    misfits: list[Sequence[Misfit]] | None = []
     seeds = range(HEALTHY_SEED, HEALTHY_SEED + effort.runs)
     for played in condition.play(seeds, effort.run_n, [None] * effort.runs):
-        answers = answers_to(device, played)
-        alarms.append([alarm.index for alarm in answers.alarms if alarm.index >= settled])
+        found = answers_to(device, played).alarms
+        alarms.append([alarm.index for alarm in found if alarm.index >= settled])
         exposures_n.append(int(played.valid[settled:].sum()))
         try:
-            misfits = None if misfits is None else [*misfits, first_misfit(answers)]
+            misfits = None if misfits is None else [*misfits, reported_misfits(played.until(MISFIT_N))]
         except LookupError:
             misfits = None
     return Healthy(count_false_alarms(alarms, exposures_n), misfits)
@@ -231,7 +232,7 @@ def faults(condition: Condition, healthy: Healthy, changes: Delays) -> Iterator[
         yield "rate"
     if changes.missed > MOST_MISSED and not is_told:
         yield "missed"
-    if condition.fits and healthy.timely_kinds():
+    if condition.fits and healthy.kinds(()):
         yield "MISFIT of a model that fits"
 
 

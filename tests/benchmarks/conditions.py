@@ -79,6 +79,10 @@ class Played:
     """I of ``analogrig.judging.information`` up to each sample, between the plants with and without the change; 0
     without one."""
 
+    def until(self, end: int) -> Played:
+        """Samples before this one."""
+        return Played(self.u[:end], self.y[:end], self.valid[:end], self.information[:end])
+
 
 @dataclass(frozen=True)
 class Condition:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from analogrig.answers import Answers, Samples
@@ -34,12 +35,12 @@ def settling_n(device: DirectDevice) -> int:
     return int(device.description()["estimator"]["warm_up_n"])
 
 
-def first_misfit(answers: Answers) -> Misfit | None:
-    """First misfit that the device reports.
+def reported_misfits(played: Played) -> Sequence[Misfit]:
+    """Misfits that the device reports in a run, in the order of their samples.
 
     :raises LookupError: the device reports no misfits at all.
     """
-    del answers
+    del played
     raise LookupError("the device reports no misfits")
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from .conditions import Array, Played
 from .figure import Figure
-from .shipped import answers_to, first_misfit, settling_n, shipped
+from .shipped import answers_to, reported_misfits, settling_n, shipped
 
 FOLDER_SETTING, FOLDER, FILE = "ANALOGRIG_SILVERBOX", "../shared/data/silverbox", "SNLS80mV.csv"
 """Environment variable, its default, and the file in that folder."""
@@ -143,14 +143,18 @@ def _alarms(record: Record) -> Iterator[Figure]:
         yield Figure(f"{row}: false alarms per 1e5", 1e5 * found / (end - start), "", f"{found} alarms")
         reasons = "" if found <= most else "rate"
         if end == GROWTH_END:
-            try:
-                misfit = first_misfit(answers)
-            except LookupError:
-                remark = "not reported"
-            else:
-                remark = "none" if misfit is None else f"{misfit.kind} at {misfit.sample:,}"
-            yield Figure(f"{row}: MISFIT", float("non-linear" in remark), "of 1 run", remark)
+            yield _misfit(row, record.played(GROWTH_END))
         yield Figure(f"{row}: required", not reasons, "", reasons)
+
+
+def _misfit(row: str, played: Played) -> Figure:
+    """Figure of 1 if the device reports a non-linear plant while the amplitude grows."""
+    try:
+        misfits = reported_misfits(played)
+    except LookupError:
+        return Figure(f"{row}: MISFIT", 0.0, "of 1 run", "not reported")
+    told = ", ".join(f"{each.kind} at {each.sample:,}" for each in misfits)
+    return Figure(f"{row}: MISFIT", float(any(each.kind == "non-linear" for each in misfits)), "of 1 run", told)
 
 
 def _changes(record: Record) -> Iterator[Figure]:
