@@ -562,7 +562,7 @@ ISSUE: Sequence[Condition] = (
     ),
     Condition("ar-.9", "autoregressive noise, 0.9, 1 LSB", Emulated(SQUARE, correlation=0.9), ("noise",)),
     *(
-        Condition(f"cubic-{percent:g}", f"cubic spring of {percent:g} %", Simulated(percent / 100.0), ("non-linear",))
+        Condition(f"cubic-{percent:g}", f"cubic spring of {percent:g} %", Simulated(percent / 100.0), ("nonlinear",))
         for percent in (0.3, 1.0, 5.0, 20.0)
     ),
     Condition("small", "excitation of 3 % of the range", Emulated(square(part_of_range=0.03)), ("excitation",)),
@@ -587,7 +587,7 @@ OWN: Sequence[Condition] = (
         Emulated(continuous(sine, steps=1, levels=32)),
         ("excitation",),
     ),
-    Condition("inl", "converter with INL of 2 LSB", Emulated(SQUARE, _bent_card()), ("non-linear",)),
+    Condition("inl", "converter with INL of 2 LSB", Emulated(SQUARE, _bent_card()), ("nonlinear",)),
     Condition("real", "real parts 15 K too warm, DT2821 card", Emulated(SQUARE, _real_card(), components=real_parts)),
     Condition("skewed", "displacement taken 10 us after force", Emulated(SQUARE, _skewed_card())),
     Condition(
@@ -597,7 +597,7 @@ OWN: Sequence[Condition] = (
         ("edges",),
     ),
     Condition("warming", "K falls by 2 % in 10,000 samples", Emulated(SQUARE, wander=warming(-0.02)), ("drift",)),
-    Condition("two-mass", "suspension on its tyre, four poles", Emulated(SQUARE, program="two-mass"), ("noise",)),
+    Condition("two-mass", "suspension on its tyre, four poles", Emulated(SQUARE, program="two-mass"), ("nonlinear",)),
     Condition(
         "loop-100",
         "ground loop of 2 LSB at 100 Hz on both channels",
@@ -610,7 +610,7 @@ OWN: Sequence[Condition] = (
         Emulated(SQUARE, disturb=impulses(0.001, 20.0)),
         ("noise",),
     ),
-    Condition("backlash", "backlash of 3 LSB of the sensor", Emulated(SQUARE, disturb=backlash(3.0)), ("non-linear",)),
+    Condition("backlash", "backlash of 3 LSB of the sensor", Emulated(SQUARE, disturb=backlash(3.0)), ("nonlinear",)),
     Condition(
         "rising", "noise that rises from 1 to 3 LSB", Emulated(SQUARE, disturb=rising_noise(0.0, 2.83)), ("noise",)
     ),

@@ -154,7 +154,7 @@ def _misfit(row: str, played: Played) -> Figure:
     except LookupError:
         return Figure(f"{row}: MISFIT", 0.0, "of 1 run", "not reported")
     told = ", ".join(f"{each.kind} at {each.sample:,}" for each in misfits)
-    return Figure(f"{row}: MISFIT", float(any(each.kind == "non-linear" for each in misfits)), "of 1 run", told)
+    return Figure(f"{row}: MISFIT", float(any(each.kind == "nonlinear" for each in misfits)), "of 1 run", told)
 
 
 def _changes(record: Record) -> Iterator[Figure]:
