@@ -24,10 +24,12 @@ from analogrig.estimator_config import DEFAULT_ARL0
 from analogrig.judging.information import first_at_level
 
 from . import silverbox
-from .conditions import CONDITIONS, PARAMETERS, Change, Condition, Simulated
+from .conditions import CONDITIONS, Condition
 from .false_alarms import CLUSTER_N, FalseAlarms, count_false_alarms
 from .figure import Figure
+from .played import PARAMETERS, Change
 from .shipped import Misfit, answers_to, reported_misfits, settling_n, shipped
+from .simulated import Simulated
 
 ONSET_N, ONSET_SPAN_N = 2500, 400
 """Earliest sample of a change, and span of the instants."""

@@ -57,9 +57,9 @@ from tests.estimator_c.plants import (
     simulate,
 )
 
-from .conditions import Played
 from .false_alarms import FalseAlarms, count_false_alarms
 from .figure import Figure
+from .played import Played
 from .shipped import answers_to, settling_n, shipped
 
 

@@ -10,7 +10,7 @@ from analogrig.devices.direct import DirectDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.run import Channel
 
-from .conditions import CARD, FORCE, Played
+from .played import CARD, FORCE, Played
 
 
 @dataclass(frozen=True)

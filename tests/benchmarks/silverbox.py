@@ -16,8 +16,8 @@ from typing import Self
 
 import numpy as np
 
-from .conditions import Array, Played
 from .figure import Figure
+from .played import Array, Played
 from .shipped import answers_to, reported_misfits, settling_n, shipped
 
 FOLDER_SETTING, FOLDER, FILE = "ANALOGRIG_SILVERBOX", "../shared/data/silverbox", "SNLS80mV.csv"

@@ -21,8 +21,9 @@ from analogrig.scenario import PotChange, Scenario
 from tests.benchmarks import __main__ as benchmarks
 from tests.benchmarks import bench_reality, bench_statistics, silverbox
 from tests.benchmarks.bench_reality import Effort, Healthy, delays_of
-from tests.benchmarks.conditions import CONDITIONS, Change, accumulate
+from tests.benchmarks.conditions import CONDITIONS
 from tests.benchmarks.false_alarms import CLUSTER_N, count_false_alarms
+from tests.benchmarks.played import Change, accumulate
 from tests.benchmarks.shipped import Misfit, answers_to, shipped
 from tests.estimator_c.performance import FULL
 from tests.estimator_c.plants import FRONT, PERIOD_S, plants_of_any_speed
