@@ -47,6 +47,17 @@ def impulses(share: float, amplitude_lsb: float) -> Disturbance:
     return disturb
 
 
+def popcorn(amplitude_lsb: float, dwell_n: float) -> Disturbance:
+    """Displacement that jumps between two levels, this much either side, after ``dwell_n`` samples on average."""
+
+    def disturb(lsb: Array, rng: np.random.Generator) -> Array:
+        jumps = rng.uniform(size=len(lsb)) < 1.0 / dwell_n
+        lsb[:, DISPLACEMENT] += amplitude_lsb * (-1.0) ** np.cumsum(jumps)
+        return lsb
+
+    return disturb
+
+
 def backlash(width_lsb: float) -> Disturbance:
     """Play of the displacement sensor: it follows the motion at half this width on either side."""
 

@@ -43,6 +43,13 @@ def square(frequency_hz: float = 200.0, part_of_range: float = 1.0, ppm: float |
     return draw
 
 
+def pulse(rng: np.random.Generator, samples: int) -> Excitation:
+    """Pulses of 200 Hz that are high for a fifth of the period."""
+    del samples
+    phase = float(rng.uniform())
+    return Excitation(shape="pulse", duty=0.2, low_v=LOW_V, high_v=HIGH_V, frequency_hz=200.0, phase=phase)
+
+
 def random_bits(rng: np.random.Generator, samples: int) -> Excitation:
     """Pseudorandom binary sequence with bits of 25 samples."""
     del samples
