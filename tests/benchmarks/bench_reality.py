@@ -232,7 +232,7 @@ def measure(name: str, effort: Effort) -> list[Figure]:
 def faults(condition: Condition, healthy: Healthy, changes: Delays) -> Iterator[str]:
     """Reasons that a row is not as required."""
     is_told = healthy.right_share(condition.right_kinds) >= LEAST_SHARE
-    if healthy.alarms.upper_rate() > MOST_RATE and not is_told:
+    if healthy.alarms.alarms and healthy.alarms.upper_rate() > MOST_RATE and not is_told:
         yield "rate"
     if changes.missed > MOST_MISSED and (condition.fits or not is_told):
         yield "missed"
