@@ -2,7 +2,7 @@
 
 python -m tests.benchmarks.bench_reality [--rows NAME,...] [--quick] [--jobs N]
 
-The whole table takes some 5 minutes on two cores. ``--quick`` plays a fifth of the healthy samples and a third of the
+The whole table takes 200 s of processor time. ``--quick`` plays a fifth of the healthy samples and a third of the
 changes, for a look at it.
 """
 
@@ -75,6 +75,10 @@ larger one of that of the clusters and that between the runs. It is 1 if there a
 
 The information of a change compares the inputs of the card with and without it, for the same
 machine, excitation and disturbance. It knows hum and drift, and whitens coloured noise.
+
+Rows of the Silverbox need its record: `{silverbox.FOLDER_SETTING}` names the folder of
+`{silverbox.FILE}`. A 12-bit card of +-0.2 V and +-0.35 V samples it. A change of the stiffness is the
+record plus the exact difference of the linear part. The splices are 20 % upwards and downwards.
 """
 """Paragraphs below the table."""
 

@@ -68,29 +68,38 @@ class Simulated:
         parameters = np.tile(np.array(list(program.values.values())[:3])[:, None], lanes)
         bent = self.cubic / (program.scales.full("force") / parameters[2, 0]) ** 2
         h = program.scales.time / CARD.rate_hz / self.steps
-        due = {lane: change for lane, change in enumerate(changes) if change is not None}
+        spring = _Spring(parameters, bent)
         out, x, v = np.empty_like(force_n), np.zeros(lanes), np.zeros(lanes)
         for k in range(samples):
             out[k] = x
-            for lane in [lane for lane, change in due.items() if change.sample == k]:
-                change = due.pop(lane)
-                parameters[PARAMETERS.index(change.parameter), lane] *= change.factor
-            m, b, stiffness = parameters
-            force = force_n[k]
-
-            def acceleration(
-                x: Array, v: Array, m: Array = m, b: Array = b, stiffness: Array = stiffness, force: Array = force
-            ) -> Array:
-                return np.asarray((force - b * v - stiffness * x * (1.0 + bent * x * x)) / m)
-
+            for lane, change in enumerate(changes):
+                if change is not None and change.sample == k:
+                    parameters[PARAMETERS.index(change.parameter), lane] *= change.factor
             for _ in range(self.steps):
-                a1 = acceleration(x, v)
-                x2, v2 = x + 0.5 * h * v, v + 0.5 * h * a1
-                a2 = acceleration(x2, v2)
-                x3, v3 = x + 0.5 * h * v2, v + 0.5 * h * a2
-                a3 = acceleration(x3, v3)
-                x4, v4 = x + h * v3, v + h * a3
-                a4 = acceleration(x4, v4)
-                x = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
-                v = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+                x, v = spring.advanced(x, v, force_n[k], h)
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Spring:
+    """Plants with a cubic spring."""
+
+    parameters: Array
+    """(3, lanes): M, B and K."""
+    bent: float
+    """Relative rise of the stiffness per square metre."""
+
+    def acceleration(self, x: Array, v: Array, force_n: Array) -> Array:
+        mass, damping, stiffness = self.parameters
+        return np.asarray((force_n - damping * v - stiffness * x * (1.0 + self.bent * x * x)) / mass)
+
+    def advanced(self, x: Array, v: Array, force_n: Array, h: float) -> tuple[Array, Array]:
+        """Displacement and velocity ``h`` seconds later, by the classical method of Runge and Kutta."""
+        a1 = self.acceleration(x, v, force_n)
+        v2 = v + 0.5 * h * a1
+        a2 = self.acceleration(x + 0.5 * h * v, v2, force_n)
+        v3 = v + 0.5 * h * a2
+        a3 = self.acceleration(x + 0.5 * h * v2, v3, force_n)
+        v4 = v + h * a3
+        a4 = self.acceleration(x + h * v3, v4, force_n)
+        return x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
