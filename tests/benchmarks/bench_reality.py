@@ -28,11 +28,8 @@ from .conditions import CONDITIONS, Condition
 from .false_alarms import CLUSTER_N, FalseAlarms, count_false_alarms
 from .figure import Figure
 from .played import PARAMETERS, Change
-from .shipped import Misfit, answers_to, reported_misfits, settling_n, shipped
+from .shipped import ONSET_N, ONSET_SPAN_N, Misfit, answers_to, reported_misfits, settling_n, shipped
 from .simulated import Simulated
-
-ONSET_N, ONSET_SPAN_N = 2500, 400
-"""Earliest sample of a change, and span of the instants."""
 
 MISFIT_N = 2000
 """Samples within which a misfit must be reported."""

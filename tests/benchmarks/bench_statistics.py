@@ -33,8 +33,6 @@ from tests.estimator_c.performance import (
     FULL,
     FULL_FREE,
     HORIZON_N,
-    LEARNT_N,
-    ONSET_SPAN_N,
     OWN_CLOCK,
     QUARTER,
     QUARTER_FREE,
@@ -60,7 +58,7 @@ from tests.estimator_c.plants import (
 from .false_alarms import FalseAlarms, count_false_alarms
 from .figure import Figure
 from .played import Played
-from .shipped import answers_to, settling_n, shipped
+from .shipped import ONSET_N, ONSET_SPAN_N, answers_to, settling_n, shipped
 
 
 def changes(excitation: Excitation) -> Iterator[tuple[str, float]]:
@@ -204,8 +202,8 @@ class ShippedDelays:
 def play_shipped(cells: Cells, change: tuple[str, float], trials: int, seed: int) -> ShippedDelays:
     """Play a change in so many trials."""
     rng = np.random.default_rng([seed, 2])
-    onset = rng.integers(LEARNT_N, LEARNT_N + ONSET_SPAN_N, trials)
-    samples = LEARNT_N + ONSET_SPAN_N + HORIZON_N
+    onset = rng.integers(ONSET_N, ONSET_N + ONSET_SPAN_N, trials)
+    samples = ONSET_N + ONSET_SPAN_N + HORIZON_N
     played = simulate((FRONT, FRONT.scaled(*change)), onset, cells.excitation, samples, seed)
     valid = rng.uniform(size=played.u.shape) >= cells.missing
     gained = np.diff(played.information, axis=1, prepend=0.0) * valid

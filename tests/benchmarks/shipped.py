@@ -12,6 +12,10 @@ from analogrig.run import Channel
 
 from .played import CARD, FORCE, Played
 
+ONSET_N, ONSET_SPAN_N = 2500, 400
+"""Earliest sample of a change, and span of the instants. The device has settled, even if a fifth of the samples is
+missing: its warm-up counts equations."""
+
 
 @dataclass(frozen=True)
 class Misfit:
