@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.judging.statistics import rate_interval
+from analogrig.judging.statistics import lower_rate, upper_rate
 from tests.estimator_c.est_driver import Estimator, compile_driver
 from tests.estimator_c.performance import (
     ARL0,
@@ -157,7 +157,7 @@ def shipped_delays(trials: int = 400, samples: int = ARL0_SAMPLES) -> Iterator[F
     for cells in CELLS:
         alarms = healthy_alarms(FRONT, cells.excitation, samples, seed=500, missing=cells.missing)
         arl0 = alarms.exposure_n / max(alarms.alarms, 1)
-        low, high = rate_interval(alarms.alarms, alarms.exposure_n, 0.95)
+        low, high = (bound(alarms.alarms, alarms.exposure_n, 0.975) for bound in (lower_rate, upper_rate))
         remark = f"{alarms.alarms} alarms in {alarms.exposure_n} samples"
         bounds = (1.0 / high, 1.0 / low if low else math.inf)
         yield Figure(f"shipped, {cells.name}: ARL0", arl0, "samples", remark, bounds=bounds)
