@@ -41,7 +41,7 @@ CPU_m7 := -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-sp-d16 -DFIRMWARE_ID=ANALO
 CPU_f405 := $(M4F) -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_BOARD_CHOICE
 BOARD_f405 := stm32f405
 board = $(addprefix estimator_c/ports/,$(or $(BOARD_$*),mps2))
-FIRMWARE_FOLDERS := $(addprefix estimator_c/,core isolation device ports/loop ports/cortex_m)
+FIRMWARE_FOLDERS := $(addprefix estimator_c/,core isolation fit device ports/loop ports/cortex_m)
 FIRMWARE_CFLAGS := -std=c99 -O2 -mthumb -ffreestanding -ffp-contract=off -ffunction-sections -DNDEBUG \
     -Wall -Wextra -Wdouble-promotion -Werror $(FIRMWARE_FOLDERS:%=-I%) -Iestimator_c/ports/cortex_m/include \
     -I$(BUILD)/generated
@@ -183,7 +183,7 @@ dist: ## pack the C estimator of the last commit for CMake, PlatformIO, Zephyr a
 	@mkdir -p $(BUILD)/dist
 	@version=$$(awk '/^#define EST_VERSION_/ { printf "%s%s", dot, $$3; dot = "." }' estimator_c/core/est.h) && \
 	    git archive --prefix=est-$$version/ --add-file=LICENSE --output=$(BUILD)/dist/est-$$version.tar.gz HEAD:estimator_c \
-	        README.md CMakeLists.txt library.json library.properties idf_component.yml core isolation src zephyr examples && \
+	        README.md CMakeLists.txt library.json library.properties idf_component.yml core isolation fit src zephyr examples && \
 	    echo $(BUILD)/dist/est-$$version.tar.gz
 
 wheels: $(BUILD)/wheels/.made ## build manylinux wheels for x86_64 and aarch64 into build/wheels; downloads zig, 100 MB

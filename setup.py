@@ -41,7 +41,7 @@ PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, LIBRARY_CHILD, EXIT_GUARD, 
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c",)
-DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/device/*.c")
+DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/fit/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
 TETHER_SOURCES = ("harness/analogrig/devices/tether.c",)
@@ -52,7 +52,7 @@ DATA = Path("analogrig")
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
 ESTIMATOR = (
     "estimator_c/*.md",
-    *(f"estimator_c/{part}/*.[ch]" for part in ("core", "isolation", "device")),
+    *(f"estimator_c/{part}/*.[ch]" for part in ("core", "isolation", "fit", "device")),
     *(f"estimator_c/ports/**/*.{suffix}" for suffix in ("c", "h", "S", "ld")),
     "estimator_c/catalogue/*",
 )
@@ -109,7 +109,7 @@ class BuildProducts(Command):
             placed(product).parent.mkdir(parents=True, exist_ok=True)
         generate_codecs(generated, placed(CATALOGUE))
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
-        folders = (*(f"estimator_c/{part}" for part in ("core", "isolation", "device", "ports/loop")), generated)
+        folders = (*(f"estimator_c/{part}" for part in ("core", "isolation", "fit", "device", "ports/loop")), generated)
         include = (*ROOM, *(f"-I{path}" for path in folders))
         compile_c(placed(ENGINE), sources(ENGINE_SOURCES), SHARED)
         compile_c(placed(DEVICE), (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))

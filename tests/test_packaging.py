@@ -56,7 +56,7 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
 def test_every_source_of_estimator_and_device_is_shipped(kind: str, wheel: Path, distributions: Path) -> None:
-    parts = ("core", "isolation", "device", "ports", "catalogue")
+    parts = ("core", "isolation", "fit", "device", "ports", "catalogue")
     tracked = [
         str(path.relative_to(CHECKOUT))
         for part in parts
@@ -89,7 +89,7 @@ def test_device_compiles_from_the_sources_and_is_the_shipped_one(where: str, env
     python = environment / "python" if where == "installed" else Path(sys.executable)
     estimator, generated = map(Path, run(python, "-c", FOLDERS).split())
     assert estimator.is_relative_to(environment.parent if where == "installed" else CHECKOUT)
-    folders = [*(estimator / part for part in ("core", "isolation", "device", "ports/loop")), generated]
+    folders = [*(estimator / part for part in ("core", "isolation", "fit", "device", "ports/loop")), generated]
     sources = [path for folder in (*folders, estimator / "ports" / "host") for path in sorted(folder.glob("*.c"))]
     flags = ("-std=c99", "-D_XOPEN_SOURCE=700", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in folders))
     run("cc", *flags, *sources, "-o", tmp_path / "own")

@@ -19,8 +19,9 @@
 /// Answers due for a sample, in this order.
 #define DUE_ALARM 1U
 #define DUE_DIAGNOSIS 2U
-#define DUE_ESTIMATES 4U
-#define DUE_STEPPED 8U
+#define DUE_MISFIT 4U
+#define DUE_ESTIMATES 8U
+#define DUE_STEPPED 16U
 
 static void add_saturating(uint32_t* const counter, const uint32_t n) {
     *counter = (*counter < (UINT32_MAX - n)) ? (*counter + n) : UINT32_MAX;
@@ -105,6 +106,25 @@ static void pack_diagnosis(const device_t* const self, device_message_t* const a
     (void)analogrig_diagnosis_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
+#if DEVICE_WITH_FIT
+/// Number in units of a message of 16 bits; the largest one if it does not fit.
+static uint16_t in_units(const float number, const float units) {
+    const float scaled = (number * units) + 0.5F;
+    return (scaled < (float)UINT16_MAX) ? (uint16_t)scaled : UINT16_MAX;
+}
+
+static void pack_misfit(const device_t* const self, device_message_t* const answer) {
+    const est_misfit_t              found   = est_fit_misfit(&self->fit);
+    const struct analogrig_misfit_t message = { .seq          = self->seq,
+                                                .cause        = (uint8_t)found.kind,
+                                                .sample_index = self->next_index,
+                                                .frequency    = in_units(found.frequency, 65536.0F),
+                                                .strength     = in_units(found.strength, 256.0F) };
+    answer->id                              = ANALOGRIG_MISFIT_FRAME_ID;
+    (void)analogrig_misfit_pack(answer->payload, &message, sizeof(answer->payload));
+}
+#endif
+
 static void pack_stepped(const device_t* const self, device_message_t* const answer) {
     const est_step_t* const          last    = &self->stepped;
     const struct analogrig_stepped_t message = { .seq          = self->seq,
@@ -127,8 +147,30 @@ static est_step_t step(device_t* const self, const est_sample_t sample) {
     if (self->isolating) {
         est_isolation_enter(&self->isolation, &self->estimator, sample, out);
     }
+#if DEVICE_WITH_FIT
+    if (self->watching) {
+        est_fit_enter(&self->fit, &self->estimator, sample, out);
+    }
+#endif
     return out;
 }
+
+#if DEVICE_WITH_FIT
+/// Start the watch of the fit, if the settings and the estimator allow it.
+static void start_watch(device_t* const self) {
+    self->watching = est_fit_init(&self->fit, &self->settings.estimator) && self->settings.misfit;
+    self->reported = EST_MISFIT_NONE;
+}
+
+/// True iff the cause of the misfit is another than the last that was reported, which it then is.
+static bool misfit_is_due(device_t* const self) {
+    const est_misfit_kind_t before = self->reported;
+    if (self->watching) {
+        self->reported = est_fit_misfit(&self->fit).kind;
+    }
+    return self->reported != before;
+}
+#endif
 
 /// Work on the diagnosis of the last alarm. Return true iff it has just been completed.
 static bool isolate(device_t* const self) {
@@ -179,6 +221,11 @@ static void enter_sample(device_t* const self, const uint16_t index, const est_s
     if (self->isolating && isolate(self)) {
         self->due |= DUE_DIAGNOSIS;
     }
+#if DEVICE_WITH_FIT
+    if (misfit_is_due(self)) {
+        self->due |= DUE_MISFIT;
+    }
+#endif
     if (report_is_due(self)) {
         self->due |= DUE_ESTIMATES;
     }
@@ -203,6 +250,11 @@ static void answer_sample(device_t* const self, device_message_t* const answer) 
     } else if ((self->due & DUE_DIAGNOSIS) != 0U) {
         pack_diagnosis(self, answer);
         self->due &= (uint8_t)~DUE_DIAGNOSIS;
+#if DEVICE_WITH_FIT
+    } else if ((self->due & DUE_MISFIT) != 0U) {
+        pack_misfit(self, answer);
+        self->due &= (uint8_t)~DUE_MISFIT;
+#endif
     } else if ((self->due & DUE_ESTIMATES) != 0U) {
         answer_estimate(self, answer);
     } else {
@@ -331,6 +383,9 @@ static uint8_t start(device_t* const self, const uint32_t run) {
     }
     self->isolating = est_isolation_init(&self->isolation, &self->settings.estimator, self->settings.force_zero) &&
                       self->settings.isolation;
+#if DEVICE_WITH_FIT
+    start_watch(self);
+#endif
     self->running      = true;
     self->run          = (uint8_t)run;
     self->next_index   = 0U;

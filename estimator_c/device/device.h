@@ -8,7 +8,7 @@
 /// or CAN frames: serial_device.h, can_device.h, slcan_device.h.
 ///
 ///     Identify    -> Hello, Firmware          Configure   -> Configured
-///     Control     -> Controlled               Sample      -> [Alarm] [Diagnosis] [Estimate ...] Stepped
+///     Control     -> Controlled               Sample      -> [Alarm] [Diagnosis] [Misfit] [Estimate ...] Stepped
 ///     STATUS      -> Status, one per counter  SampleBlock -> the same for each of its samples
 ///
 /// Samples are entered in the order of their index. A repeated or late sample is ignored; indices skipped by an early
@@ -21,6 +21,7 @@
 #define DEVICE_H_INCLUDED
 
 #include "est.h"
+#include "est_fit.h"
 #include "est_isolation.h"
 #include "settings.h"
 
@@ -124,6 +125,11 @@ typedef struct {
     uint8_t           element;       ///< next element of theta to report
     bool              restarted;
     est_step_t        stepped;
+#if DEVICE_WITH_FIT
+    est_fit_watch_t   fit;
+    bool              watching;
+    est_misfit_kind_t reported;  ///< last cause of a misfit
+#endif
 } device_t;
 
 /// Prepare the device: default configuration, stopped. Cost: as est_init().

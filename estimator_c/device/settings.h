@@ -6,11 +6,17 @@
 
 #include "est.h"
 
+/// 0 omits the watch of the fit, est_fit.h, and its setting.
+#ifndef DEVICE_WITH_FIT
+#define DEVICE_WITH_FIT 1
+#endif
+
 /// Configuration of a device.
 typedef struct {
     est_config_t estimator;
     float        force_zero;  ///< u at zero force, for the isolation [codes]
     bool         isolation;   ///< diagnose the changed parameter, if the configuration of the estimator allows it
+    bool         misfit;      ///< watch whether the model fits, if the configuration of the estimator allows it
 } settings_t;
 
 /// Result of settings_set().

@@ -98,7 +98,7 @@ static float whiten(float* const past, const float* const c, const float x) {
 }
 
 /// Follow u: its edges, its whitened steps, and the effect of the mass, which is that of y'' on the equation, whitened.
-static void follow_input(est_fit_t* const self, const float u) {
+static void follow_input(est_fit_watch_t* const self, const float u) {
     const float step = u - self->u[0];
     const float bend = step - (self->u[0] - self->u[1]);
     self->u[1]       = self->u[0];
@@ -114,7 +114,7 @@ static void follow_input(est_fit_t* const self, const float u) {
     }
 }
 
-static void follow_output(est_fit_t* const self, const float y) {
+static void follow_output(est_fit_watch_t* const self, const float y) {
     self->learnt_n   = (uint16_t)(self->learnt_n + ((self->learnt_n < LEVEL_N) ? 1U : 0U));
     const float rate = 1.0F / (float)self->learnt_n;
     self->level += rate * (y - self->level);
@@ -125,13 +125,13 @@ static void follow_output(est_fit_t* const self, const float y) {
 }
 
 /// Region of the state of the plant before the present sample.
-static uint8_t find_region(const est_fit_t* const self) {
+static uint8_t find_region(const est_fit_watch_t* const self) {
     const float level = self->y[0] - self->level;
     const float moved = self->y[0] - self->y[2];
     const float bound = LEVEL_BOUND * self->spread;
     const float moves = MOVES * self->spread;
-    uint8_t     stage = (level < bound) ? 2U : 3U;
-    uint8_t     trend = (moved < moves) ? 1U : 2U;
+    uint32_t    stage = (level < bound) ? 2U : 3U;
+    uint32_t    trend = (moved < moves) ? 1U : 2U;
     if (level < 0.0F) {
         stage = (level < -bound) ? 0U : 1U;
     }
@@ -142,7 +142,7 @@ static uint8_t find_region(const est_fit_t* const self) {
 }
 
 /// Limit an innovation, and follow the magnitude of the innovations.
-static float limit_innovation(est_fit_t* const self, const float innovation) {
+static float limit_innovation(est_fit_watch_t* const self, const float innovation) {
     const float most = CLIP * self->deviation;
     const float size = smaller(magnitude(innovation), most);
     self->deviation += (size - self->deviation) / ((self->settling_n > 0U) ? MAGNITUDE_SETTLING_N : MAGNITUDE_N);
@@ -150,7 +150,7 @@ static float limit_innovation(est_fit_t* const self, const float innovation) {
     return (innovation < 0.0F) ? -size : size;
 }
 
-static void enter_innovation(est_fit_t* const self, const float z) {
+static void enter_innovation(est_fit_watch_t* const self, const float z) {
     est_fit_sums_t* const sums   = &self->sums;
     const float           step   = self->steps[0];
     const float           bend   = self->bends[1][0];
@@ -190,7 +190,7 @@ static float resonance(const uint32_t line) {
 
 /// Enter the last sum into some of the resonators (Goertzel's algorithm). `turn`: number of the sum, from 1; sample
 /// `slice` of EST_FIT_SUM_N.
-static void enter_lines(est_fit_t* const self, const uint32_t turn, const uint32_t slice) {
+static void enter_lines(est_fit_watch_t* const self, const uint32_t turn, const uint32_t slice) {
     const uint32_t first = slice * LINES_A_SAMPLE;
     for (uint32_t line = first; line < (first + LINES_A_SAMPLE); line++) {
         const float now    = (turn > 1U) ? self->now[line] : 0.0F;
@@ -201,7 +201,7 @@ static void enter_lines(est_fit_t* const self, const uint32_t turn, const uint32
 }
 
 /// Replace some of the resonators by their powers.
-static void evaluate_lines(est_fit_t* const self, const uint32_t slice) {
+static void evaluate_lines(est_fit_watch_t* const self, const uint32_t slice) {
     const uint32_t first = slice * LINES_A_SAMPLE;
     for (uint32_t line = first; line < (first + LINES_A_SAMPLE); line++) {
         const float now    = self->now[line];
@@ -217,7 +217,7 @@ static void evaluate_lines(est_fit_t* const self, const uint32_t slice) {
     }
 }
 
-static void evaluate_regions(est_fit_t* const self, const uint32_t slice) {
+static void evaluate_regions(est_fit_watch_t* const self, const uint32_t slice) {
     self->explained = (slice == 0U) ? 0.0F : self->explained;
     for (uint32_t i = slice * REGIONS_A_SAMPLE; (i < ((slice + 1U) * REGIONS_A_SAMPLE)) && (i < EST_FIT_REGIONS_N);
          i++) {
@@ -229,12 +229,12 @@ static void evaluate_regions(est_fit_t* const self, const uint32_t slice) {
 }
 
 /// Power of a line; 0 beyond the ends of the spectrum.
-static float power_at(const est_fit_t* const self, const uint32_t line) {
+static float power_at(const est_fit_watch_t* const self, const uint32_t line) {
     return ((line >= 1U) && (line < EST_FIT_LINES_N)) ? self->now[line] : 0.0F;
 }
 
 /// Mean power of the lines around the peak, without its neighbours.
-static float power_around(const est_fit_t* const self) {
+static float power_around(const est_fit_watch_t* const self) {
     float   sum = 0.0F;
     uint8_t n   = 0U;
     for (uint32_t distance = 2U; distance <= 6U; distance++) {
@@ -247,7 +247,7 @@ static float power_around(const est_fit_t* const self) {
 }
 
 /// Frequency of the line at the peak, from the powers of the peak and its larger neighbour [cycles per sample].
-static float find_frequency(const est_fit_t* const self) {
+static float find_frequency(const est_fit_watch_t* const self) {
     const float above = power_at(self, self->peak + 1U);
     const float below = power_at(self, self->peak - 1U);
     const float share = root(ratio((above > below) ? above : below, self->now[self->peak]));
@@ -272,7 +272,7 @@ typedef struct {
     float lack;     ///< reciprocal information on a change of the mass [1 / nats]
 } est_fit_evidence_t;
 
-static est_fit_evidence_t measure(const est_fit_t* const self, const est_t* const estimator) {
+static est_fit_evidence_t measure(const est_fit_watch_t* const self, const est_t* const estimator) {
     const est_fit_sums_t* const sums     = &self->sums;
     const float* const          lagged   = sums->lagged;
     const float                 n        = (float)sums->innovations_n;
@@ -303,14 +303,14 @@ static est_fit_evidence_t measure(const est_fit_t* const self, const est_t* cons
 static float larger(const float a, const float b) { return (a > b) ? a : b; }
 
 /// Evidence for a line that is neither a harmonic of the excitation nor the peak of a broad spectrum, over its limit.
-static float weigh_hum(const est_fit_t* const self, const est_fit_evidence_t* const found) {
+static float weigh_hum(const est_fit_watch_t* const self, const est_fit_evidence_t* const found) {
     const bool stands_out = self->now[self->peak] > (LINE_ABOVE * power_around(self));
     const bool is_apart = (found->hum > (REGIONS_HUM * found->regions)) && (found->hum > (COLOUR_HUM * found->colour));
     return (stands_out && is_apart) ? (found->line / LINE) : 0.0F;
 }
 
 /// Evidence that the effect of the edges of u varies, over its limit. u must have edges that are apart.
-static float weigh_edges(const est_fit_t* const self, const est_fit_evidence_t* const found) {
+static float weigh_edges(const est_fit_watch_t* const self, const est_fit_evidence_t* const found) {
     const uint32_t edges_n = self->sums.edges_n;
     if ((edges_n < EDGES_MIN) || ((edges_n * 4U) > self->sums.innovations_n)) {
         return 0.0F;  // MISRA D4
@@ -321,7 +321,7 @@ static float weigh_edges(const est_fit_t* const self, const est_fit_evidence_t* 
 }
 
 /// Evidence for noise other than declared, over its limit.
-static float weigh_noise(const est_fit_t* const self, const est_fit_evidence_t* const found) {
+static float weigh_noise(const est_fit_watch_t* const self, const est_fit_evidence_t* const found) {
     const float excess = (self->sums.innovations_n >= MANY_N) ? (found->noise / NOISE) : 0.0F;
     return larger(found->colour / COLOUR, excess);
 }
@@ -333,7 +333,7 @@ static bool is_slow(const est_t* const estimator) {
 
 /// Name the cause of the misfit in a block with enough innovations: the first in the order of est_misfit_kind_t whose
 /// evidence exceeds its limit.
-static est_misfit_t name_cause(const est_fit_t* const self, const est_t* const estimator) {
+static est_misfit_t name_cause(const est_fit_watch_t* const self, const est_t* const estimator) {
     const est_fit_evidence_t found   = measure(self, estimator);
     const bool               slow    = is_slow(estimator);
     const est_misfit_t       order[] = {
@@ -353,7 +353,7 @@ static est_misfit_t name_cause(const est_fit_t* const self, const est_t* const e
 }
 
 /// Judge a block. With alarms in quick succession the estimate never settles, and the innovations show nothing else.
-static est_misfit_t judge(const est_fit_t* const self, const est_t* const estimator) {
+static est_misfit_t judge(const est_fit_watch_t* const self, const est_t* const estimator) {
     const est_fit_sums_t* const sums = &self->sums;
     if (sums->alarms_n >= STORM_N) {
         return (est_misfit_t){ .kind     = EST_MISFIT_NOISE,
@@ -366,7 +366,7 @@ static est_misfit_t judge(const est_fit_t* const self, const est_t* const estima
 }
 
 /// State what two blocks in succession agree on.
-static void conclude(est_fit_t* const self, const est_misfit_t found) {
+static void conclude(est_fit_watch_t* const self, const est_misfit_t found) {
     if (found.kind == self->candidate) {
         self->misfit = found;
     }
@@ -375,7 +375,7 @@ static void conclude(est_fit_t* const self, const est_misfit_t found) {
 
 // ---------------------------------------------          API           ---------------------------------------------
 
-static void begin_block(est_fit_t* const self) {
+static void begin_block(est_fit_watch_t* const self) {
     self->sums       = (est_fit_sums_t){ .sum = 0.0F };
     self->shift[0]   = 0.0F;
     self->shift[1]   = 0.0F;
@@ -384,7 +384,7 @@ static void begin_block(est_fit_t* const self) {
 }
 
 /// Advance by one sample: enter the innovation into the spectrum, and do the share of the work that falls to it.
-static void advance(est_fit_t* const self, const est_t* const estimator, const float z) {
+static void advance(est_fit_watch_t* const self, const est_t* const estimator, const float z) {
     const uint32_t slice = self->position_n % EST_FIT_SUM_N;
     const uint32_t turn  = self->position_n / EST_FIT_SUM_N;
     if (turn > 0U) {
@@ -407,7 +407,7 @@ static void advance(est_fit_t* const self, const est_t* const estimator, const f
 }
 
 /// Innovation for the statistics; 0 if there is none, or if it is excluded. After an alarm the estimate settles.
-static float take_innovation(est_fit_t* const self, const est_step_t step) {
+static float take_innovation(est_fit_watch_t* const self, const est_step_t step) {
     float z = 0.0F;
     if ((step.status == EST_UPDATED) && (self->excluded_n > 0U)) {
         self->excluded_n--;
@@ -429,24 +429,24 @@ static float take_innovation(est_fit_t* const self, const est_step_t step) {
     return z;
 }
 
-static void enter_alarm(est_fit_t* const self) {
+static void enter_alarm(est_fit_watch_t* const self) {
     const uint16_t half_n = self->since_n / 2U;
     self->excluded_n      = (uint8_t)((half_n < EXCLUDED_MAX) ? half_n : EXCLUDED_MAX);
     self->since_n         = 0U;
     self->sums.alarms_n++;
 }
 
-bool est_fit_init(est_fit_t* const self, const est_config_t* const config) {
+bool est_fit_init(est_fit_watch_t* const self, const est_config_t* const config) {
     EST_ASSERT((self != NULL) && (config != NULL));
-    *self           = (est_fit_t){ .config = config, .settling_n = EST_FIT_SETTLING_N, .edge_age_n = UINT8_MAX };
+    *self           = (est_fit_watch_t){ .config = config, .settling_n = EST_FIT_SETTLING_N, .edge_age_n = UINT8_MAX };
     self->deviation = MAGNITUDE_MIN;
     return config->na == 2U;
 }
 
-void est_fit_enter(est_fit_t* const   self,
-                   const est_t* const estimator,
-                   const est_sample_t sample,
-                   const est_step_t   step) {
+void est_fit_enter(est_fit_watch_t* const self,
+                   const est_t* const     estimator,
+                   const est_sample_t     sample,
+                   const est_step_t       step) {
     EST_ASSERT((self != NULL) && (estimator != NULL));
     const bool known = (step.status == EST_UPDATED) || (step.status == EST_GATHERING);
     if ((self->position_n % EST_FIT_SUM_N) == 0U) {
@@ -471,7 +471,7 @@ void est_fit_enter(est_fit_t* const   self,
     }
 }
 
-est_misfit_t est_fit_misfit(const est_fit_t* const self) {
+est_misfit_t est_fit_misfit(const est_fit_watch_t* const self) {
     EST_ASSERT(self != NULL);
     return self->misfit;
 }

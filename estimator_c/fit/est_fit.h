@@ -105,18 +105,18 @@ typedef struct {
     est_fit_sums_t      sums;
     est_misfit_kind_t   candidate;  ///< of the last block
     est_misfit_t        misfit;
-} est_fit_t;
+} est_fit_watch_t;
 
 /// Prepare for the first sample of an estimator with this configuration. The configuration is not copied; it must
 /// stay unchanged. Returns false iff na is not 2; the tests of the excitation and of slow plants then do not apply
 /// and the state is unusable. Cost: constant. RAM: 0.7 kB. May be called from an interrupt.
-EST_RESULT_USED bool est_fit_init(est_fit_t* self, const est_config_t* config);
+EST_RESULT_USED bool est_fit_init(est_fit_watch_t* self, const est_config_t* config);
 
 /// Enter the input and result of an est_step(); to be called after every step. May be called from an interrupt.
-void est_fit_enter(est_fit_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
+void est_fit_enter(est_fit_watch_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 
 /// Present misfit. Cost: constant. May be called from an interrupt.
-est_misfit_t est_fit_misfit(const est_fit_t* self);
+est_misfit_t est_fit_misfit(const est_fit_watch_t* self);
 
 #ifdef __cplusplus
 }

@@ -13,7 +13,7 @@ from pathlib import Path
 
 ESTIMATOR = Path(__file__).parents[1]
 GENERATED = ESTIMATOR.parent / "build" / "generated"
-PARTS = (ESTIMATOR / "core", ESTIMATOR / "isolation", ESTIMATOR / "device", GENERATED)
+PARTS = (ESTIMATOR / "core", ESTIMATOR / "isolation", ESTIMATOR / "fit", ESTIMATOR / "device", GENERATED)
 LOOP = ESTIMATOR / "ports" / "loop"
 HERE = ESTIMATOR / "fuzz"
 

@@ -65,6 +65,20 @@ class ReportedDiagnosis:
     """Parameter after the change over that before; 1 if several have changed."""
 
 
+@dataclass(frozen=True)
+class ReportedMisfit:
+    """A change of the cause of a poor fit, as the device reports it."""
+
+    index: int
+    """Sample after which it was found, counted from the start of the record without wrap-around."""
+    cause: int
+    """Cause of the catalogue; NONE: the model fits again."""
+    frequency: float = 0.0
+    """Frequency of the disturbance in cycles per sample; 0 unless the cause is HUM."""
+    strength: float = 0.0
+    """Statistic over its limit; 0 if the device does not report it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Answers:
     """Answers to the n oldest unanswered samples, with p parameters.
@@ -83,6 +97,8 @@ class Answers:
     statistic: NDArray[np.float32] | None = None
     """(n,): of the trigger."""
     diagnoses: tuple[ReportedDiagnosis, ...] = ()
+    misfits: tuple[ReportedMisfit, ...] = ()
+    """In ascending order."""
 
     def __len__(self) -> int:
         return len(self.flags)
@@ -97,4 +113,5 @@ class Answers:
             diagnoses=tuple(
                 dataclasses.replace(each, index=first + each.index, onset=first + each.onset) for each in self.diagnoses
             ),
+            misfits=tuple(dataclasses.replace(each, index=first + each.index) for each in self.misfits),
         )

@@ -14,7 +14,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
 from analogrig.datasheet import Datasheet
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.device import Device
@@ -55,6 +55,7 @@ class RunBuilder:
         self._flags = np.empty(n, np.uint8)
         self._alarms: list[RaisedAlarm] = []
         self._diagnoses: list[ReportedDiagnosis] = []
+        self._misfits: list[ReportedMisfit] = []
         self.samples = 0
         self.records: list[int] = []
         """First samples of the records."""
@@ -82,6 +83,7 @@ class RunBuilder:
         shifted = answers.shifted(self.records[-1])
         self._alarms += shifted.alarms
         self._diagnoses += shifted.diagnoses
+        self._misfits += shifted.misfits
         self.samples += answered
 
     def end_record(self, line_s: float, counters: Mapping[str, int]) -> None:
@@ -91,7 +93,7 @@ class RunBuilder:
 
     def build(self, conditions: Conditions) -> Run:
         """Run of the samples so far."""
-        alarms, diagnoses = self._alarms, self._diagnoses
+        alarms, diagnoses, misfits = self._alarms, self._diagnoses, self._misfits
         return Run(
             conditions=conditions,
             codes=self._codes[: self.samples],
@@ -107,6 +109,10 @@ class RunBuilder:
             diagnosis_change=np.array([diagnosis.change for diagnosis in diagnoses], dtype=np.uint8),
             diagnosis_onset=np.array([diagnosis.onset for diagnosis in diagnoses], dtype=np.int64),
             diagnosis_extent=np.array([diagnosis.extent for diagnosis in diagnoses], dtype=np.float32),
+            misfit_index=np.array([misfit.index for misfit in misfits], dtype=np.int64),
+            misfit_cause=np.array([misfit.cause for misfit in misfits], dtype=np.uint8),
+            misfit_frequency=np.array([misfit.frequency for misfit in misfits], dtype=np.float32),
+            misfit_strength=np.array([misfit.strength for misfit in misfits], dtype=np.float32),
         )
 
 

@@ -85,6 +85,8 @@ class Datasheet:
     """Noise variance that the device assumes [codes^2]; None: not known."""
     diagnoses: bool = False
     """True if the device names the parameter that has changed."""
+    misfits: bool = False
+    """True if the device watches whether its model fits, and names the cause of a misfit."""
     cannot_tell: tuple[str, ...] = ()
     """Faults that the device's protocol leaves unnoticed, as noun phrases."""
 
@@ -136,6 +138,7 @@ class Datasheet:
             is_ceiling_log_arl0=trigger == "cusum",
             noise_variance=settings.get("noise_variance"),
             diagnoses=settings.get("isolation", True),
+            misfits=settings.get("misfit", False),
         )
 
     @classmethod

@@ -21,7 +21,7 @@ EdgeInstants = Literal["locked", "may-slip", "anywhere"]
 _MODEL_SETTINGS = (
     *("na", "nb", "nk", "nc", "offset", "noise_estimated", "refresh_n", "stuck_n", "idle_n"),
     *("forgetting", "random_walk", "p0", "p0_offset", "noise_variance", "edge_codes", "code_low", "code_high"),
-    *("isolation", "force_zero"),
+    *("isolation", "force_zero", "misfit"),
 )
 _TRIGGER_SETTINGS = ("trigger", "ceiling", "hold_off_n", "warm_up_n", "absolute", "edge_instants", "reset")
 """Fields with the same name in the device. The coefficients of C come between the two groups."""
@@ -66,6 +66,7 @@ _IN_RANGE: Mapping[str, tuple[int, int] | tuple[float, float]] = {
     "code_low": _CODES,
     "code_high": _CODES,
     "isolation": _SWITCH,
+    "misfit": _SWITCH,
     "hold_off_n": _U16,
     "warm_up_n": _U16,
     "absolute": _SWITCH,
@@ -112,6 +113,8 @@ class EstimatorConfig:
     code_high: float = 1.0e6
     isolation: bool = True
     """Diagnose after an alarm whether M, B or K has changed; for na = 2, nb + nk <= 3 and the trigger ``cusum``."""
+    misfit: bool = True
+    """Watch whether the model fits, and report the cause of a misfit; for na = 2."""
     force_zero: float = 0.0
     """Code of zero force, for isolation. The bench sets it from the range of the rig's card."""
     edge_instants: EdgeInstants = "may-slip"

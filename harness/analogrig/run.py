@@ -65,13 +65,25 @@ _ARRAYS: dict[str, tuple[str, int]] = {
     "alarm_statistic": ("float32", 1),
 }
 
-_OPTIONAL_ARRAYS: dict[str, tuple[str, int]] = {
+MOST_FREQUENCY = 0.5
+"""Largest frequency of a disturbance in cycles per sample."""
+
+_DIAGNOSIS_ARRAYS: dict[str, tuple[str, int]] = {
     "diagnosis_index": ("int64", 1),
     "diagnosis_change": ("uint8", 1),
     "diagnosis_onset": ("int64", 1),
     "diagnosis_extent": ("float32", 1),
 }
-"""Arrays of diagnoses, absent and then empty in older recordings."""
+
+_MISFIT_ARRAYS: dict[str, tuple[str, int]] = {
+    "misfit_index": ("int64", 1),
+    "misfit_cause": ("uint8", 1),
+    "misfit_frequency": ("float32", 1),
+    "misfit_strength": ("float32", 1),
+}
+
+_OPTIONAL_ARRAYS = _DIAGNOSIS_ARRAYS | _MISFIT_ARRAYS
+"""Arrays that are absent from older recordings, and then empty."""
 
 
 @dataclass(frozen=True)
@@ -192,6 +204,14 @@ class Run:
     """(d,): sample of the change according to the device."""
     diagnosis_extent: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     """(d,): ratio of the new to the old value of the parameter."""
+    misfit_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(f,): sample after which the device reported another cause of a misfit."""
+    misfit_cause: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    """(f,): Cause of the catalogue."""
+    misfit_frequency: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    """(f,): frequency of the disturbance in cycles per sample; 0 unless the cause is HUM."""
+    misfit_strength: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    """(f,): statistic over its limit; 0 if it is not reported."""
 
     @property
     def samples(self) -> int:
@@ -327,6 +347,7 @@ class Run:
         :raises RecordingError: names every check that failed.
         """
         n, alarms, diagnoses = self.samples, len(self.alarm_index), len(self.diagnosis_index)
+        misfits = len(self.misfit_index)
         conditions = self.conditions
         earliest, starts, latest = (
             [each.start for each in segments]
@@ -341,7 +362,8 @@ class Run:
                 len(getattr(self, name)) == n for name in ("clipped", "theta", "innovation", "statistic", "flags")
             )
             and len(self.alarm_kind) == len(self.alarm_statistic) == alarms
-            and all(len(getattr(self, name)) == diagnoses for name in _OPTIONAL_ARRAYS),
+            and all(len(getattr(self, name)) == diagnoses for name in _DIAGNOSIS_ARRAYS)
+            and all(len(getattr(self, name)) == misfits for name in _MISFIT_ARRAYS),
             "channels": set(MEASURED) <= set(conditions.channels) <= set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
             "sample times": all(
@@ -367,6 +389,9 @@ class Run:
             "alarms": _are_sample_indices(self.alarm_index, n),
             "diagnoses": _are_sample_indices(self.diagnosis_index, n)
             and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
+            "misfits": _are_sample_indices(self.misfit_index, n)
+            and set(self.misfit_cause.tolist()) <= set(Cause)
+            and bool(((self.misfit_frequency >= 0.0) & (self.misfit_frequency <= MOST_FREQUENCY)).all()),
             "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
             "theta": self.theta.shape[1] == self._recorded_datasheet(path).theta_n,

@@ -15,7 +15,7 @@ from estimator_c.evidence import eva
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 CORE = ESTIMATOR / "core"
 GENERATED = ESTIMATOR.parent / "build" / "generated"
-SOURCES = sorted(path for part in ("core", "isolation") for path in (ESTIMATOR / part).glob("*.c"))
+SOURCES = sorted(path for part in ("core", "isolation", "fit") for path in (ESTIMATOR / part).glob("*.c"))
 INCLUDE = f"-I{CORE}"
 
 BUILDS = [("-DEST_NC_MAX=0U",), ("-DEST_NC_MAX=2U",)]
@@ -33,10 +33,10 @@ def test_gcc_analyzer_finds_nothing(source: Path, options: Sequence[str], tmp_pa
 
 
 @pytest.mark.tools("clang-tidy")
-@pytest.mark.parametrize("part", ["core", "isolation", "device"])
+@pytest.mark.parametrize("part", ["core", "isolation", "fit", "device"])
 def test_clang_tidy_finds_nothing(part: str) -> None:
     """The checks are those of estimator_c/.clang-tidy."""
-    folders = [ESTIMATOR / name for name in ("core", "isolation", "device")]
+    folders = [ESTIMATOR / name for name in ("core", "isolation", "fit", "device")]
     options = ["-std=c99", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in (*folders, GENERATED))]
     sources = map(str, sorted((ESTIMATOR / part).glob("*.c")))
     done = subprocess.run(
@@ -45,7 +45,7 @@ def test_clang_tidy_finds_nothing(part: str) -> None:
     assert done.returncode == 0, done.stdout
 
 
-DEVICE_FOLDERS = [*(ESTIMATOR / name for name in ("core", "isolation", "device", "ports/loop")), GENERATED]
+DEVICE_FOLDERS = [*(ESTIMATOR / name for name in ("core", "isolation", "fit", "device", "ports/loop")), GENERATED]
 DEVICE_SOURCES = sorted(
     path for part in ("device", "ports/loop", "ports/host") for path in (ESTIMATOR / part).glob("*.c")
 )

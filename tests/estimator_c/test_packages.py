@@ -170,8 +170,8 @@ def test_example_fits_an_atmega328p(tmp_path: Path) -> None:
 
 def compiles(compiler: str, flags: tuple[str, ...], folder: Path) -> None:
     """Compile core, isolation and the sources for Arduino with -Wall -Wextra -Werror, and no other option of ours."""
-    include = [f"-I{ESTIMATOR / part}" for part in ("core", "isolation")]
-    sources = sorted(path for part in ("core", "isolation", "src") for path in (ESTIMATOR / part).glob("*.c"))
+    include = [f"-I{ESTIMATOR / part}" for part in ("core", "isolation", "fit")]
+    sources = sorted(path for part in ("core", "isolation", "fit", "src") for path in (ESTIMATOR / part).glob("*.c"))
     for source in sources:
         run(compiler, *flags, *WARNINGS, *include, "-c", source, "-o", folder / "object.o")
 

@@ -13,7 +13,7 @@ from tests.estimator_c.shells import EXTENDED, REMOTE, CFrame, Frame, from_c, to
 
 ROOT = Path(__file__).parents[2]
 ESTIMATOR = ROOT / "estimator_c"
-FOLDERS = [ESTIMATOR / folder for folder in ("core", "isolation", "device", "ports/loop")]
+FOLDERS = [ESTIMATOR / folder for folder in ("core", "isolation", "fit", "device", "ports/loop")]
 CODECS = ROOT / "build" / "generated"
 
 UART = "volatile uint32_t UART_STATUS, UART_DATA, RANDOM;"

@@ -23,7 +23,7 @@ GENERATED = ROOT / "build" / "generated"
 README = Path(__file__).with_name("README.md")
 TABLE = "| defect | property | simplest scenario that shows it | what it shows |\n|---|---|---|---|\n"
 
-FOLDERS = ("core", "isolation", "device", "ports/loop", "ports/library")
+FOLDERS = ("core", "isolation", "fit", "device", "ports/loop", "ports/library")
 FLAGS = ("-O1", "-w", "-shared", "-fPIC", "-std=c99", "-ffp-contract=off", "-DEST_NC_MAX=2U", "-DNDEBUG")
 
 FOUND_ONLY = "tests.properties.found_only"
@@ -82,7 +82,7 @@ def planted(defect: Defect | None, folder: Path) -> Path:
     library = folder / "device.so"
     files = [
         file
-        for part in ("core", "isolation", "device", "ports/library")
+        for part in ("core", "isolation", "fit", "device", "ports/library")
         for file in sorted(sources.glob(f"{part}/*.c"))
     ]
     include = [f"-I{sources / part}" for part in FOLDERS] + [f"-I{GENERATED}"]

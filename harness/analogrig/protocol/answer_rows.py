@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit
 
 
 class AnswerRows:
@@ -18,6 +18,7 @@ class AnswerRows:
         self.flags: list[int] = []
         self.alarms: list[RaisedAlarm] = []
         self.diagnoses: list[ReportedDiagnosis] = []
+        self.misfits: list[ReportedMisfit] = []
         self._last_taken = (width * [0.0], 0.0)
 
     def repeat(self, flags: int, statistic: float | None = None) -> None:
@@ -36,7 +37,7 @@ class AnswerRows:
         self.statistics.append(statistic)
 
     def take(self, n: int, before: int) -> Answers:
-        """Remove and return the first n samples, and the alarms and diagnoses before the index ``before``."""
+        """Remove and return the first n samples, and all that was reported before the index ``before``."""
         cut = n * self.width
         values = np.array(self.values[:cut], dtype=np.float32).reshape(n, self.width)
         out = Answers(
@@ -46,9 +47,10 @@ class AnswerRows:
             flags=np.array(self.flags[:n], dtype=np.uint8),
             alarms=tuple(alarm for alarm in self.alarms if alarm.index < before),
             diagnoses=tuple(diagnosis for diagnosis in self.diagnoses if diagnosis.index < before),
+            misfits=tuple(misfit for misfit in self.misfits if misfit.index < before),
         )
         if n:
             self._last_taken = (self.values[cut - self.width : cut], self.statistics[n - 1])
         del self.values[:cut], self.statistics[:n], self.flags[:n], self.alarms[: len(out.alarms)]
-        del self.diagnoses[: len(out.diagnoses)]
+        del self.diagnoses[: len(out.diagnoses)], self.misfits[: len(out.misfits)]
         return out

@@ -99,12 +99,12 @@ class BusLoad:
     bitrate: int
     data_bitrate: int | None
     sample_s: float
-    """Time on the bus of one sample and its answers, without alarms and diagnoses [s]."""
+    """Time on the bus of one sample and its answers, without alarms, diagnoses and misfits [s]."""
     utilisation: float
     """Share of the bus in real time; more than 1.0 does not fit."""
     latency_s: float | None
-    """Worst-case time in real time from a sample to the end of its last answer, after an alarm and a diagnosis [s]. The
-    device itself takes no time. None if it is unbounded."""
+    """Worst-case time in real time from a sample to the end of its last answer, after an Alarm, a Diagnosis and a Misfit
+    [s]. The device itself takes no time. None if it is unbounded."""
 
     @property
     def most_samples_per_s(self) -> float:
@@ -134,7 +134,7 @@ def exchange_load(
 
     there_s = latency_s(answers(0.0), samples.identifier, 1.0 / line.bitrate)
     late_s = 0.0 if there_s is None else there_s - samples.frame_s
-    back = [stream(Alarm), stream(Diagnosis), *answers(late_s)]
+    back = [stream(Alarm), stream(Diagnosis), stream(Misfit), *answers(late_s)]
     back_s = latency_s(back, LAYOUTS["Stepped"].id, 1.0 / line.bitrate)
     sample_s = sum(sample_times(line, parameters=parameters, report_interval_n=report_interval_n, in_blocks=in_blocks))
     return BusLoad(

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
 from analogrig.catalogue import (
     BLOCK_SAMPLES,
     INDICES,
@@ -68,9 +68,15 @@ class Packing:
         return BLOCK_SAMPLES if self.in_blocks else 1
 
 
+def misfit_of(index: int, message: Misfit) -> ReportedMisfit:
+    """Misfit that a message reports after the sample ``index``."""
+    return ReportedMisfit(index, message.cause, message.frequency / 65536.0, message.strength / 256.0)
+
+
 def most_answers(samples: int, parameters: int) -> int:
-    """Largest number of answers to a message: estimates and Stepped for each sample, an alarm and a diagnosis."""
-    return samples * (parameters + 2) + 2
+    """Largest number of answers to a message: estimates and Stepped for each sample, and one Alarm, Diagnosis and
+    Misfit."""
+    return samples * (parameters + 2) + 3
 
 
 class Exchange:
@@ -214,6 +220,8 @@ class Exchange:
             self._step(message)
         elif isinstance(message, Alarm) and message.sample_index == self._wire_index:
             self._rows.alarms.append(RaisedAlarm(self._answered, message.trigger, message.statistic))
+        elif isinstance(message, Misfit) and message.sample_index == self._wire_index and message.cause in set(Cause):
+            self._rows.misfits.append(misfit_of(self._answered, message))
         elif isinstance(message, Diagnosis) and message.change in _DECIDED and self._pending:
             self._diagnosis = message
         elif lost := self._lost_before(message):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig import catalogue
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit
 from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
@@ -125,6 +125,7 @@ class CatalogueRun(CapturedRun):
     """Flags and statistic by sample index."""
     alarms: list[tuple[int, int, float]] = field(default_factory=list)
     diagnoses: list[tuple[int, int, int, float]] = field(default_factory=list)
+    misfits: list[ReportedMisfit] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
     incomplete: set[int] = field(default_factory=set)
     """Samples some of whose answers are not in the capture."""
@@ -156,6 +157,7 @@ class CatalogueRun(CapturedRun):
             self._enter(rows, k, elements)
         rows.alarms = [RaisedAlarm(*alarm) for alarm in self.alarms if 0 <= alarm[0] < self.extent]
         rows.diagnoses = [ReportedDiagnosis(*each) for each in self.diagnoses if 0 <= each[0] < self.extent]
+        rows.misfits = [misfit for misfit in self.misfits if 0 <= misfit.index < self.extent]
         return rows.take(self.extent, self.extent)
 
     def _enter(self, rows: AnswerRows, k: int, elements: Sequence[int]) -> None:
@@ -350,6 +352,11 @@ class CaptureDecoder:
     def _alarm(self, message: catalogue.Alarm) -> None:
         index = self._index(message.sample_index, of_sample=False)
         self._current_run().alarms.append((index, message.trigger, message.statistic))
+
+    def _misfit(self, message: catalogue.Misfit) -> None:
+        if message.cause in set(catalogue.Cause):
+            index = self._index(message.sample_index, of_sample=False)
+            self._current_run().misfits.append(misfit_of(index, message))
 
     def _diagnosis(self, message: catalogue.Diagnosis) -> None:
         self._undated = message
