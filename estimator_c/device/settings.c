@@ -38,9 +38,7 @@ static const field_t FIELDS[] = {
     MEMBER(HOLD_OFF_N, estimator.trigger.hold_off_n, UINT16_MAX),
     MEMBER(WARM_UP_N, estimator.trigger.warm_up_n, UINT16_MAX),
     MEMBER(ISOLATION, isolation, 1U),
-#if DEVICE_WITH_FIT
     MEMBER(MISFIT, misfit, 1U),
-#endif
     NUMBER(FORGETTING, estimator.forgetting),
     NUMBER(RANDOM_WALK, estimator.random_walk),
     NUMBER(P0, estimator.p0),
@@ -120,11 +118,13 @@ static bool is_acceptable(const field_t field, const float value) {
         base.estimator.c[i] = 0.0F;
     }
     return est_config_valid(&base.estimator) && (base.force_zero >= -EST_CODE_LIMIT) &&
-           (base.force_zero <= EST_CODE_LIMIT);
+           (base.force_zero <= EST_CODE_LIMIT) && (DEVICE_WITH_FIT || !base.misfit);
 }
 
 settings_t settings_default(void) {
-    return (settings_t){ .estimator = est_config_default(), .force_zero = 0.0F, .isolation = true, .misfit = true };
+    return (settings_t){
+        .estimator = est_config_default(), .force_zero = 0.0F, .isolation = true, .misfit = DEVICE_WITH_FIT
+    };
 }
 
 settings_result_t settings_set(settings_t* const self, const uint8_t key, const float value) {

@@ -6,7 +6,7 @@
 
 #include "est.h"
 
-/// 0 omits the watch of the fit, est_fit.h, and its setting.
+/// 0 omits the watch of the fit, est_fit.h. A device without it has the setting, but only as false.
 #ifndef DEVICE_WITH_FIT
 #define DEVICE_WITH_FIT 1
 #endif

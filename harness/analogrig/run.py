@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.catalogue import Change
+from analogrig.catalogue import Cause, Change
 from analogrig.datasheet import Datasheet
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.header import check_tables

@@ -9,7 +9,8 @@ takes blocks of samples and yields answers. An installed package adds the kind a
 =============  ==========================================================================================
 describe       ``AdaptedDescription`` (base class), ``DeviceDescription``, ``Capability``, ``Thing``
 state          ``Datasheet``, ``ModelOrders``
-answer         ``Device`` (base class), ``Samples``, ``Answers``, ``RaisedAlarm``, ``ReportedDiagnosis``
+answer         ``Device`` (base class), ``Samples``, ``Answers``, ``RaisedAlarm``, ``ReportedDiagnosis``,
+               ``ReportedMisfit``
 flags          ``SteppedFlag``, ``LOST``, ``UNREPORTED``, ``UNARMED``
 errors         ``DeviceRefused``, ``LinkClosed``, ``TimeLimitReached``; ``analogrig`` has more
 =============  ==========================================================================================
@@ -24,7 +25,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+    from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
     from analogrig.catalogue import SteppedFlag
     from analogrig.datasheet import Datasheet, ModelOrders
     from analogrig.devices.adapted import AdaptedDescription
@@ -39,7 +40,7 @@ else:
     __getattr__ = loader(
         __name__,
         {
-            "analogrig.answers": "Answers RaisedAlarm ReportedDiagnosis Samples",
+            "analogrig.answers": "Answers RaisedAlarm ReportedDiagnosis ReportedMisfit Samples",
             "analogrig.catalogue": "SteppedFlag",
             "analogrig.datasheet": "Datasheet ModelOrders",
             "analogrig.devices.adapted": "AdaptedDescription",
@@ -66,6 +67,7 @@ __all__ = [
     "ModelOrders",
     "RaisedAlarm",
     "ReportedDiagnosis",
+    "ReportedMisfit",
     "Samples",
     "SteppedFlag",
     "Thing",

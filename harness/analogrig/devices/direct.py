@@ -22,8 +22,8 @@ from analogrig.run import Channel
 class DirectDevice(Device):
     """Estimator of a device of our catalogue that has the capability ``blocks``, without its line.
 
-    Its answers are those of ``CatalogueDevice`` to the bit. It lacks what other messages carry: the diagnoses, the
-    flags RESTARTED and IDLE, and the counters of messages.
+    Its answers are those of ``CatalogueDevice`` to the bit. It lacks what other messages carry: the diagnoses,
+    the misfits, the flags RESTARTED and IDLE, and the counters of messages.
     """
 
     def __init__(self, description: CatalogueDescription, *, alarms_only: bool = False) -> None:

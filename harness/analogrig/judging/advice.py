@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, Verdict
+from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, MisfitPeriod, Verdict
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -32,6 +33,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         return ()
     return (
         *_statement(run),
+        *_misfits(verdict),
         *_unjudged_quantities(verdict),
         *_theta_without_a_model(run),
         *_assumed_settings(run),
@@ -43,6 +45,16 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_undetectable_changes(verdict),
         *_implausible_estimates(verdict),
     )
+
+
+def _misfits(verdict: Verdict) -> Iterator[str]:
+    """One sentence for each cause of a misfit."""
+    for cause, periods in itertools.groupby(sorted(verdict.fit or (), key=_cause), _cause):
+        yield f"the model does not fit ({cause}): alarms may be false, and changes missed; {next(periods).cure}"
+
+
+def _cause(period: MisfitPeriod) -> str:
+    return period.cause
 
 
 def _unjudged_quantities(verdict: Verdict) -> Iterator[str]:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.catalogue import Change, SteppedFlag
+from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
 from analogrig.judging.exposure import Exposure, exposure
@@ -47,6 +47,42 @@ ESTIMATES, STATISTIC, DIAGNOSES = "estimates of M, B, K", "the trigger's statist
 
 DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
 """Changes that a device can diagnose, with their names in verdicts."""
+
+CURES: Mapping[str, str] = {
+    "drift": "remove the mean of the displacement by a high-pass filter, or make the run shorter",
+    "hum": "shield the sensor and its cable, or sample synchronously with the mains",
+    "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card',
+    "nonlinear": "reduce the amplitude of the excitation, or raise the orders na and nb",
+    "noise": "measure the variance at rest and set noise_variance, or set noise_estimated = true",
+    "slow plant": "lower the sample rate, or use a converter with more bits",
+    "excitation": "raise the amplitude of the excitation",
+}
+"""Measure against each cause of a misfit."""
+
+
+@dataclass(frozen=True)
+class MisfitPeriod:
+    """Samples ``start`` <= k < ``end`` in which the device reported one cause of a misfit."""
+
+    cause: str
+    """Cause of the catalogue, in lower case: ``hum``, ``slow plant``."""
+    start: int
+    end: int
+    strength: float | None
+    """Statistic over its limit at ``start``; None if the device does not report it."""
+    frequency_hz: float | None
+    """Frequency of the disturbance; None unless the cause is ``hum``."""
+
+    @property
+    def text(self) -> str:
+        """Cause and samples: ``hum at 50.1 Hz in samples 1872-4999``."""
+        at = "" if self.frequency_hz is None else f" at {self.frequency_hz:.3g} Hz"
+        return f"{self.cause}{at} in samples {self.start}-{self.end - 1}"
+
+    @property
+    def cure(self) -> str:
+        """Measure against the cause."""
+        return CURES[self.cause]
 
 
 @dataclass(frozen=True)
@@ -192,6 +228,8 @@ class Verdict:
     """First sample with a lit overload lamp, by amplifier."""
     doubtful_alarms: tuple[int, ...] = ()
     """Sample indices of the alarms that are false under some hypotheses only."""
+    fit: tuple[MisfitPeriod, ...] | None = None
+    """Periods of a misfit, in order; None if the device does not watch whether its model fits."""
 
     def __bool__(self) -> bool:
         raise TypeError('a verdict is neither true nor false: ask for verdict.outcome == "passed"')
@@ -240,7 +278,29 @@ def judge(run: Run) -> Verdict:
         not_judged=unreported(sheet),
         cannot_tell=sheet.cannot_tell,
         overloads=dict(run.conditions.overloads),
+        fit=misfit_periods(run) if sheet.misfits else None,
     )
+
+
+def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
+    """Periods in which the device reported a misfit. Each ends with the next report, or with its record."""
+    changes = [*run.misfit_index.tolist(), run.samples]
+    out = []
+    for i, cause in enumerate(map(Cause, run.misfit_cause.tolist())):
+        start = changes[i]
+        record_end = min((record for record in run.conditions.records if record > start), default=run.samples)
+        if cause != Cause.NONE:
+            is_hum = cause == Cause.HUM
+            out.append(
+                MisfitPeriod(
+                    cause=cause.name.lower().replace("_", " "),
+                    start=start,
+                    end=min(changes[i + 1], record_end),
+                    strength=float(run.misfit_strength[i]) or None,
+                    frequency_hz=float(run.misfit_frequency[i]) / run.conditions.sample_period_s if is_hum else None,
+                )
+            )
+    return tuple(out)
 
 
 def unreported(sheet: Datasheet) -> tuple[str, ...]:
@@ -311,7 +371,12 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "not_judged": list(verdict.not_judged),
         "cannot_tell": list(verdict.cannot_tell),
         "overloads": dict(verdict.overloads),
+        "fit": None if verdict.fit is None else [_misfit_as_json(period) for period in verdict.fit],
     }
+
+
+def _misfit_as_json(period: MisfitPeriod) -> dict[str, Any]:
+    return dataclasses.asdict(period) | {"cure": period.cure}
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from analogrig.catalogue import (
     Diagnosis,
     Estimate,
     Message,
+    Misfit,
     Sample,
     SampleBlock,
     Stepped,
@@ -103,8 +104,8 @@ class BusLoad:
     utilisation: float
     """Share of the bus in real time; more than 1.0 does not fit."""
     latency_s: float | None
-    """Worst-case time in real time from a sample to the end of its last answer, after an Alarm, a Diagnosis and a Misfit
-    [s]. The device itself takes no time. None if it is unbounded."""
+    """Worst-case time in real time from a sample to the end of its last answer, after an Alarm, a Diagnosis and a
+    Misfit [s]. The device itself takes no time. None if it is unbounded."""
 
     @property
     def most_samples_per_s(self) -> float:

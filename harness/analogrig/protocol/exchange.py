@@ -22,11 +22,13 @@ from analogrig.catalogue import (
     RUNS,
     STEPPED_FLAGS,
     Alarm,
+    Cause,
     Change,
     Diagnosis,
     Element,
     Estimate,
     Message,
+    Misfit,
     Sample,
     SampleBlock,
     SampleFlag,
@@ -49,6 +51,8 @@ _NO_INDEX = -1
 _NO_ELEMENT = -1
 
 _DECIDED = frozenset(Change) - {Change.UNDECIDED}
+
+_CAUSES = frozenset(Cause)
 
 Codes = tuple[int, int, bool]
 """u, y, and False if they are missing."""
@@ -220,7 +224,7 @@ class Exchange:
             self._step(message)
         elif isinstance(message, Alarm) and message.sample_index == self._wire_index:
             self._rows.alarms.append(RaisedAlarm(self._answered, message.trigger, message.statistic))
-        elif isinstance(message, Misfit) and message.sample_index == self._wire_index and message.cause in set(Cause):
+        elif isinstance(message, Misfit) and message.sample_index == self._wire_index and message.cause in _CAUSES:
             self._rows.misfits.append(misfit_of(self._answered, message))
         elif isinstance(message, Diagnosis) and message.change in _DECIDED and self._pending:
             self._diagnosis = message

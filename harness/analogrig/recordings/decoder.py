@@ -17,6 +17,7 @@ from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.links.dbc import check_layout, load_dbc
 from analogrig.protocol.answer_rows import AnswerRows
+from analogrig.protocol.exchange import misfit_of
 from analogrig.recordings.captured import CapturedRun
 from analogrig.run import LOST, UNREPORTED
 from analogrig.wording import number_of

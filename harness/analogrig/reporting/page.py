@@ -50,6 +50,7 @@ def render(run: Run, verdict: Verdict) -> str:
         tweaks=tables.tweaks(verdict),
         diagnoses=tables.diagnoses(verdict),
         false_alarms=tables.false_alarms(run, verdict),
+        fit=tables.fit(verdict),
         estimates=tables.estimates(verdict),
         settings=tables.settings(run),
         period=tables.period(run),

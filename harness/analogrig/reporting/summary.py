@@ -9,6 +9,7 @@ from analogrig.judging.verdict import (
     ESTIMATES,
     ChangeVerdict,
     DiagnosisVerdict,
+    MisfitPeriod,
     SegmentEstimate,
     Verdict,
     missing_text,
@@ -44,6 +45,7 @@ def summary(run: Run, verdict: Verdict) -> str:
         "false alarms": f"{_alarms(verdict.false_alarms)} in {number_of(run.samples, 'sample')}",
         "false or not, depending on the instants of the changes": verdict.doubtful_alarms
         and f"alarms at {', '.join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))}",
+        "misfit": verdict.fit and misfit_text(verdict.fit),
         missing_text(run): verdict.missing_n and number_of(verdict.missing_n, "sample"),
         "overload lamps": verdict.overloads and lamps_text(verdict.overloads),
         "on the line": traffic_text(conditions.link_counters),
@@ -56,6 +58,12 @@ def summary(run: Run, verdict: Verdict) -> str:
     digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  {digest}"]
     return "\n".join(lines)
+
+
+def misfit_text(fit: Sequence[MisfitPeriod]) -> str:
+    """Periods of a misfit: ``hum at 50.1 Hz in samples 1872-4999``; ``none`` without one."""
+    more = ", ..." if len(fit) > SHOWN_ALARMS else ""
+    return ", ".join(period.text for period in fit[:SHOWN_ALARMS]) + more if fit else "none"
 
 
 def traffic_text(link_counters: Mapping[str, int]) -> str:

@@ -13,6 +13,7 @@ from analogrig.judging.verdict import (
     STATISTIC,
     ChangeVerdict,
     DiagnosisVerdict,
+    MisfitPeriod,
     SegmentEstimate,
     Verdict,
     missing_text,
@@ -27,6 +28,9 @@ from analogrig.wording import number_of
 
 _MAX_FALSE_ALARMS = 20
 """Rows in the table of false alarms; the plots mark more."""
+
+_MAX_MISFITS = 20
+"""Rows in the table of misfits."""
 
 _SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
 
@@ -135,6 +139,17 @@ def false_alarms(run: Run, verdict: Verdict) -> str:
     return table(caption, heading(("Sample",), ("Statistic",)), rows)
 
 
+def fit(verdict: Verdict) -> str:
+    """Table of the periods in which the model did not fit."""
+    if verdict.fit is None:
+        return "<p>Not judged: the device does not watch whether its model fits.</p>"
+    if not verdict.fit:
+        return "<p>The device reported no misfit.</p>"
+    caption = "Cause of the misfit as reported by the device; strength: statistic over its limit"
+    head = heading(("Samples", "Cause"), ("Frequency [Hz]", "Strength"), ("Cure",))
+    return table(caption, head, (_misfit_row(period) for period in verdict.fit[:_MAX_MISFITS]))
+
+
 def estimates(verdict: Verdict) -> str:
     """Table of M, B and K at the end of each segment, compared with the truth."""
     if ESTIMATES in verdict.not_judged:
@@ -226,6 +241,11 @@ def _diagnosis_row(tweak: ChangeVerdict, diagnosis: DiagnosisVerdict) -> str:
     cells += [number(diagnosis.extent, ".3f"), number(diagnosis.extent_error, "+.1%")]
     cells += [number(diagnosis.delay_n), number(diagnosis.bound_n), number(diagnosis.onset_error_n, "+d")]
     return row([*cells, cell(word, f"text {kind}")])
+
+
+def _misfit_row(period: MisfitPeriod) -> str:
+    cells = [_zoom(period.start, period.end - 1), cell(period.cause), number(period.frequency_hz, ".4g")]
+    return row([*cells, number(period.strength, ".2f"), cell(period.cure, "text")])
 
 
 def _result(tweak: ChangeVerdict) -> tuple[str, str]:
