@@ -26,6 +26,7 @@ HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
 FLOAT_ROUTINES = HERE.parent / "ports" / "cortex_m0" / "float.S"
 ISOLATION = HERE.parent / "isolation"
+FIT = HERE.parent / "fit"
 DEVICE = HERE.parent / "device"
 LIBC = HERE.parent / "ports" / "cortex_m" / "include"
 CODECS = Path("build/generated")
@@ -38,7 +39,7 @@ PACKAGES = {COMPILER: "gcc-arm-none-eabi", SIMULATOR: "qemu-system-arm", "avr-gc
 FLAGS = (
     *("-std=c99", "-mthumb", "-ffreestanding", "-ffp-contract=off", "-DNDEBUG", "-ffunction-sections"),
     *("-Wall", "-Wextra", "-Wdouble-promotion", "-Werror"),
-    *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}", f"-I{ISOLATION}"),
+    *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}", f"-I{ISOLATION}", f"-I{FIT}"),
 )
 
 CLOCK_MHZ, CYCLES = 168.0, 1.5
@@ -109,6 +110,7 @@ TRIGGER_ALONE = tuple(f"-DEST_WITH_{what}=0" for what in ("EDGES", "TRIGGERS", "
 # What footprint.c is to use.
 EVERYTHING = ("-DFOOTPRINT_ALL",)
 ISOLATES = "-DFOOTPRINT_ISOLATES"
+WATCHES = "-DFOOTPRINT_WATCHES"
 
 
 @dataclass(frozen=True)
@@ -156,8 +158,8 @@ def core_sources() -> list[Path]:
 
 
 def all_sources() -> list[Path]:
-    """Sources of the estimator with isolation."""
-    return [*core_sources(), *sorted(ISOLATION.glob("*.c"))]
+    """Sources of the estimator with isolation and the watch of the fit."""
+    return [*core_sources(), *sorted(ISOLATION.glob("*.c")), *sorted(FIT.glob("*.c"))]
 
 
 def symbols(image: Path) -> dict[str, tuple[int, int]]:
@@ -292,6 +294,16 @@ class ImageRunner:
         entered = count_steps(image, processor.machine, *calls[1:], calls[0])
         yield Steps(f"{processor.name}, isolation, a sample entered", entered)
 
+    def fit(self, processor: Processor, orders: Orders) -> Steps:
+        """Samples entered into the watch of the fit, over more than a block of it."""
+        sources = [HERE / "image.c", HERE / "subject_est.c", *all_sources()]
+        flags = ("-O2", *processor.flags, *orders.flags(fixed=False), "-DSUBJECT_WATCHES", "-DSAMPLES_N=1400U")
+        image = link(self._folder / "image.elf", sources, flags)
+        return Steps(
+            f"{processor.name}, fit, a sample entered",
+            count_steps(image, processor.machine, "est_fit_enter", "est_step"),
+        )
+
     def device(self, processor: Processor) -> Steps:
         """The steps of the device: a frame decoded, a sample entered, its answers encoded."""
         sources = [HERE / "image.c", HERE / "subject_device.c", *all_sources()]
@@ -339,6 +351,7 @@ def costs(folder: Path) -> Iterator[Cost]:
     for build, level in itertools.product(stack.BUILDS, stack.LEVELS):
         yield Cost(f"{build.name}, stack of est_step() at {level}", stack.stack_bytes(build, level, folder), "B")
     yield from isolation(bench)
+    yield from fit(bench)
     for processor in (M4F, M3):
         yield from device(bench.device(processor))
 
@@ -359,6 +372,16 @@ def isolation(bench: ImageRunner) -> Iterator[Cost]:
     text_bytes = bench.text_bytes(*EVERYTHING, ISOLATES) - bench.text_bytes(*EVERYTHING)
     yield Cost("M4F, code of isolation at -Os, beside the core's", text_bytes, "B")
     yield Cost("M4F, state: sizeof(est_isolation_t)", bench.state_bytes("isolation", ISOLATES), "B")
+
+
+def fit(bench: ImageRunner) -> Iterator[Cost]:
+    """Costs of the watch of the fit beside the core, on the M4F."""
+    steps = bench.fit(M4F, LARGE)
+    yield Cost(steps.name, steps.typical, "instructions")
+    yield Cost(f"{steps.name}, worst", max(steps.counts), "instructions")
+    text_bytes = bench.text_bytes(*EVERYTHING, WATCHES) - bench.text_bytes(*EVERYTHING)
+    yield Cost("M4F, code of the watch of the fit at -Os, beside the core's", text_bytes, "B")
+    yield Cost("M4F, state: sizeof(est_fit_watch_t)", bench.state_bytes("fit", WATCHES), "B")
 
 
 def instructions(bench: ImageRunner) -> Iterator[Cost]:

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: MIT
 /// Call the functions that a typical program calls, so that the linker keeps them and drops the rest. -DFOOTPRINT_ALL
-/// adds the rest of the interface, -DFOOTPRINT_ISOLATES isolation.
+/// adds the rest of the interface, -DFOOTPRINT_ISOLATES isolation, -DFOOTPRINT_WATCHES the watch of the fit.
 
 #include "est.h"
+#include "est_fit.h"
 #include "est_isolation.h"
 
 #include <stddef.h>
@@ -15,6 +16,10 @@ static volatile float sink;
 
 #ifdef FOOTPRINT_ISOLATES
 est_isolation_t isolation;
+#endif
+
+#ifdef FOOTPRINT_WATCHES
+est_fit_watch_t fit;
 #endif
 
 OUTSIDE void reset(void) {
@@ -33,6 +38,11 @@ OUTSIDE void reset(void) {
     est_isolation_enter(&isolation, &estimator, sample, step);
     (void)est_isolation_work(&isolation);
     sink = est_isolation_diagnosis(&isolation).extent;
+#endif
+#ifdef FOOTPRINT_WATCHES
+    sink = est_fit_init(&fit, &config) ? 1.0F : 0.0F;
+    est_fit_enter(&fit, &estimator, sample, step);
+    sink = est_fit_misfit(&fit).strength;
 #endif
 }
 

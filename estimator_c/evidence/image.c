@@ -9,7 +9,9 @@
 
 #define OUTSIDE __attribute__((section(".outside"), noinline, used))
 
+#ifndef SAMPLES_N
 #define SAMPLES_N 600U
+#endif
 #define MISSING_SAMPLE 330U
 #define LATE_SAMPLE 381U  ///< first sample after a drifting edge crosses a sampling instant
 #define SOFT_SAMPLE 480U  ///< first sample of the changed plant

@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: MIT
 /// The estimator as a subject. -DSUBJECT_NA=2U, _NB, _NK and _OFFSET set the orders, -DSUBJECT_LOCKED the generator
-/// on the clock of the card, -DSUBJECT_ISOLATES the isolation of the change.
+/// on the clock of the card, -DSUBJECT_ISOLATES the isolation of the change, -DSUBJECT_WATCHES the watch of
+/// the fit.
 
 #include "est.h"
+#include "est_fit.h"
 #include "est_isolation.h"
 #include "subject.h"
 
@@ -17,6 +19,10 @@ static est_config_t config;
 
 #ifdef SUBJECT_ISOLATES
 static est_isolation_t isolation;
+#endif
+
+#ifdef SUBJECT_WATCHES
+static est_fit_watch_t fit;
 #endif
 
 SUBJECT void subject_begin(void) {
@@ -34,6 +40,10 @@ SUBJECT void subject_begin(void) {
     const bool applies = est_isolation_init(&isolation, &config, 0.0F);
     (void)applies;
 #endif
+#ifdef SUBJECT_WATCHES
+    const bool watches = est_fit_init(&fit, &config);
+    (void)watches;
+#endif
 }
 
 SUBJECT void subject_enter(const float u, const float y, const bool valid) {
@@ -42,6 +52,8 @@ SUBJECT void subject_enter(const float u, const float y, const bool valid) {
     est_isolation_enter(&isolation, &estimator, sample, est_step(&estimator, sample));
     while (est_isolation_work(&isolation)) {
     }
+#elif defined(SUBJECT_WATCHES)
+    est_fit_enter(&fit, &estimator, sample, est_step(&estimator, sample));
 #else
     (void)est_step(&estimator, sample);
 #endif

@@ -5,11 +5,13 @@
 
 #include <stddef.h>
 
-/// Lines of the spectrum that one sample takes care of.
-#define LINES_A_SAMPLE (EST_FIT_LINES_N / EST_FIT_SUM_N)
+/// Samples of the evaluation: the resonators, then the causes one by one, then the conclusion.
+#define CAUSES_FROM 8U
+#define CAUSES_N 6U
 
-/// Regions that one sample evaluates.
-#define REGIONS_A_SAMPLE (EST_FIT_REGIONS_N / (EST_FIT_SUM_N - 2U))
+/// Lines and regions that one sample takes care of.
+#define LINES_A_SAMPLE (EST_FIT_LINES_N / CAUSES_FROM)
+#define REGIONS_A_SAMPLE 2U
 
 /// Innovations in a block below which nothing is stated, and those below which their variance is not judged: with many
 /// missing samples the estimate is less certain, and the innovations are larger.
@@ -19,15 +21,13 @@
 /// Alarms in a block that only noise can raise: the estimate of a plant needs as long to settle as the next alarm.
 #define STORM_N 18U
 
-/// Limit of an innovation in mean magnitudes: 3 standard deviations of Gaussian noise. Mean square of Gaussian noise
-/// over its squared mean magnitude.
+/// Limit of an innovation in mean magnitudes: 3 standard deviations of Gaussian noise.
 #define CLIP 3.76F
-#define GAUSSIAN 1.5707963F
 
 /// Memories of the magnitude of the innovations, until the first block and afterwards, and of the level of y [samples].
 #define MAGNITUDE_SETTLING_N 8.0F
 #define MAGNITUDE_N 64.0F
-#define LEVEL_N 512U
+#define LEVEL_N 128U
 
 /// First and smallest mean magnitude of the innovations, from which it can grow [codes].
 #define MAGNITUDE_MIN 1.0e-6F
@@ -39,10 +39,16 @@
 #define LEVEL_BOUND 0.7F
 #define MOVES 0.05F
 
+/// Innovations in a region below which it explains nothing.
+#define REGION_MIN 4U
+
 /// Equations that an edge of u affects directly.
 #define EDGE_EQUATIONS_N 3U
 
-/// Limits of the statistics in est_fit_evidence_t.
+/// Limits of the statistics. DRIFT: squared mean of the innovations over its variance. LINE: power of a line over its
+/// mean. STEPS, SHIFTS, REGIONS: share of the energy of the innovations that follows the steps of u, that a shift of
+/// each edge explains, and that the state of the plant explains. EDGE_RATIO: variance next to edges over that
+/// elsewhere. COLOUR: mean autocorrelation. NOISE: variance over the declared one. INFORMATION: see weigh_lack().
 #define DRIFT 64.0F
 #define LINE 22.0F
 #define STEPS 0.09F
@@ -51,15 +57,15 @@
 #define REGIONS 0.12F
 #define COLOUR 0.22F
 #define NOISE 2.5F
-#define INFORMATION 200.0F
+#define INFORMATION 600.0F
 
-/// A line is hum if it exceeds the lines around by LINE_ABOVE, and its share the shares of REGIONS and COLOUR by these
-/// factors: the response of a plant that is not linear, and noise that is not white, have peaks too.
+/// A line is hum if it exceeds the lines around by LINE_ABOVE, and its share those of the regions and of the colour by
+/// these factors: the response of a plant that is not linear, and noise that is not white, have peaks too.
 #define LINE_ABOVE 2.5F
 #define REGIONS_HUM 1.2F
 #define COLOUR_HUM 0.4F
 
-/// Edges that drift explain all that the state of the plant explains, and that of a plant that is not linear less than
+/// Edges that drift explain all that the state of the plant explains, and those of a plant that is not linear less than
 /// this part.
 #define STEPS_REGIONS 0.7F
 
@@ -69,12 +75,11 @@
 /// 1 + a1 + a2 below which the plant hardly moves between two samples.
 #define SLOW 0.0035F
 
-/// 0.2^2 / 2 * 100: information on a change by 20 % in 100 samples, per squared effect over the variance.
-#define CHANGE_WEIGHT 2.0F
-
 static float magnitude(const float x) { return (x < 0.0F) ? -x : x; }
 
 static float smaller(const float a, const float b) { return (a < b) ? a : b; }
+
+static float larger(const float a, const float b) { return (a > b) ? a : b; }
 
 static float ratio(const float a, const float b) { return (b > 0.0F) ? (a / b) : 0.0F; }
 
@@ -89,43 +94,49 @@ static float root(const float x) {
 
 // ---------------------------------------------        SIGNALS         ---------------------------------------------
 
-/// Whiten x by 1/C. Zeros before the first sample.
-static float whiten(float* const past, const float* const c, const float x) {
-    const float out = x - (c[0] * past[0]) - (c[1] * past[1]);
-    past[1]         = past[0];
-    past[0]         = out;
-    return out;
+/// Close the sums of the steps at an edge of u.
+static void close_shift(est_fit_watch_t* const self) {
+    self->sums.product += self->shift[0];
+    self->sums.steps += self->shift[1];
+    self->sums.shifts += ratio(self->shift[0] * self->shift[0], self->shift[1]);
+    self->shift[0] = 0.0F;
+    self->shift[1] = 0.0F;
 }
 
-/// Follow u: its edges, its whitened steps, and the effect of the mass, which is that of y'' on the equation, whitened.
+/// Follow u: its edges, and its steps whitened by 1/C.
 static void follow_input(est_fit_watch_t* const self, const float u) {
-    const float step = u - self->u[0];
-    const float bend = step - (self->u[0] - self->u[1]);
-    self->u[1]       = self->u[0];
-    self->u[0]       = u;
-    (void)whiten(self->steps, self->c, step);
-    (void)whiten(self->bends[1], self->c, whiten(self->bends[0], self->c, bend));
-    self->edge_age_n = (uint8_t)(self->edge_age_n + ((self->edge_age_n < UINT8_MAX) ? 1U : 0U));
+    const float step     = u - self->u;
+    const float whitened = step - (self->c[0] * self->step[0]) - (self->c[1] * self->step[1]);
+    self->u              = u;
+    self->step[1]        = self->step[0];
+    self->step[0]        = whitened;
     if (magnitude(step) >= self->config->edge_codes) {
         self->edge_age_n = 0U;
-        self->sums.shifts += ratio(self->shift[0] * self->shift[0], self->shift[1]);
-        self->shift[0] = 0.0F;
-        self->shift[1] = 0.0F;
+        close_shift(self);
+    } else if (self->edge_age_n < EDGE_EQUATIONS_N) {
+        self->edge_age_n++;
+    } else {
+        // the equation has no edge
     }
 }
 
 static void follow_output(est_fit_watch_t* const self, const float y) {
-    self->learnt_n   = (uint16_t)(self->learnt_n + ((self->learnt_n < LEVEL_N) ? 1U : 0U));
-    const float rate = 1.0F / (float)self->learnt_n;
-    self->level += rate * (y - self->level);
-    self->spread += rate * (magnitude(y - self->level) - self->spread);
     self->y[2] = self->y[1];
     self->y[1] = self->y[0];
     self->y[0] = y;
 }
 
+/// Follow the level of y, at one sample of four.
+static void follow_level(est_fit_watch_t* const self) {
+    self->learnt_n    = (uint16_t)(self->learnt_n + ((self->learnt_n < LEVEL_N) ? 1U : 0U));
+    const float rate  = 1.0F / (float)self->learnt_n;
+    const float above = self->y[0] - self->level;
+    self->level += rate * above;
+    self->spread += rate * (magnitude(above) - self->spread);
+}
+
 /// Region of the state of the plant before the present sample.
-static uint8_t find_region(const est_fit_watch_t* const self) {
+static uint32_t find_region(const est_fit_watch_t* const self) {
     const float level = self->y[0] - self->level;
     const float moved = self->y[0] - self->y[2];
     const float bound = LEVEL_BOUND * self->spread;
@@ -138,92 +149,69 @@ static uint8_t find_region(const est_fit_watch_t* const self) {
     if (moved < -moves) {
         trend = 0U;
     }
-    return (uint8_t)((3U * stage) + trend);
+    return (3U * stage) + trend;
 }
 
 /// Limit an innovation, and follow the magnitude of the innovations.
 static float limit_innovation(est_fit_watch_t* const self, const float innovation) {
-    const float most = CLIP * self->deviation;
-    const float size = smaller(magnitude(innovation), most);
-    self->deviation += (size - self->deviation) / ((self->settling_n > 0U) ? MAGNITUDE_SETTLING_N : MAGNITUDE_N);
-    self->deviation = (self->deviation < MAGNITUDE_MIN) ? MAGNITUDE_MIN : self->deviation;
+    const float size   = smaller(magnitude(innovation), CLIP * self->deviation);
+    const float memory = (self->settling_n > 0U) ? MAGNITUDE_SETTLING_N : MAGNITUDE_N;
+    self->deviation    = larger(self->deviation + ((size - self->deviation) / memory), MAGNITUDE_MIN);
     return (innovation < 0.0F) ? -size : size;
 }
 
+/// Enter an innovation into the sums, and every second one into those that are costly.
 static void enter_innovation(est_fit_watch_t* const self, const float z) {
     est_fit_sums_t* const sums   = &self->sums;
-    const float           step   = self->steps[0];
-    const float           bend   = self->bends[1][0];
-    const uint8_t         region = find_region(self);
+    const float           square = z * z;
     sums->innovations_n++;
     sums->sum += z;
-    sums->squares += z * z;
-    for (uint8_t i = 0U; i < 4U; i++) {
-        sums->lagged[i] += z * self->past[i];
-    }
+    sums->squares += square;
     if (self->edge_age_n < EDGE_EQUATIONS_N) {
         sums->edges_n++;
-        sums->edges += z * z;
+        sums->edges += square;
     }
-    sums->steps[0] += z * step;
-    sums->steps[1] += step * step;
-    self->shift[0] += z * step;
-    self->shift[1] += step * step;
-    sums->excitation += bend * bend;
-    sums->regions[region] += z;
-    sums->regions_n[region]++;
+    self->shift[0] += z * self->step[0];
+    self->shift[1] += self->step[0] * self->step[0];
+    if ((self->position_n % 2U) == 0U) {
+        sums->lagged += z * (self->past[0] + self->past[1] + self->past[2] + self->past[3]);
+    } else {
+        const uint32_t region = find_region(self);
+        sums->regions[region] += z;
+        sums->regions_n[region]++;
+    }
 }
 
 // ---------------------------------------------        SPECTRUM        ---------------------------------------------
 
-/// 2 cos(pi k / EST_FIT_LINES_N) for the first half of the lines; those of the second half are negative.
-static float resonance(const uint32_t line) {
-    static const float first[1U + (EST_FIT_LINES_N / 2U)] = {
-        2.0F,        1.9957178F,  1.9828897F,  1.9615706F,  1.9318517F,  1.8938603F,  1.8477591F,
-        1.7937455F,  1.7320508F,  1.6629392F,  1.5867067F,  1.5036796F,  1.4142136F,  1.3186916F,
-        1.2175229F,  1.1111405F,  1.0F,        0.88457738F, 0.76536686F, 0.64287893F, 0.51763809F,
-        0.39018064F, 0.26105238F, 0.13080626F, 0.0F,
-    };
-    const uint32_t half = EST_FIT_LINES_N / 2U;
-    return (line <= half) ? first[line] : -first[EST_FIT_LINES_N - line];
-}
+/// 2 cos(pi k / EST_FIT_LINES_N)
+static const float RESONANCE[EST_FIT_LINES_N] = {
+    2.0F,  1.9828897F,  1.9318517F,  1.8477591F,  1.7320508F,  1.5867067F,   1.4142136F,   1.2175229F,
+    1.0F,  0.76536686F, 0.51763809F, 0.26105238F, 0.0F,        -0.26105238F, -0.51763809F, -0.76536686F,
+    -1.0F, -1.2175229F, -1.4142136F, -1.5867067F, -1.7320508F, -1.8477591F,  -1.9318517F,  -1.9828897F,
+};
 
-/// Enter the last sum into some of the resonators (Goertzel's algorithm). `turn`: number of the sum, from 1; sample
-/// `slice` of EST_FIT_SUM_N.
-static void enter_lines(est_fit_watch_t* const self, const uint32_t turn, const uint32_t slice) {
-    const uint32_t first = slice * LINES_A_SAMPLE;
-    for (uint32_t line = first; line < (first + LINES_A_SAMPLE); line++) {
-        const float now    = (turn > 1U) ? self->now[line] : 0.0F;
-        const float before = (turn > 1U) ? self->before[line] : 0.0F;
-        self->now[line]    = self->entered + ((resonance(line) * now) - before);
+/// Enter the last sum into some of the resonators (Goertzel's algorithm). The first sum finds them at rest.
+static void enter_lines(est_fit_watch_t* const self, const bool is_first, const uint32_t slice) {
+    const uint32_t begin = slice * LINES_A_SAMPLE;
+    for (uint32_t line = begin; line < (begin + LINES_A_SAMPLE); line++) {
+        const float now    = is_first ? 0.0F : self->now[line];
+        const float before = is_first ? 0.0F : self->before[line];
+        self->now[line]    = self->entered + ((RESONANCE[line] * now) - before);
         self->before[line] = now;
     }
 }
 
-/// Replace some of the resonators by their powers.
+/// Replace some of the resonators by their powers. The mean is no line.
 static void evaluate_lines(est_fit_watch_t* const self, const uint32_t slice) {
-    const uint32_t first = slice * LINES_A_SAMPLE;
-    for (uint32_t line = first; line < (first + LINES_A_SAMPLE); line++) {
+    const uint32_t begin = slice * LINES_A_SAMPLE;
+    self->peak           = (slice == 0U) ? 1U : self->peak;
+    for (uint32_t line = begin; line < (begin + LINES_A_SAMPLE); line++) {
         const float now    = self->now[line];
         const float before = self->before[line];
-        self->now[line]    = (now * now) + (before * before) - ((resonance(line) * now) * before);
-        if (line <= 1U) {
-            self->peak = 1U;
-        } else if (self->now[line] > self->now[self->peak]) {
+        self->now[line]    = (now * now) + (before * before) - ((RESONANCE[line] * now) * before);
+        if ((line > 1U) && (self->now[line] > self->now[self->peak])) {
             self->peak = (uint8_t)line;
-        } else {
-            // the peak is another line
-        }
-    }
-}
-
-static void evaluate_regions(est_fit_watch_t* const self, const uint32_t slice) {
-    self->explained = (slice == 0U) ? 0.0F : self->explained;
-    for (uint32_t i = slice * REGIONS_A_SAMPLE; (i < ((slice + 1U) * REGIONS_A_SAMPLE)) && (i < EST_FIT_REGIONS_N);
-         i++) {
-        const uint16_t n = self->sums.regions_n[i];
-        if (n > 8U) {
-            self->explained += (self->sums.regions[i] * self->sums.regions[i]) / (float)n;
         }
     }
 }
@@ -235,13 +223,13 @@ static float power_at(const est_fit_watch_t* const self, const uint32_t line) {
 
 /// Mean power of the lines around the peak, without its neighbours.
 static float power_around(const est_fit_watch_t* const self) {
-    float   sum = 0.0F;
-    uint8_t n   = 0U;
+    float    sum = 0.0F;
+    uint32_t n   = 0U;
     for (uint32_t distance = 2U; distance <= 6U; distance++) {
         const uint32_t above = self->peak + distance;
         const uint32_t below = (self->peak > distance) ? (self->peak - distance) : 0U;
         sum += power_at(self, above) + power_at(self, below);
-        n = (uint8_t)(n + ((above < EST_FIT_LINES_N) ? 1U : 0U) + ((below > 0U) ? 1U : 0U));
+        n += ((above < EST_FIT_LINES_N) ? 1U : 0U) + ((below > 0U) ? 1U : 0U);
     }
     return sum / (float)n;
 }
@@ -250,130 +238,132 @@ static float power_around(const est_fit_watch_t* const self) {
 static float find_frequency(const est_fit_watch_t* const self) {
     const float above = power_at(self, self->peak + 1U);
     const float below = power_at(self, self->peak - 1U);
-    const float share = root(ratio((above > below) ? above : below, self->now[self->peak]));
+    const float share = root(ratio(larger(above, below), self->now[self->peak]));
     const float shift = share / (1.0F + share);
     return ((float)self->peak + ((above > below) ? shift : -shift)) / (float)EST_FIT_BLOCK_N;
 }
 
-// ---------------------------------------------        VERDICT         ---------------------------------------------
+// ---------------------------------------------         CAUSES         ---------------------------------------------
 
-/// Statistics of a block. Shares are of the energy of the innovations, or of the declared one if that is more: the
-/// structure of innovations that are smaller than promised does no harm. Private.
-typedef struct {
-    float drift;    ///< squared mean over its variance
-    float line;     ///< power of the largest line over its mean
-    float hum;      ///< share of that line
-    float steps;    ///< share that follows the steps of u
-    float shifts;   ///< share that a shift of each edge explains
-    float edges;    ///< variance next to edges over that elsewhere
-    float regions;  ///< share that the state of the plant explains
-    float colour;   ///< mean autocorrelation
-    float noise;    ///< variance over the declared one
-    float lack;     ///< reciprocal information on a change of the mass [1 / nats]
-} est_fit_evidence_t;
+static float declared_variance(const est_fit_watch_t* const self) {
+    return self->config->noise_estimated ? 0.0F : self->config->noise_variance;
+}
 
-static est_fit_evidence_t measure(const est_fit_watch_t* const self, const est_t* const estimator) {
-    const est_fit_sums_t* const sums     = &self->sums;
-    const float* const          lagged   = sums->lagged;
-    const float                 n        = (float)sums->innovations_n;
-    const float                 declared = self->config->noise_estimated ? 0.0F : self->config->noise_variance;
-    const float                 least    = declared * n;
-    const float                 energy   = (sums->squares > least) ? sums->squares : least;
-    const float                 edges_n  = (float)sums->edges_n;
-    const float                 apart    = (n - edges_n) * declared;
-    const float                 rest     = sums->squares - sums->edges;
-    float                       gain     = 0.0F;
+/// Energy of which the statistics are shares: that of the innovations, or the declared one if that is more. The
+/// structure of innovations that are smaller than promised does no harm.
+static float energy_of(const est_fit_watch_t* const self) {
+    return larger(self->sums.squares, declared_variance(self) * (float)self->sums.innovations_n);
+}
+
+/// Share of the energy that the state of the plant explains.
+static float regions_share(const est_fit_watch_t* const self) {
+    return ratio(2.0F * self->sums.explained, energy_of(self));
+}
+
+/// Mean autocorrelation at the lags 1 to 4.
+static float colour_of(const est_fit_watch_t* const self) { return ratio(0.5F * self->sums.lagged, energy_of(self)); }
+
+static float weigh_drift(const est_fit_watch_t* const self) {
+    return ratio(self->sums.sum * self->sums.sum, energy_of(self) * DRIFT);
+}
+
+/// Weigh a line that is neither a harmonic of the excitation nor the peak of a broad spectrum.
+static float weigh_hum(const est_fit_watch_t* const self) {
+    const float line     = ratio(self->now[self->peak], energy_of(self));
+    const float share    = ratio(line, 0.5F * (float)self->sums.innovations_n);
+    const bool  is_apart = (share > (REGIONS_HUM * regions_share(self))) && (share > (COLOUR_HUM * colour_of(self)));
+    return (is_apart && (self->now[self->peak] > (LINE_ABOVE * power_around(self)))) ? (line / LINE) : 0.0F;
+}
+
+/// Variance next to edges over that elsewhere.
+static float edge_ratio(const est_fit_watch_t* const self) {
+    const float edges_n  = (float)self->sums.edges_n;
+    const float others_n = (float)self->sums.innovations_n - edges_n;
+    const float others   = larger(self->sums.squares - self->sums.edges, others_n * declared_variance(self));
+    return ratio(self->sums.edges * others_n, edges_n * others);
+}
+
+/// Weigh edges whose effect varies. Only edges that are apart are judged.
+static float weigh_edges(const est_fit_watch_t* const self) {
+    const est_fit_sums_t* const sums = &self->sums;
+    if ((sums->edges_n < EDGES_MIN) || (((uint32_t)sums->edges_n * 4U) > sums->innovations_n)) {
+        return 0.0F;  // MISRA D4
+    }
+    const float energy  = energy_of(self);
+    const float regions = regions_share(self);
+    const float steps   = ratio(sums->product * sums->product, sums->steps * energy);
+    if (regions > REGIONS) {
+        return (steps > (STEPS_REGIONS * regions)) ? (steps / STEPS) : 0.0F;  // MISRA D4
+    }
+    return larger(steps / STEPS, larger(ratio(sums->shifts, energy * SHIFTS), edge_ratio(self) / EDGE_RATIO));
+}
+
+static float weigh_noise(const est_fit_watch_t* const self) {
+    const float n      = (float)self->sums.innovations_n;
+    const float excess = ratio(self->sums.squares, n * declared_variance(self) * NOISE);
+    return larger(colour_of(self) / COLOUR, (self->sums.innovations_n >= MANY_N) ? excess : 0.0F);
+}
+
+/// 1 + a1 + a2.
+static float stiffness(const est_t* const estimator) {
+    return 1.0F + est_theta(estimator, 0U) + est_theta(estimator, 1U);
+}
+
+/// Weigh the lack of information on a change of the mass. Its effect on y is that of the steps of u, whitened twice: up
+/// to a constant, the energy of the steps whitened once over 1 + a1 + a2. Below the limit, changes by 20 % are missed.
+static float weigh_lack(const est_fit_watch_t* const self, const est_t* const estimator) {
+    float gain = 0.0F;
     for (uint8_t i = 0U; i < self->config->nb; i++) {
         gain += est_theta(estimator, (uint8_t)(2U + i));
     }
-    return (est_fit_evidence_t){
-        .drift   = ratio(sums->sum * sums->sum, energy),
-        .line    = ratio(self->now[self->peak], energy),
-        .hum     = ratio(self->now[self->peak], 0.5F * n * energy),
-        .steps   = ratio(sums->steps[0] * sums->steps[0], sums->steps[1] * energy),
-        .shifts  = ratio(sums->shifts, energy),
-        .edges   = ratio(sums->edges * (n - edges_n), edges_n * ((rest > apart) ? rest : apart)),
-        .regions = ratio(self->explained, energy),
-        .colour  = 0.25F * ratio(lagged[0] + lagged[1] + lagged[2] + lagged[3], energy),
-        .noise   = ratio(sums->squares, least),
-        .lack    = ratio(energy, CHANGE_WEIGHT * gain * gain * sums->excitation),
-    };
+    const float information = ratio(2.0F * gain * gain * self->sums.steps, energy_of(self) * stiffness(estimator));
+    return ratio(INFORMATION, information);
 }
 
-static float larger(const float a, const float b) { return (a > b) ? a : b; }
-
-/// Evidence for a line that is neither a harmonic of the excitation nor the peak of a broad spectrum, over its limit.
-static float weigh_hum(const est_fit_watch_t* const self, const est_fit_evidence_t* const found) {
-    const bool stands_out = self->now[self->peak] > (LINE_ABOVE * power_around(self));
-    const bool is_apart = (found->hum > (REGIONS_HUM * found->regions)) && (found->hum > (COLOUR_HUM * found->colour));
-    return (stands_out && is_apart) ? (found->line / LINE) : 0.0F;
-}
-
-/// Evidence that the effect of the edges of u varies, over its limit. u must have edges that are apart.
-static float weigh_edges(const est_fit_watch_t* const self, const est_fit_evidence_t* const found) {
-    const uint32_t edges_n = self->sums.edges_n;
-    if ((edges_n < EDGES_MIN) || ((edges_n * 4U) > self->sums.innovations_n)) {
-        return 0.0F;  // MISRA D4
+/// Weigh one cause, in the order of est_misfit_kind_t. The model fits as far as it is concerned unless its strength
+/// exceeds 1.
+static est_misfit_t weigh_cause(const est_fit_watch_t* const self, const est_t* const estimator, const uint32_t cause) {
+    const bool slow = stiffness(estimator) < SLOW;
+    switch (cause) {
+    case 0U:
+        return (est_misfit_t){ .kind = EST_MISFIT_DRIFT, .strength = weigh_drift(self) };
+    case 1U:
+        return (est_misfit_t){ .kind = EST_MISFIT_HUM, .strength = weigh_hum(self) };
+    case 2U:
+        return (est_misfit_t){ .kind = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_EDGES, .strength = weigh_edges(self) };
+    case 3U:
+        return (est_misfit_t){ .kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NONLINEAR,
+                               .strength = regions_share(self) / REGIONS };
+    case 4U:
+        return (est_misfit_t){ .kind = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NOISE, .strength = weigh_noise(self) };
+    default:
+        return (est_misfit_t){ .kind = EST_MISFIT_EXCITATION, .strength = weigh_lack(self, estimator) };
     }
-    const float steps = (found->steps > (STEPS_REGIONS * found->regions)) ? (found->steps / STEPS) : 0.0F;
-    const float other = larger(found->shifts / SHIFTS, found->edges / EDGE_RATIO);
-    return larger(steps, (found->regions > REGIONS) ? 0.0F : other);
 }
 
-/// Evidence for noise other than declared, over its limit.
-static float weigh_noise(const est_fit_watch_t* const self, const est_fit_evidence_t* const found) {
-    const float excess = (self->sums.innovations_n >= MANY_N) ? (found->noise / NOISE) : 0.0F;
-    return larger(found->colour / COLOUR, excess);
+/// Begin the search for the cause. With alarms in quick succession the estimate never settles, and the innovations show
+/// nothing else.
+static void begin_search(est_fit_watch_t* const self) {
+    close_shift(self);
+    self->found = (est_misfit_t){ .kind = EST_MISFIT_NONE };
+    if (self->sums.alarms_n >= STORM_N) {
+        self->found.kind     = EST_MISFIT_NOISE;
+        self->found.strength = (float)self->sums.alarms_n / (float)STORM_N;
+    }
 }
 
-/// True iff the plant hardly moves between two samples.
-static bool is_slow(const est_t* const estimator) {
-    return (1.0F + est_theta(estimator, 0U) + est_theta(estimator, 1U)) < SLOW;
-}
-
-/// Name the cause of the misfit in a block with enough innovations: the first in the order of est_misfit_kind_t whose
-/// evidence exceeds its limit.
-static est_misfit_t name_cause(const est_fit_watch_t* const self, const est_t* const estimator) {
-    const est_fit_evidence_t found   = measure(self, estimator);
-    const bool               slow    = is_slow(estimator);
-    const est_misfit_t       order[] = {
-              { EST_MISFIT_DRIFT, found.drift / DRIFT, 0.0F },
-              { EST_MISFIT_HUM, weigh_hum(self, &found), find_frequency(self) },
-              { slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_EDGES, weigh_edges(self, &found), 0.0F },
-              { slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NONLINEAR, found.regions / REGIONS, 0.0F },
-              { slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NOISE, weigh_noise(self, &found), 0.0F },
-              { EST_MISFIT_EXCITATION, found.lack * INFORMATION, 0.0F },
-    };
-    for (uint8_t i = 0U; i < (sizeof(order) / sizeof(order[0])); i++) {
-        if (order[i].strength > 1.0F) {
-            return order[i];  // MISRA D4
+/// Test one cause, unless the block has too few innovations or an earlier cause is found.
+static void test_cause(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t cause) {
+    const bool enough = (self->sums.innovations_n >= ENOUGH_N) && (self->sums.squares > 0.0F);
+    if (enough && (self->found.kind == EST_MISFIT_NONE)) {
+        const est_misfit_t weighed = weigh_cause(self, estimator, cause);
+        if (weighed.strength > 1.0F) {
+            self->found = weighed;
         }
     }
-    return (est_misfit_t){ .kind = EST_MISFIT_NONE };
 }
 
-/// Judge a block. With alarms in quick succession the estimate never settles, and the innovations show nothing else.
-static est_misfit_t judge(const est_fit_watch_t* const self, const est_t* const estimator) {
-    const est_fit_sums_t* const sums = &self->sums;
-    if (sums->alarms_n >= STORM_N) {
-        return (est_misfit_t){ .kind     = EST_MISFIT_NOISE,
-                               .strength = (float)sums->alarms_n / (float)STORM_N };  // MISRA D4
-    }
-    if ((sums->innovations_n < ENOUGH_N) || !(sums->squares > 0.0F)) {
-        return (est_misfit_t){ .kind = EST_MISFIT_NONE };  // MISRA D4
-    }
-    return name_cause(self, estimator);
-}
-
-/// State what two blocks in succession agree on.
-static void conclude(est_fit_watch_t* const self, const est_misfit_t found) {
-    if (found.kind == self->candidate) {
-        self->misfit = found;
-    }
-    self->candidate = found.kind;
-}
-
-// ---------------------------------------------          API           ---------------------------------------------
+// ---------------------------------------------         BLOCKS         ---------------------------------------------
 
 static void begin_block(est_fit_watch_t* const self) {
     self->sums       = (est_fit_sums_t){ .sum = 0.0F };
@@ -383,54 +373,85 @@ static void begin_block(est_fit_watch_t* const self) {
     self->position_n = 0U;
 }
 
-/// Advance by one sample: enter the innovation into the spectrum, and do the share of the work that falls to it.
-static void advance(est_fit_watch_t* const self, const est_t* const estimator, const float z) {
-    const uint32_t slice = self->position_n % EST_FIT_SUM_N;
-    const uint32_t turn  = self->position_n / EST_FIT_SUM_N;
-    if (turn > 0U) {
-        enter_lines(self, turn, slice);
+/// State what two blocks in succession agree on.
+static void conclude(est_fit_watch_t* const self) {
+    if (self->found.kind == EST_MISFIT_HUM) {
+        self->found.frequency = find_frequency(self);
     }
-    if (self->position_n >= EST_FIT_BLOCK_N) {
-        evaluate_lines(self, slice);
-        evaluate_regions(self, slice);
+    if (self->found.kind == self->candidate) {
+        self->misfit = self->found;
     }
-    self->pending += z;
-    self->position_n++;
-    if (slice == (EST_FIT_SUM_N - 1U)) {
-        self->entered = self->pending;
-        self->pending = 0.0F;
-    }
-    if (self->position_n == (EST_FIT_BLOCK_N + EST_FIT_SUM_N)) {
-        conclude(self, judge(self, estimator));
-        begin_block(self);
+    self->candidate = self->found.kind;
+    begin_block(self);
+}
+
+static void evaluate_regions(est_fit_watch_t* const self, const uint32_t slice) {
+    est_fit_sums_t* const sums = &self->sums;
+    for (uint32_t i = slice * REGIONS_A_SAMPLE; i < ((slice + 1U) * REGIONS_A_SAMPLE); i++) {
+        if ((i < EST_FIT_REGIONS_N) && (sums->regions_n[i] >= REGION_MIN)) {
+            sums->explained += (sums->regions[i] * sums->regions[i]) / (float)sums->regions_n[i];
+        }
     }
 }
 
-/// Innovation for the statistics; 0 if there is none, or if it is excluded. After an alarm the estimate settles.
-static float take_innovation(est_fit_watch_t* const self, const est_step_t step) {
-    float z = 0.0F;
-    if ((step.status == EST_UPDATED) && (self->excluded_n > 0U)) {
-        self->excluded_n--;
-    } else if (step.status == EST_UPDATED) {
-        z = limit_innovation(self, step.innovation);
-        if ((self->settling_n == 0U) && (self->position_n < EST_FIT_BLOCK_N)) {
-            enter_innovation(self, z);
-        }
+/// Do the share of the evaluation that falls to one of the samples after the block.
+static void evaluate(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t slice) {
+    if (slice < CAUSES_FROM) {
+        evaluate_lines(self, slice);
+        evaluate_regions(self, slice);
+    } else if (slice == CAUSES_FROM) {
+        begin_search(self);
+    } else if (slice <= (CAUSES_FROM + CAUSES_N)) {
+        test_cause(self, estimator, slice - CAUSES_FROM - 1U);
     } else {
-        // no equation
+        conclude(self);
     }
-    if (step.status == EST_UPDATED) {
-        self->since_n = (uint16_t)(self->since_n + ((self->since_n < UINT16_MAX) ? 1U : 0U));
+}
+
+/// Do the share of the work that falls to one of the EST_FIT_SUM_N samples of a sum.
+static void advance(est_fit_watch_t* const self, const est_t* const estimator, const float z) {
+    const uint32_t slice = self->position_n % EST_FIT_SUM_N;
+    const uint32_t sum_n = self->position_n / EST_FIT_SUM_N;
+    self->position_n++;
+    self->pending += z;
+    if ((slice < CAUSES_FROM) && (sum_n > 0U)) {
+        enter_lines(self, sum_n == 1U, slice);
     }
-    for (uint8_t i = 3U; i > 0U; i--) {
-        self->past[i] = self->past[i - 1U];
+    if ((slice % 4U) == 3U) {
+        follow_level(self);
     }
-    self->past[0] = z;
+    if (slice == (EST_FIT_SUM_N - 1U)) {
+        self->entered = self->pending;
+        self->pending = 0.0F;
+        self->c[0]    = est_prefilter(estimator, 0U);
+        self->c[1]    = est_prefilter(estimator, 1U);
+    }
+    if (sum_n >= (EST_FIT_BLOCK_N / EST_FIT_SUM_N)) {
+        evaluate(self, estimator, slice);
+    }
+}
+
+// ---------------------------------------------          API           ---------------------------------------------
+
+/// Innovation for the statistics; 0 if there is none, or if it is excluded because the estimate settles.
+static float take_innovation(est_fit_watch_t* const self, const est_step_t step) {
+    if (step.status != EST_UPDATED) {
+        return 0.0F;  // MISRA D4
+    }
+    self->since_n = (uint16_t)(self->since_n + ((self->since_n < UINT16_MAX) ? 1U : 0U));
+    if (self->excluded_n > 0U) {
+        self->excluded_n--;
+        return 0.0F;  // MISRA D4
+    }
+    const float z = limit_innovation(self, step.innovation);
+    if ((self->settling_n == 0U) && (self->position_n < EST_FIT_BLOCK_N)) {
+        enter_innovation(self, z);
+    }
     return z;
 }
 
 static void enter_alarm(est_fit_watch_t* const self) {
-    const uint16_t half_n = self->since_n / 2U;
+    const uint32_t half_n = self->since_n / 2U;
     self->excluded_n      = (uint8_t)((half_n < EXCLUDED_MAX) ? half_n : EXCLUDED_MAX);
     self->since_n         = 0U;
     self->sums.alarms_n++;
@@ -438,8 +459,9 @@ static void enter_alarm(est_fit_watch_t* const self) {
 
 bool est_fit_init(est_fit_watch_t* const self, const est_config_t* const config) {
     EST_ASSERT((self != NULL) && (config != NULL));
-    *self           = (est_fit_watch_t){ .config = config, .settling_n = EST_FIT_SETTLING_N, .edge_age_n = UINT8_MAX };
-    self->deviation = MAGNITUDE_MIN;
+    *self            = (est_fit_watch_t){ .config = config, .settling_n = EST_FIT_SETTLING_N };
+    self->edge_age_n = EDGE_EQUATIONS_N;
+    self->deviation  = MAGNITUDE_MIN;
     return config->na == 2U;
 }
 
@@ -449,25 +471,25 @@ void est_fit_enter(est_fit_watch_t* const self,
                    const est_step_t       step) {
     EST_ASSERT((self != NULL) && (estimator != NULL));
     const bool known = (step.status == EST_UPDATED) || (step.status == EST_GATHERING);
-    if ((self->position_n % EST_FIT_SUM_N) == 0U) {
-        self->c[0] = est_prefilter(estimator, 0U);
-        self->c[1] = est_prefilter(estimator, 1U);
-    }
-    follow_input(self, known ? sample.u : self->u[0]);
+    follow_input(self, known ? sample.u : self->u);
     const float z = take_innovation(self, step);
+    for (uint8_t i = 3U; i > 0U; i--) {
+        self->past[i] = self->past[i - 1U];
+    }
+    self->past[0] = z;
     if (known) {
         follow_output(self, sample.y);
     }
     if (step.alarm) {
         enter_alarm(self);
     }
-    if (self->settling_n == 0U) {
-        advance(self, estimator, z);
-    } else if (step.status == EST_UPDATED) {
-        self->settling_n--;
-        begin_block(self);
-    } else {
-        // the estimate has not moved
+    advance(self, estimator, z);
+    if (self->settling_n > 0U) {
+        self->settling_n = (uint16_t)(self->settling_n - ((step.status == EST_UPDATED) ? 1U : 0U));
+        self->position_n %= EST_FIT_SUM_N;
+        if (self->settling_n == 0U) {
+            begin_block(self);
+        }
     }
 }
 

@@ -27,11 +27,11 @@ extern "C" {
 #define est_fit_init EST_NAME(est_fit_init)
 
 /// Number of samples whose sum is one sample of the spectrum. Lines up to 1 / (2 * EST_FIT_SUM_N) cycles per sample
-/// are found: 1,250 Hz at 20 kHz.
-#define EST_FIT_SUM_N 8U
+/// are found: 625 Hz at 20 kHz.
+#define EST_FIT_SUM_N 16U
 
 /// Number of lines in the spectrum; the first is the mean.
-#define EST_FIT_LINES_N 48U
+#define EST_FIT_LINES_N 24U
 
 /// Number of samples in a block. EST_FIT_SUM_N more are needed to evaluate it.
 #define EST_FIT_BLOCK_N (2U * EST_FIT_LINES_N * EST_FIT_SUM_N)
@@ -65,45 +65,45 @@ typedef struct {
 typedef struct {
     uint16_t innovations_n;
     uint16_t alarms_n;
-    uint16_t edges_n;     ///< innovations in `edges`
-    float    sum;         ///< of the innovations
-    float    squares;     ///< of their squares
-    float    lagged[4];   ///< of their products with those 1 .. 4 samples before
-    float    edges;       ///< of the squares of those that an edge of u affects directly
-    float    steps[2];    ///< product of the innovations with the whitened steps of u, and square of the latter
-    float    shifts;      ///< energy of the innovations explained by a shift of each edge
-    float    excitation;  ///< square of the effect of u on the innovations if the mass changes
-    float    regions[EST_FIT_REGIONS_N];
+    uint16_t edges_n;                     ///< innovations in `edges`
+    float    sum;                         ///< of the innovations
+    float    squares;                     ///< of their squares
+    float    lagged;                      ///< of every second one's product with the sum of the four before
+    float    edges;                       ///< of the squares of those that an edge of u affects directly
+    float    product;                     ///< of the innovations with the whitened steps of u, up to the last edge
+    float    steps;                       ///< of the squares of these steps, up to the last edge
+    float    shifts;                      ///< energy of the innovations explained by a shift of each edge
+    float    explained;                   ///< energy of every second innovation explained by the regions
+    float    regions[EST_FIT_REGIONS_N];  ///< of every second innovation
     uint16_t regions_n[EST_FIT_REGIONS_N];
 } est_fit_sums_t;
 
 /// State of the watch. The fields are private; read est_fit_misfit().
 typedef struct {
     const est_config_t* config;
-    uint16_t            settling_n;               ///< equations until the first block
-    uint16_t            position_n;               ///< samples of the block so far
-    uint16_t            since_n;                  ///< equations since the last alarm
-    uint8_t             excluded_n;               ///< equations after an alarm that are still excluded
-    uint8_t             edge_age_n;               ///< samples since the last edge of u
-    uint16_t            learnt_n;                 ///< samples in level and spread, limited
-    float               deviation;                ///< mean magnitude of the innovations [codes]
-    float               level;                    ///< mean of y [codes]
-    float               spread;                   ///< mean distance of y from its level [codes]
-    float               y[3];                     ///< newest first
-    float               u[2];                     ///< newest first
+    uint16_t            settling_n;  ///< equations until the first block
+    uint16_t            position_n;  ///< samples of the block so far
+    uint16_t            since_n;     ///< equations since the last alarm
+    uint16_t            learnt_n;    ///< samples in level and spread, limited
+    uint8_t             excluded_n;  ///< equations after an alarm that are still excluded
+    uint8_t             edge_age_n;  ///< samples since the last edge of u, limited
+    uint8_t             peak;        ///< line with the largest power
+    float               deviation;   ///< mean magnitude of the innovations [codes]
+    float               level;       ///< mean of y [codes]
+    float               spread;      ///< mean distance of y from its level [codes]
+    float               y[3];        ///< newest first
+    float               u;
     float               c[2];                     ///< prefilter
-    float               steps[2];                 ///< whitened steps of u, newest first
-    float               bends[2][2];              ///< second differences of u, whitened once and twice, newest first
+    float               step[2];                  ///< whitened steps of u, newest first
     float               past[4];                  ///< innovations, newest first; 0 where there is none
-    float               shift[2];                 ///< sums.steps since the last edge
-    float               pending;                  ///< sum of the innovations for the spectrum, incomplete
+    float               shift[2];                 ///< sums.product and sums.steps since the last edge
+    float               pending;                  ///< incomplete sum of the innovations for the spectrum
     float               entered;                  ///< sum of the innovations that the resonators take
     float               now[EST_FIT_LINES_N];     ///< resonators; during the evaluation the powers
     float               before[EST_FIT_LINES_N];  ///< resonators, one step before
-    uint8_t             peak;                     ///< line with the largest power
-    float               explained;                ///< energy explained by the regions
     est_fit_sums_t      sums;
-    est_misfit_kind_t   candidate;  ///< of the last block
+    est_misfit_t        found;      ///< in the block that is evaluated
+    est_misfit_kind_t   candidate;  ///< cause found in the last block
     est_misfit_t        misfit;
 } est_fit_watch_t;
 
