@@ -2,6 +2,7 @@
 /* Runs whole blocks of samples through the public header est.h, for the tests. */
 
 #include "est.h"
+#include "est_fit.h"
 #include "est_isolation.h"
 
 #include <stddef.h>
@@ -286,4 +287,62 @@ void driver_diagnose(size_t               n,
     found[0]                  = (double)now.change;
     found[1]                  = now.extent;
     found[2]                  = now.samples_n;
+}
+
+int driver_can_watch_fit(void) {
+    static est_fit_watch_t fit;
+    return est_fit_init(&fit, &config) ? 1 : 0;
+}
+
+/* t runs of n samples, each from the start. cause, (t, n): the cause of the misfit after each sample. found, (t, 2):
+   strength and frequency after the last one. */
+void driver_watch_fit(size_t               t,
+                      size_t               n,
+                      const double*        u,
+                      const double*        y,
+                      const unsigned char* valid,
+                      unsigned char*       cause,
+                      double*              found) {
+    static est_fit_watch_t fit;
+    for (size_t run = 0; run < t; run++) {
+        if (!est_init(&self, &config) || !est_fit_init(&fit, &config)) {
+            return;
+        }
+        for (size_t at = run * n; at < ((run + 1U) * n); at++) {
+            const est_sample_t sample = { .u = (float)u[at], .y = (float)y[at], .valid = valid[at] != 0 };
+            est_fit_enter(&fit, &self, sample, est_step(&self, sample));
+            cause[at] = (unsigned char)est_fit_misfit(&fit).kind;
+        }
+        found[2U * run]        = est_fit_misfit(&fit).strength;
+        found[(2U * run) + 1U] = est_fit_misfit(&fit).frequency;
+    }
+}
+
+/* The same for n steps that are given, the estimate being theta all the time. found, (2,). */
+void driver_judge_fit(size_t               n,
+                      const double*        theta,
+                      const double*        u,
+                      const double*        y,
+                      const double*        innovation,
+                      const unsigned char* status,
+                      const unsigned char* alarm,
+                      unsigned char*       cause,
+                      double*              found) {
+    static est_fit_watch_t fit;
+    if (!est_init(&self, &config) || !est_fit_init(&fit, &config)) {
+        return;
+    }
+    for (unsigned i = 0; i < est_theta_count(&self); i++) {
+        self.theta[i] = (float)theta[i];
+    }
+    for (size_t k = 0; k < n; k++) {
+        const est_sample_t sample = { .u = (float)u[k], .y = (float)y[k], .valid = status[k] != EST_MISSING };
+        const est_step_t   step   = { .status     = (est_status_t)status[k],
+                                      .alarm      = alarm[k] != 0,
+                                      .innovation = (float)innovation[k] };
+        est_fit_enter(&fit, &self, sample, step);
+        cause[k] = (unsigned char)est_fit_misfit(&fit).kind;
+    }
+    found[0] = est_fit_misfit(&fit).strength;
+    found[1] = est_fit_misfit(&fit).frequency;
 }

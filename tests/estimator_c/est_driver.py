@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 CORE = Path(__file__).parents[2] / "estimator_c" / "core"
 ISOLATION = CORE.parent / "isolation"
+FIT = CORE.parent / "fit"
 STRICT = [
     "-std=c99",
     "-Wall",
@@ -109,6 +110,25 @@ class Diagnosed:
     """Samples after the alarm that it rests on."""
 
 
+CAUSES = ("none", "drift", "hum", "edges", "nonlinear", "noise", "slow plant", "excitation")
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """What est_fit made of t runs of n samples."""
+
+    cause: NDArray[np.uint8]
+    """(t, n): index in CAUSES after each sample."""
+    strength: NDArray[np.float64]
+    """(t,) after the last sample; and the following likewise."""
+    frequency: NDArray[np.float64]
+    """Cycles per sample."""
+
+    def share(self, cause: str, sample: int = -1) -> float:
+        """Share of the runs with this cause after a sample."""
+        return float(np.mean(self.cause[:, sample] == CAUSES.index(cause)))
+
+
 class Estimator:
     """One estimator at a time, as in the driver."""
 
@@ -201,6 +221,43 @@ class Estimator:
         alarm, at, change, extent, refined, onset, least, most = found.T
         return Isolated(alarm, at, np.array(CHANGES)[change.astype(int)], extent, refined, onset, least, most)
 
+    def can_watch_fit(self) -> bool:
+        """est_fit_init() with the configuration of the last init()."""
+        return bool(self._c.driver_can_watch_fit())
+
+    def watch_fit(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> Watched:
+        """Whole runs (t, n), each from the start."""
+        signals = [np.ascontiguousarray(x, np.float64) for x in (u, y)]
+        runs, samples = signals[0].shape
+        valid_ = np.ascontiguousarray(np.ones((runs, samples)) if valid is None else valid, np.uint8)
+        cause, found = np.zeros((runs, samples), np.uint8), np.zeros((runs, 2))
+        pointers = (ctypes.c_void_p(x.ctypes.data) for x in (*signals, valid_, cause, found))
+        self._c.driver_watch_fit(ctypes.c_size_t(runs), ctypes.c_size_t(samples), *pointers)
+        return Watched(cause, *found.T)
+
+    def judge_fit(
+        self,
+        theta: ArrayLike,
+        u: ArrayLike,
+        y: ArrayLike,
+        innovation: ArrayLike,
+        status: ArrayLike | None = None,
+        alarms: ArrayLike = (),
+    ) -> Watched:
+        """What est_fit makes of one run of steps (n,) that are given; theta stays as it is.
+
+        :param alarms: samples with an alarm.
+        """
+        signals = [np.ascontiguousarray(x, np.float64) for x in (theta, u, y, innovation)]
+        n = len(signals[-1])
+        status_ = np.ascontiguousarray(np.zeros(n) if status is None else status, np.uint8)
+        alarm = np.zeros(n, np.uint8)
+        alarm[np.asarray(alarms, np.int64)] = 1
+        cause, found = np.zeros((1, n), np.uint8), np.zeros((1, 2))
+        pointers = (ctypes.c_void_p(x.ctypes.data) for x in (*signals, status_, alarm, cause, found))
+        self._c.driver_judge_fit(ctypes.c_size_t(n), *pointers)
+        return Watched(cause, *found.T)
+
     def diagnose(self, theta: ArrayLike, steps: NDArray[np.float64], slices: int = SLICES_N) -> Diagnosed:
         """What est_isolation makes of steps (n, 3) that are given: statistic, status, alarm; theta stays as it is.
 
@@ -222,7 +279,12 @@ def compile_driver(folder: Path, *options: str) -> Path:
     if not options and os.environ.get("EST_COVERAGE"):  # estimator_c/evidence/coverage.py counts there
         folder, options = Path(os.environ["EST_COVERAGE"]), COVERED
     library = folder / f"est_driver_{len(list(folder.iterdir()))}.so"
-    sources = [Path(__file__).with_name("est_driver.c"), *sorted(CORE.glob("*.c")), *sorted(ISOLATION.glob("*.c"))]
-    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, *options, "-shared", "-fPIC", f"-I{CORE}", f"-I{ISOLATION}"]
+    folders = (CORE, ISOLATION, FIT)
+    sources = [
+        Path(__file__).with_name("est_driver.c"),
+        *(path for each in folders for path in sorted(each.glob("*.c"))),
+    ]
+    include = [f"-I{each}" for each in folders]
+    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, *options, "-shared", "-fPIC", *include]
     subprocess.run([*command, "-o", str(library), *map(str, sources)], check=True)
     return library

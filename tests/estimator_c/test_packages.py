@@ -250,7 +250,7 @@ def kconfig_defaults() -> dict[str, str]:
 
 @pytest.mark.tools("cmake")
 def test_zephyr_module_builds_with_its_defaults(tmp_path: Path) -> None:
-    settings = {"EST": "y", "EST_ISOLATION": "y", **kconfig_defaults()}
+    settings = {"EST": "y", "EST_ISOLATION": "y", "EST_FIT": "y", **kconfig_defaults()}
     built = cmake(tmp_path, ZEPHYR, *(f"-DCONFIG_{name}={value}" for name, value in settings.items()))
     run(built / "program")
 

@@ -1,0 +1,133 @@
+"""Conditions under which the model of the estimator does not fit, and the cause that est_fit names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import signal
+
+from tests.estimator_c.est_driver import CAUSES
+from tests.estimator_c.plants import (
+    CODES,
+    DISPLACEMENT_RANGE_M,
+    FRONT,
+    NOISE_LSB,
+    PERIOD_S,
+    Excitation,
+    simulate,
+)
+
+__all__ = ["CAUSES", "CONDITIONS", "Condition", "whitened"]
+
+Array = NDArray[np.float64]
+
+SUBSTEPS = 4
+"""Of a sample, for the plant that is not linear."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What disturbs the front suspension, and what should be said of it."""
+
+    cause: str
+    """One of CAUSES."""
+    share: float = 0.95
+    """Least share of the runs with this cause after 2,000 samples."""
+    excitation: Excitation = Excitation(on_samples=False, drift_ppm=20.0)
+    disturb: Callable[[Array, np.random.Generator], Array] = lambda y, _: y
+    """Codes of displacement (t, n) to disturbed ones."""
+    hardening: float = 0.0
+    """Part of the force of the spring that grows with the third power, at the deflection of the largest force."""
+
+    def play(self, trials: int, samples: int, seed: int) -> tuple[Array, Array]:
+        """(t, n) codes of force and of displacement."""
+        rng = np.random.default_rng([seed, 2])
+        if self.hardening:
+            u, y = _hardened(self.hardening, self.excitation, trials, samples, rng)
+        else:
+            played = simulate((FRONT, FRONT), np.full(trials, samples), self.excitation, samples, seed)
+            u, y = played.u, played.y
+        return u, np.round(self.disturb(y, rng))
+
+
+def whitened(x: ArrayLike, c: tuple[float, float]) -> Array:
+    """x filtered by 1 / (1 + c1 z^-1 + c2 z^-2)."""
+    return np.asarray(signal.lfilter([1.0], [1.0, *c], x))
+
+
+def _hardened(
+    part: float, excitation: Excitation, trials: int, samples: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Codes of a plant with a cubic spring, by Runge and Kutta's method; edges come at sampling instants."""
+    edges = np.floor((np.arange(samples)[:, None] - excitation.first_edges(rng, trials)) / excitation.half_period_n)
+    force = (np.floor(edges) % 2.0) * FRONT.force_range_n
+    mass, damping, stiffness = FRONT.mass_kg, FRONT.damping_n_s_per_m, FRONT.stiffness_n_per_m
+    most = FRONT.force_range_n / stiffness
+    step = PERIOD_S / SUBSTEPS
+
+    def slope(state: Array, pushed: Array) -> Array:
+        x, v = state
+        spring = stiffness * x * (1.0 - part + part * (x / most) ** 2)
+        return np.array([v, (pushed - damping * v - spring) / mass])
+
+    state, out = np.zeros((2, trials)), np.empty((samples, trials))
+    for k in range(samples):
+        out[k] = state[0]
+        for _ in range(SUBSTEPS):
+            first = slope(state, force[k])
+            second = slope(state + 0.5 * step * first, force[k])
+            third = slope(state + 0.5 * step * second, force[k])
+            fourth = slope(state + step * third, force[k])
+            state = state + step / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+    codes = [force.T * (CODES / FRONT.force_range_n), out.T * (CODES / DISPLACEMENT_RANGE_M)]
+    u, y = (np.round(each + rng.normal(0.0, NOISE_LSB, each.shape)) for each in codes)
+    return u, y
+
+
+def _noise(codes: float) -> Callable[[Array, np.random.Generator], Array]:
+    """White noise of which ``codes`` is the standard deviation with that of the plant's own."""
+    added = np.sqrt(codes**2 - NOISE_LSB**2)
+    return lambda y, rng: y + rng.normal(0.0, added, y.shape)
+
+
+def _hum(codes: float, cycles: float) -> Callable[[Array, np.random.Generator], Array]:
+    """A sine of this amplitude and of ``cycles`` per sample, at a phase of its own in each trial."""
+
+    def disturb(y: Array, rng: np.random.Generator) -> Array:
+        phase = rng.uniform(0.0, 2.0 * np.pi, (len(y), 1))
+        return y + codes * np.sin(2.0 * np.pi * cycles * np.arange(y.shape[1]) + phase)
+
+    return disturb
+
+
+def _drift(codes: float) -> Callable[[Array, np.random.Generator], Array]:
+    return lambda y, _: y + codes * np.arange(y.shape[1])
+
+
+def _coloured(y: Array, rng: np.random.Generator) -> Array:
+    """Autoregressive noise with the pole 0.9 and the variance of the plant's own noise, beside which it comes."""
+    return y + signal.lfilter([np.sqrt(1.0 - 0.81)], [1.0, -0.9], rng.normal(0.0, NOISE_LSB, y.shape), axis=1)
+
+
+_FREE = Excitation(on_samples=False, drift_ppm=20.0)
+
+CONDITIONS = {
+    "noise, 2 LSB": Condition("noise", disturb=_noise(2.0)),
+    "noise, 4 LSB": Condition("noise", disturb=_noise(4.0)),
+    "noise, autoregressive 0.9": Condition("noise", disturb=_coloured),
+    "hum, 1 LSB, 50 Hz": Condition("hum", disturb=_hum(1.0, 50.0 / 20e3)),
+    "hum, 1 LSB, 150 Hz": Condition("hum", disturb=_hum(1.0, 150.0 / 20e3)),
+    "hum, 3 LSB, 50 Hz": Condition("hum", disturb=_hum(3.0, 50.0 / 20e3)),
+    "hum, 10 LSB, 50 Hz": Condition("hum", share=0.8, disturb=_hum(10.0, 50.0 / 20e3)),
+    "drift, 0.01 code a sample": Condition("drift", disturb=_drift(0.01)),
+    "drift, 0.1 code a sample": Condition("drift", disturb=_drift(0.1)),
+    "spring, cubic 0.3 %": Condition("nonlinear", hardening=0.003),
+    "spring, cubic 1 %": Condition("nonlinear", hardening=0.01),
+    "spring, cubic 5 %": Condition("nonlinear", hardening=0.05),
+    "edges, 190 Hz": Condition("edges", excitation=replace(_FREE, half_period_n=20e3 / 380.0)),
+    "edges, 100 ppm": Condition("edges", share=0.8, excitation=replace(_FREE, drift_ppm=100.0)),
+    "excitation, 3 %": Condition("excitation", excitation=replace(_FREE, part_of_range=0.03)),
+}
