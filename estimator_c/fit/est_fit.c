@@ -58,6 +58,7 @@
 #define COLOUR 0.22F
 #define NOISE 2.5F
 #define INFORMATION 600.0F
+#define INFORMATION_MIN 1.0F
 
 /// A line is hum if it exceeds the lines around by LINE_ABOVE, and its share those of the regions and of the colour by
 /// these factors: the response of a plant that is not linear, and noise that is not white, have peaks too.
@@ -65,8 +66,8 @@
 #define REGIONS_HUM 1.2F
 #define COLOUR_HUM 0.4F
 
-/// Edges that drift explain all that the state of the plant explains, and those of a plant that is not linear less than
-/// this part.
+/// Edges that drift explain all that the state of the plant explains, and edges that jump more. With a plant that is
+/// not linear, the steps of u explain less than this part.
 #define STEPS_REGIONS 0.7F
 
 /// Equations next to edges in a block below which their variance is not judged.
@@ -77,14 +78,21 @@
 
 static float magnitude(const float x) { return (x < 0.0F) ? -x : x; }
 
-static float smaller(const float a, const float b) { return (a < b) ? a : b; }
+static float minimum(const float a, const float b) { return (a < b) ? a : b; }
 
-static float larger(const float a, const float b) { return (a > b) ? a : b; }
+static float maximum(const float a, const float b) { return (a > b) ? a : b; }
 
-static float ratio(const float a, const float b) { return (b > 0.0F) ? (a / b) : 0.0F; }
+/// a / b; 0 unless b is positive.
+static float quotient(const float a, const float b) {
+    float out = 0.0F;
+    if (b > 0.0F) {
+        out = a / b;
+    }
+    return out;
+}
 
 /// Square root of 0 <= x <= 1 to 1 %, by Newton's method from above.
-static float root(const float x) {
+static float square_root(const float x) {
     float out = 0.5F * (1.0F + x);
     for (uint8_t i = 0U; i < 5U; i++) {
         out = 0.5F * (out + (x / out));
@@ -98,7 +106,7 @@ static float root(const float x) {
 static void close_shift(est_fit_watch_t* const self) {
     self->sums.product += self->shift[0];
     self->sums.steps += self->shift[1];
-    self->sums.shifts += ratio(self->shift[0] * self->shift[0], self->shift[1]);
+    self->sums.shifts += quotient(self->shift[0] * self->shift[0], self->shift[1]);
     self->shift[0] = 0.0F;
     self->shift[1] = 0.0F;
 }
@@ -141,22 +149,21 @@ static uint32_t find_region(const est_fit_watch_t* const self) {
     const float moved = self->y[0] - self->y[2];
     const float bound = LEVEL_BOUND * self->spread;
     const float moves = MOVES * self->spread;
-    uint32_t    stage = (level < bound) ? 2U : 3U;
-    uint32_t    trend = (moved < moves) ? 1U : 2U;
-    if (level < 0.0F) {
-        stage = (level < -bound) ? 0U : 1U;
-    }
-    if (moved < -moves) {
-        trend = 0U;
-    }
+    uint32_t    stage = 0U;
+    uint32_t    trend = 0U;
+    stage += (level < -bound) ? 0U : 1U;
+    stage += (level < 0.0F) ? 0U : 1U;
+    stage += (level < bound) ? 0U : 1U;
+    trend += (moved < -moves) ? 0U : 1U;
+    trend += (moved < moves) ? 0U : 1U;
     return (3U * stage) + trend;
 }
 
 /// Limit an innovation, and follow the magnitude of the innovations.
 static float limit_innovation(est_fit_watch_t* const self, const float innovation) {
-    const float size   = smaller(magnitude(innovation), CLIP * self->deviation);
+    const float size   = minimum(magnitude(innovation), CLIP * self->deviation);
     const float memory = (self->settling_n > 0U) ? MAGNITUDE_SETTLING_N : MAGNITUDE_N;
-    self->deviation    = larger(self->deviation + ((size - self->deviation) / memory), MAGNITUDE_MIN);
+    self->deviation    = maximum(self->deviation + ((size - self->deviation) / memory), MAGNITUDE_MIN);
     return (innovation < 0.0F) ? -size : size;
 }
 
@@ -221,6 +228,11 @@ static float power_at(const est_fit_watch_t* const self, const uint32_t line) {
     return ((line >= 1U) && (line < EST_FIT_LINES_N)) ? self->now[line] : 0.0F;
 }
 
+/// Power of the larger neighbour of the peak.
+static float neighbour_power(const est_fit_watch_t* const self) {
+    return maximum(power_at(self, self->peak + 1U), power_at(self, self->peak - 1U));
+}
+
 /// Mean power of the lines around the peak, without its neighbours.
 static float power_around(const est_fit_watch_t* const self) {
     float    sum = 0.0F;
@@ -229,18 +241,19 @@ static float power_around(const est_fit_watch_t* const self) {
         const uint32_t above = self->peak + distance;
         const uint32_t below = (self->peak > distance) ? (self->peak - distance) : 0U;
         sum += power_at(self, above) + power_at(self, below);
-        n += ((above < EST_FIT_LINES_N) ? 1U : 0U) + ((below > 0U) ? 1U : 0U);
+        n += (above < EST_FIT_LINES_N) ? 1U : 0U;
+        n += (below > 0U) ? 1U : 0U;
     }
     return sum / (float)n;
 }
 
 /// Frequency of the line at the peak, from the powers of the peak and its larger neighbour [cycles per sample].
 static float find_frequency(const est_fit_watch_t* const self) {
-    const float above = power_at(self, self->peak + 1U);
-    const float below = power_at(self, self->peak - 1U);
-    const float share = root(ratio(larger(above, below), self->now[self->peak]));
-    const float shift = share / (1.0F + share);
-    return ((float)self->peak + ((above > below) ? shift : -shift)) / (float)EST_FIT_BLOCK_N;
+    const bool  upwards = power_at(self, self->peak + 1U) > power_at(self, self->peak - 1U);
+    const float share   = square_root(quotient(neighbour_power(self), self->now[self->peak]));
+    const float shift   = share / (1.0F + share);
+    const float line    = (float)self->peak;
+    return (upwards ? (line + shift) : (line - shift)) / (float)EST_FIT_BLOCK_N;
 }
 
 // ---------------------------------------------         CAUSES         ---------------------------------------------
@@ -252,35 +265,39 @@ static float declared_variance(const est_fit_watch_t* const self) {
 /// Energy of which the statistics are shares: that of the innovations, or the declared one if that is more. The
 /// structure of innovations that are smaller than promised does no harm.
 static float energy_of(const est_fit_watch_t* const self) {
-    return larger(self->sums.squares, declared_variance(self) * (float)self->sums.innovations_n);
+    return maximum(self->sums.squares, declared_variance(self) * (float)self->sums.innovations_n);
 }
 
 /// Share of the energy that the state of the plant explains.
 static float regions_share(const est_fit_watch_t* const self) {
-    return ratio(2.0F * self->sums.explained, energy_of(self));
+    return quotient(2.0F * self->sums.explained, energy_of(self));
 }
 
 /// Mean autocorrelation at the lags 1 to 4.
-static float colour_of(const est_fit_watch_t* const self) { return ratio(0.5F * self->sums.lagged, energy_of(self)); }
+static float colour_of(const est_fit_watch_t* const self) {
+    return quotient(0.5F * self->sums.lagged, energy_of(self));
+}
 
 static float weigh_drift(const est_fit_watch_t* const self) {
-    return ratio(self->sums.sum * self->sums.sum, energy_of(self) * DRIFT);
+    return quotient(self->sums.sum * self->sums.sum, energy_of(self) * DRIFT);
 }
 
 /// Weigh a line that is neither a harmonic of the excitation nor the peak of a broad spectrum.
 static float weigh_hum(const est_fit_watch_t* const self) {
-    const float line     = ratio(self->now[self->peak], energy_of(self));
-    const float share    = ratio(line, 0.5F * (float)self->sums.innovations_n);
-    const bool  is_apart = (share > (REGIONS_HUM * regions_share(self))) && (share > (COLOUR_HUM * colour_of(self)));
-    return (is_apart && (self->now[self->peak] > (LINE_ABOVE * power_around(self)))) ? (line / LINE) : 0.0F;
+    const float power      = self->now[self->peak] + neighbour_power(self);  // it may lie between two lines
+    const float line       = quotient(power, energy_of(self));
+    const float share      = quotient(line, 0.5F * (float)self->sums.innovations_n);
+    const bool  is_apart   = (share > (REGIONS_HUM * regions_share(self))) && (share > (COLOUR_HUM * colour_of(self)));
+    const bool  stands_out = self->now[self->peak] > (LINE_ABOVE * power_around(self));
+    return (is_apart && stands_out) ? quotient(line, LINE) : 0.0F;
 }
 
 /// Variance next to edges over that elsewhere.
 static float edge_ratio(const est_fit_watch_t* const self) {
     const float edges_n  = (float)self->sums.edges_n;
     const float others_n = (float)self->sums.innovations_n - edges_n;
-    const float others   = larger(self->sums.squares - self->sums.edges, others_n * declared_variance(self));
-    return ratio(self->sums.edges * others_n, edges_n * others);
+    const float others   = maximum(self->sums.squares - self->sums.edges, others_n * declared_variance(self));
+    return quotient(self->sums.edges * others_n, edges_n * others);
 }
 
 /// Weigh edges whose effect varies. Only edges that are apart are judged.
@@ -291,17 +308,18 @@ static float weigh_edges(const est_fit_watch_t* const self) {
     }
     const float energy  = energy_of(self);
     const float regions = regions_share(self);
-    const float steps   = ratio(sums->product * sums->product, sums->steps * energy);
-    if (regions > REGIONS) {
-        return (steps > (STEPS_REGIONS * regions)) ? (steps / STEPS) : 0.0F;  // MISRA D4
-    }
-    return larger(steps / STEPS, larger(ratio(sums->shifts, energy * SHIFTS), edge_ratio(self) / EDGE_RATIO));
+    const float steps   = quotient(sums->product * sums->product, sums->steps * energy);
+    const float shifts  = quotient(sums->shifts, energy);
+    const float next    = (regions > REGIONS) ? 0.0F : quotient(edge_ratio(self), EDGE_RATIO);
+    const float drifts  = (steps > (STEPS_REGIONS * regions)) ? quotient(steps, STEPS) : 0.0F;
+    const float jumps   = (shifts > regions) ? quotient(shifts, SHIFTS) : 0.0F;
+    return maximum(next, maximum(drifts, jumps));
 }
 
 static float weigh_noise(const est_fit_watch_t* const self) {
     const float n      = (float)self->sums.innovations_n;
-    const float excess = ratio(self->sums.squares, n * declared_variance(self) * NOISE);
-    return larger(colour_of(self) / COLOUR, (self->sums.innovations_n >= MANY_N) ? excess : 0.0F);
+    const float excess = quotient(self->sums.squares, n * declared_variance(self) * NOISE);
+    return maximum(colour_of(self) / COLOUR, (self->sums.innovations_n >= MANY_N) ? excess : 0.0F);
 }
 
 /// 1 + a1 + a2.
@@ -316,29 +334,42 @@ static float weigh_lack(const est_fit_watch_t* const self, const est_t* const es
     for (uint8_t i = 0U; i < self->config->nb; i++) {
         gain += est_theta(estimator, (uint8_t)(2U + i));
     }
-    const float information = ratio(2.0F * gain * gain * self->sums.steps, energy_of(self) * stiffness(estimator));
-    return ratio(INFORMATION, information);
+    const float information = quotient(2.0F * gain * gain * self->sums.steps, energy_of(self) * stiffness(estimator));
+    return INFORMATION / maximum(information, INFORMATION_MIN);
 }
 
 /// Weigh one cause, in the order of est_misfit_kind_t. The model fits as far as it is concerned unless its strength
 /// exceeds 1.
 static est_misfit_t weigh_cause(const est_fit_watch_t* const self, const est_t* const estimator, const uint32_t cause) {
-    const bool slow = stiffness(estimator) < SLOW;
+    const bool   slow = stiffness(estimator) < SLOW;
+    est_misfit_t out  = { .kind = EST_MISFIT_NONE, .strength = 0.0F, .frequency = 0.0F };
     switch (cause) {
     case 0U:
-        return (est_misfit_t){ .kind = EST_MISFIT_DRIFT, .strength = weigh_drift(self) };
+        out.kind     = EST_MISFIT_DRIFT;
+        out.strength = weigh_drift(self);
+        break;
     case 1U:
-        return (est_misfit_t){ .kind = EST_MISFIT_HUM, .strength = weigh_hum(self) };
+        out.kind     = EST_MISFIT_HUM;
+        out.strength = weigh_hum(self);
+        break;
     case 2U:
-        return (est_misfit_t){ .kind = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_EDGES, .strength = weigh_edges(self) };
+        out.kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_EDGES;
+        out.strength = weigh_edges(self);
+        break;
     case 3U:
-        return (est_misfit_t){ .kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NONLINEAR,
-                               .strength = regions_share(self) / REGIONS };
+        out.kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NONLINEAR;
+        out.strength = regions_share(self) / REGIONS;
+        break;
     case 4U:
-        return (est_misfit_t){ .kind = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NOISE, .strength = weigh_noise(self) };
+        out.kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NOISE;
+        out.strength = weigh_noise(self);
+        break;
     default:
-        return (est_misfit_t){ .kind = EST_MISFIT_EXCITATION, .strength = weigh_lack(self, estimator) };
+        out.kind     = EST_MISFIT_EXCITATION;
+        out.strength = weigh_lack(self, estimator);
+        break;
     }
+    return out;
 }
 
 /// Begin the search for the cause. With alarms in quick succession the estimate never settles, and the innovations show

@@ -107,17 +107,11 @@ def _drift(codes: float) -> Callable[[Array, np.random.Generator], Array]:
     return lambda y, _: y + codes * np.arange(y.shape[1])
 
 
-def _coloured(y: Array, rng: np.random.Generator) -> Array:
-    """Autoregressive noise with the pole 0.9 and the variance of the plant's own noise, beside which it comes."""
-    return y + signal.lfilter([np.sqrt(1.0 - 0.81)], [1.0, -0.9], rng.normal(0.0, NOISE_LSB, y.shape), axis=1)
-
-
 _FREE = Excitation(on_samples=False, drift_ppm=20.0)
 
 CONDITIONS = {
     "noise, 2 LSB": Condition("noise", disturb=_noise(2.0)),
     "noise, 4 LSB": Condition("noise", disturb=_noise(4.0)),
-    "noise, autoregressive 0.9": Condition("noise", disturb=_coloured),
     "hum, 1 LSB, 50 Hz": Condition("hum", disturb=_hum(1.0, 50.0 / 20e3)),
     "hum, 1 LSB, 150 Hz": Condition("hum", disturb=_hum(1.0, 150.0 / 20e3)),
     "hum, 3 LSB, 50 Hz": Condition("hum", disturb=_hum(3.0, 50.0 / 20e3)),
