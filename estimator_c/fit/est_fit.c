@@ -184,8 +184,8 @@ static void enter_innovation(est_fit_watch_t* const self, const float z) {
         sums->lagged += z * (self->past[0] + self->past[1] + self->past[2] + self->past[3]);
     } else {
         const uint32_t region = find_region(self);
-        sums->regions[region] += z;
-        sums->regions_n[region]++;
+        self->regions[region] += z;
+        self->regions_n[region]++;
     }
 }
 
@@ -253,7 +253,8 @@ static float find_frequency(const est_fit_watch_t* const self) {
     const float share   = square_root(quotient(neighbour_power(self), self->now[self->peak]));
     const float shift   = share / (1.0F + share);
     const float line    = (float)self->peak;
-    return (upwards ? (line + shift) : (line - shift)) / (float)EST_FIT_BLOCK_N;
+    const float block_n = 2.0F * (float)EST_FIT_LINES_N * (float)EST_FIT_SUM_N;
+    return (upwards ? (line + shift) : (line - shift)) / block_n;
 }
 
 // ---------------------------------------------         CAUSES         ---------------------------------------------
@@ -416,12 +417,15 @@ static void conclude(est_fit_watch_t* const self) {
     begin_block(self);
 }
 
+/// Evaluate some of the regions, and clear them for the next block.
 static void evaluate_regions(est_fit_watch_t* const self, const uint32_t slice) {
-    est_fit_sums_t* const sums = &self->sums;
-    for (uint32_t i = slice * REGIONS_A_SAMPLE; i < ((slice + 1U) * REGIONS_A_SAMPLE); i++) {
-        if ((i < EST_FIT_REGIONS_N) && (sums->regions_n[i] >= REGION_MIN)) {
-            sums->explained += (sums->regions[i] * sums->regions[i]) / (float)sums->regions_n[i];
+    const uint32_t begin = slice * REGIONS_A_SAMPLE;
+    for (uint32_t i = begin; (i < (begin + REGIONS_A_SAMPLE)) && (i < EST_FIT_REGIONS_N); i++) {
+        if (self->regions_n[i] >= REGION_MIN) {
+            self->sums.explained += (self->regions[i] * self->regions[i]) / (float)self->regions_n[i];
         }
+        self->regions[i]   = 0.0F;
+        self->regions_n[i] = 0U;
     }
 }
 

@@ -65,17 +65,15 @@ typedef struct {
 typedef struct {
     uint16_t innovations_n;
     uint16_t alarms_n;
-    uint16_t edges_n;                     ///< innovations in `edges`
-    float    sum;                         ///< of the innovations
-    float    squares;                     ///< of their squares
-    float    lagged;                      ///< of every second one's product with the sum of the four before
-    float    edges;                       ///< of the squares of those that an edge of u affects directly
-    float    product;                     ///< of the innovations with the whitened steps of u, up to the last edge
-    float    steps;                       ///< of the squares of these steps, up to the last edge
-    float    shifts;                      ///< energy of the innovations explained by a shift of each edge
-    float    explained;                   ///< energy of every second innovation explained by the regions
-    float    regions[EST_FIT_REGIONS_N];  ///< of every second innovation
-    uint16_t regions_n[EST_FIT_REGIONS_N];
+    uint16_t edges_n;    ///< innovations in `edges`
+    float    sum;        ///< of the innovations
+    float    squares;    ///< of their squares
+    float    lagged;     ///< of every second one's product with the sum of the four before
+    float    edges;      ///< of the squares of those that an edge of u affects directly
+    float    product;    ///< of the innovations with the whitened steps of u, up to the last edge
+    float    steps;      ///< of the squares of these steps, up to the last edge
+    float    shifts;     ///< energy of the innovations explained by a shift of each edge
+    float    explained;  ///< energy of every second innovation explained by the regions
 } est_fit_sums_t;
 
 /// State of the watch. The fields are private; read est_fit_misfit().
@@ -93,14 +91,16 @@ typedef struct {
     float               spread;      ///< mean distance of y from its level [codes]
     float               y[3];        ///< newest first
     float               u;
-    float               c[2];                     ///< prefilter
-    float               step[2];                  ///< whitened steps of u, newest first
-    float               past[4];                  ///< innovations, newest first; 0 where there is none
-    float               shift[2];                 ///< sums.product and sums.steps since the last edge
-    float               pending;                  ///< incomplete sum of the innovations for the spectrum
-    float               entered;                  ///< sum of the innovations that the resonators take
-    float               now[EST_FIT_LINES_N];     ///< resonators; during the evaluation the powers
-    float               before[EST_FIT_LINES_N];  ///< resonators, one step before
+    float               c[2];                          ///< prefilter
+    float               step[2];                       ///< whitened steps of u, newest first
+    float               past[4];                       ///< innovations, newest first; 0 where there is none
+    float               shift[2];                      ///< sums.product and sums.steps since the last edge
+    float               pending;                       ///< incomplete sum of the innovations for the spectrum
+    float               entered;                       ///< sum of the innovations that the resonators take
+    float               now[EST_FIT_LINES_N];          ///< resonators; during the evaluation the powers
+    float               before[EST_FIT_LINES_N];       ///< resonators, one step before
+    float               regions[EST_FIT_REGIONS_N];    ///< sums of every second innovation, by region
+    uint16_t            regions_n[EST_FIT_REGIONS_N];  ///< innovations in each of them
     est_fit_sums_t      sums;
     est_misfit_t        found;      ///< in the block that is evaluated
     est_misfit_kind_t   candidate;  ///< cause found in the last block
