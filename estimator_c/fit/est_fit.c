@@ -253,7 +253,7 @@ static float find_frequency(const est_fit_watch_t* const self) {
     const float share   = square_root(quotient(neighbour_power(self), self->now[self->peak]));
     const float shift   = share / (1.0F + share);
     const float line    = (float)self->peak;
-    const float block_n = 2.0F * (float)EST_FIT_LINES_N * (float)EST_FIT_SUM_N;
+    const float block_n = (2.0F * (float)EST_FIT_LINES_N) * (float)EST_FIT_SUM_N;
     return (upwards ? (line + shift) : (line - shift)) / block_n;
 }
 

@@ -20,6 +20,7 @@ from analogrig.catalogue import (
     RUN_SHIFT,
     RUNS,
     Alarm,
+    Cause,
     Change,
     Command,
     Configure,
@@ -36,6 +37,7 @@ from analogrig.catalogue import (
     Identify,
     Key,
     Message,
+    Misfit,
     Result,
     Sample,
     SampleBlock,
@@ -48,7 +50,7 @@ from analogrig.catalogue import (
 from analogrig.devices.library import LIBRARY, MemoryWire
 from analogrig.links import frame
 from analogrig.links.link import FramedLink
-from tests.estimator_c import isolation
+from tests.estimator_c import isolation, misfits
 from tests.estimator_c.est_driver import Estimator
 from tests.estimator_c.performance import FULL
 from tests.estimator_c.plants import FRONT, simulate
@@ -296,6 +298,64 @@ def test_diagnosis_leaves_the_estimates_alone(idle: Device, device: Device) -> N
     assert np.array_equal(theta_of(with_it), theta_of(without))
 
 
+# ---- misfits
+
+
+def hum_codes(fits_from: int, samples: int) -> tuple[list[int], list[int]]:
+    """A plant whose displacement has hum until the sample ``fits_from``."""
+    (u, *_), (disturbed, *_) = misfits.CONDITIONS["hum, 3 LSB, 50 Hz"].play(1, samples, seed=2)
+    (_, *_), (undisturbed, *_) = misfits.Condition("none").play(1, samples, seed=2)
+    y = np.where(np.arange(samples) < fits_from, disturbed, undisturbed)
+    return [np.clip(np.round(codes), 0, 65535).astype(int).tolist() for codes in (u, y)]  # type: ignore[return-value]
+
+
+def misfits_of(device: Device, u: list[int], y: list[int]) -> list[Misfit]:
+    """Messages about misfits, each of which must come before the Stepped of its sample."""
+    out = []
+    for k in range(len(u)):
+        answers = device.sample(k, u[k], y[k])
+        told = of(Misfit, answers)
+        assert all(each.sample_index == k for each in told)
+        assert isinstance(answers[-1], Stepped)
+        out += told
+    return out
+
+
+def test_cause_of_a_misfit_is_told_when_it_is_found_and_when_it_is_gone(device: Device) -> None:
+    found, gone = misfits_of(device, *hum_codes(2500, 5000))
+    assert found.cause == Cause.HUM
+    assert found.sample_index < 2000
+    assert found.frequency / 65536 == pytest.approx(50.0 / 20e3, rel=0.15)
+    assert found.strength > 256
+    assert (gone.cause, gone.frequency, gone.strength) == (Cause.NONE, 0, 0)
+    assert 2500 < gone.sample_index < 5000
+
+
+def test_start_begins_the_watch_anew(device: Device) -> None:
+    u, y = hum_codes(2000, 2000)
+    before = misfits_of(device, u, y)
+    device.control(Command.STOP)
+    device.control(Command.START)
+    assert [each._replace(seq=0) for each in misfits_of(device, u, y)] == [each._replace(seq=0) for each in before]
+
+
+@pytest.mark.parametrize("settings", [{Key.MISFIT: 0.0}, {Key.NA: 1.0, Key.C2: 0.0, Key.C1: -0.5}], ids=str)
+def test_fit_is_not_watched_where_it_is_off_or_cannot_be(idle: Device, settings: dict[Key, float]) -> None:
+    for key, value in settings.items():
+        assert idle.configure(key, value).result == Result.APPLIED
+    assert idle.control(Command.START) == Result.APPLIED
+    assert misfits_of(idle, *hum_codes(2000, 2000)) == []
+
+
+def test_watch_of_the_fit_leaves_the_estimates_alone(idle: Device, device: Device) -> None:
+    u, y = hum_codes(2000, 2000)
+    idle.configure(Key.MISFIT, 0.0)
+    idle.control(Command.START)
+    with_it, without = ([m for k in range(len(u)) for m in each.sample(k, u[k], y[k])] for each in (device, idle))
+    assert of(Misfit, with_it)
+    assert np.array_equal(theta_of(with_it), theta_of(without))
+
+
 # ---- blocks
 
 
@@ -457,6 +517,7 @@ VALUES = {
     Key.ABSOLUTE: 1.0,
     Key.RESET: 1.0,
     Key.ISOLATION: 0.0,
+    Key.MISFIT: 0.0,
     Key.FORCE_ZERO: 341.25,
     Key.C1: -0.5,
     Key.C2: 0.25,
@@ -518,6 +579,7 @@ def test_configuration_is_what_the_run_uses(idle: Device, estimator: Estimator) 
         (Key.HOLD_OFF_N, 65536.0),
         (Key.C1, math.inf),
         (Key.ISOLATION, 2.0),
+        (Key.MISFIT, 2.0),
         (Key.FORCE_ZERO, 1.1e6),
     ],
 )
