@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -227,7 +228,7 @@ class Estimator:
 
     def watch_fit(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> Watched:
         """Whole runs (t, n), each from the start."""
-        signals = [np.ascontiguousarray(x, np.float64) for x in (u, y)]
+        signals: list[NDArray[Any]] = [np.ascontiguousarray(x, np.float64) for x in (u, y)]
         runs, samples = signals[0].shape
         valid_ = np.ascontiguousarray(np.ones((runs, samples)) if valid is None else valid, np.uint8)
         cause, found = np.zeros((runs, samples), np.uint8), np.zeros((runs, 2))
@@ -248,7 +249,7 @@ class Estimator:
 
         :param alarms: samples with an alarm.
         """
-        signals = [np.ascontiguousarray(x, np.float64) for x in (theta, u, y, innovation)]
+        signals: list[NDArray[Any]] = [np.ascontiguousarray(x, np.float64) for x in (theta, u, y, innovation)]
         n = len(signals[-1])
         status_ = np.ascontiguousarray(np.zeros(n) if status is None else status, np.uint8)
         alarm = np.zeros(n, np.uint8)

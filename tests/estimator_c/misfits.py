@@ -28,6 +28,10 @@ SUBSTEPS = 4
 """Of a sample, for the plant that is not linear."""
 
 
+FREE = Excitation(on_samples=False, drift_ppm=20.0)
+"""Of a generator on a clock of its own."""
+
+
 @dataclass(frozen=True)
 class Condition:
     """What disturbs the front suspension, and what should be said of it."""
@@ -36,7 +40,7 @@ class Condition:
     """One of CAUSES."""
     share: float = 0.95
     """Least share of the runs with this cause after 2,000 samples."""
-    excitation: Excitation = Excitation(on_samples=False, drift_ppm=20.0)
+    excitation: Excitation = FREE
     disturb: Callable[[Array, np.random.Generator], Array] = lambda y, _: y
     """Codes of displacement (t, n) to disturbed ones."""
     hardening: float = 0.0
@@ -54,7 +58,7 @@ class Condition:
 
 
 def whitened(x: ArrayLike, c: tuple[float, float]) -> Array:
-    """x filtered by 1 / (1 + c1 z^-1 + c2 z^-2)."""
+    """Return x filtered by 1 / (1 + c1 z^-1 + c2 z^-2)."""
     return np.asarray(signal.lfilter([1.0], [1.0, *c], x))
 
 
@@ -107,8 +111,6 @@ def _drift(codes: float) -> Callable[[Array, np.random.Generator], Array]:
     return lambda y, _: y + codes * np.arange(y.shape[1])
 
 
-_FREE = Excitation(on_samples=False, drift_ppm=20.0)
-
 CONDITIONS = {
     "noise, 2 LSB": Condition("noise", disturb=_noise(2.0)),
     "noise, 4 LSB": Condition("noise", disturb=_noise(4.0)),
@@ -121,7 +123,7 @@ CONDITIONS = {
     "spring, cubic 0.3 %": Condition("nonlinear", hardening=0.003),
     "spring, cubic 1 %": Condition("nonlinear", hardening=0.01),
     "spring, cubic 5 %": Condition("nonlinear", hardening=0.05),
-    "edges, 190 Hz": Condition("edges", excitation=replace(_FREE, half_period_n=20e3 / 380.0)),
-    "edges, 100 ppm": Condition("edges", share=0.8, excitation=replace(_FREE, drift_ppm=100.0)),
-    "excitation, 3 %": Condition("excitation", excitation=replace(_FREE, part_of_range=0.03)),
+    "edges, 190 Hz": Condition("edges", excitation=replace(FREE, half_period_n=20e3 / 380.0)),
+    "edges, 100 ppm": Condition("edges", share=0.8, excitation=replace(FREE, drift_ppm=100.0)),
+    "excitation, 3 %": Condition("excitation", excitation=replace(FREE, part_of_range=0.03)),
 }

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.catalogue import Change
+from analogrig.catalogue import Cause, Change
 from analogrig.plant import Plant, Segment
 from analogrig.run import CHANNELS, Channel, Conditions, Run
 
@@ -24,6 +24,7 @@ def made_run(
     clipped: NDArray[np.bool_] | None = None,
     alarms: Sequence[int] = (),
     diagnoses: Sequence[tuple[int, Change, int, float]] = (),
+    misfits: Sequence[tuple[int, Cause, float, float]] = (),
     expect: Mapping[str, float] | None = None,
     faults: tuple[str, ...] = (),
     samples_asked: int | None = None,
@@ -33,6 +34,7 @@ def made_run(
     """Run of the given force; ``clipped`` applies to the displacement. Without ``theta`` all estimates are zero.
 
     :param diagnoses: of each the sample after which it was said, what, the onset and the extent.
+    :param misfits: of each the sample, the cause, the frequency in cycles per sample, and the strength.
     """
     n = len(force_n)
     channels = {
@@ -75,6 +77,10 @@ def made_run(
         diagnosis_change=np.array([said[1] for said in diagnoses], np.uint8),
         diagnosis_onset=np.array([said[2] for said in diagnoses], np.int64),
         diagnosis_extent=np.array([said[3] for said in diagnoses], np.float32),
+        misfit_index=np.array([said[0] for said in misfits], np.int64),
+        misfit_cause=np.array([said[1] for said in misfits], np.uint8),
+        misfit_frequency=np.array([said[2] for said in misfits], np.float32),
+        misfit_strength=np.array([said[3] for said in misfits], np.float32),
     )
 
 

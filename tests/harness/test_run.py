@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analogrig.catalogue import Change
+from analogrig.catalogue import Cause, Change
 from analogrig.errors import RecordingError
 from analogrig.plant import Plant
 from analogrig.run import Run
@@ -17,13 +17,20 @@ from tests.harness.runs import made_run
 FRONT = Plant(115.0, 3021.0, 24500.0)
 SAID = [(30, Change.STIFFNESS, 11, 0.75), (320, Change.SEVERAL, 300, 1.0)]
 DIAGNOSIS = ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")
+FOUND = [(100, Cause.HUM, 0.0025, 3.5), (400, Cause.NONE, 0.0, 0.0)]
+MISFIT = ("misfit_index", "misfit_cause", "misfit_frequency", "misfit_strength")
 
 
 @pytest.fixture
 def run() -> Run:
     rng = np.random.default_rng(4)
     return made_run(
-        rng.uniform(0.0, 2900.0, 500), [(0, FRONT)], alarms=[17, 300], diagnoses=SAID, theta=rng.normal(size=(500, 6))
+        rng.uniform(0.0, 2900.0, 500),
+        [(0, FRONT)],
+        alarms=[17, 300],
+        diagnoses=SAID,
+        misfits=FOUND,
+        theta=rng.normal(size=(500, 6)),
     )
 
 
@@ -32,7 +39,7 @@ def test_saved_run_is_loaded_bit_for_bit(run: Run, tmp_path: Path) -> None:
     again = Run.load(tmp_path / "deep" / "run.npz")
     assert again.conditions == run.conditions
     arrays = ("codes", "clipped", "theta", "innovation", "statistic", "flags")
-    for name in (*arrays, "alarm_index", "alarm_kind", "alarm_statistic", *DIAGNOSIS):
+    for name in (*arrays, "alarm_index", "alarm_kind", "alarm_statistic", *DIAGNOSIS, *MISFIT):
         assert getattr(again, name).tobytes() == getattr(run, name).tobytes(), name
     assert again.theta_hash() == run.theta_hash()
 
@@ -118,15 +125,16 @@ def test_arrays_that_do_not_fit_together_are_refused(run: Run, tmp_path: Path) -
             Run.load(tmp_path / "run.npz")
 
 
-def test_recording_from_before_diagnoses_has_none(run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [DIAGNOSIS, MISFIT], ids=["diagnoses", "misfits"])
+def test_recording_from_before_these_reports_has_none(run: Run, tmp_path: Path, names: tuple[str, ...]) -> None:
     path = tmp_path / "run.npz"
     run.save(path)
     with np.load(path) as file:
-        members = {name: file[name] for name in file.files if name not in DIAGNOSIS}
+        members = {name: file[name] for name in file.files if name not in names}
     np.savez(path, allow_pickle=False, **members)
     again = Run.load(path)
     assert again.theta_hash() == run.theta_hash()
-    assert [len(getattr(again, name)) for name in DIAGNOSIS] == [0] * 4
+    assert [len(getattr(again, name)) for name in names] == [0] * 4
 
 
 @pytest.mark.parametrize(
@@ -141,6 +149,23 @@ def test_impossible_diagnosis_is_refused(run: Run, tmp_path: Path, name: str, va
     run.save(tmp_path / "run.npz")
     rewritten(tmp_path / "run.npz", None, **{name: values})
     with pytest.raises(RecordingError, match="its diagnoses do not fit together"):
+        Run.load(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("misfit_index", np.array([100, 500])),
+        ("misfit_index", np.array([100])),
+        ("misfit_cause", np.array([2, 8], np.uint8)),
+        ("misfit_frequency", np.array([0.6, 0.0], np.float32)),
+        ("misfit_frequency", np.array([np.nan, 0.0], np.float32)),
+    ],
+)
+def test_impossible_misfit_is_refused(run: Run, tmp_path: Path, name: str, values: np.ndarray) -> None:
+    run.save(tmp_path / "run.npz")
+    rewritten(tmp_path / "run.npz", None, **{name: values})
+    with pytest.raises(RecordingError, match="do not fit together"):
         Run.load(tmp_path / "run.npz")
 
 

@@ -64,10 +64,10 @@ class DirectDevice(Device):
         self._trigger = Trigger[estimator.trigger.replace("-", "_").upper()]
         # Runs share the table: to write it anew for each takes as long as to play a thousand samples.
         self._table = self._description.as_table()
-        self._datasheet = Datasheet.recorded(self._table)
+        self._datasheet = dataclasses.replace(Datasheet.recorded(self._table), misfits=False)
         if self._alarms_only:
             self._datasheet = dataclasses.replace(self._datasheet, theta_n=0, model=None)
-            self._table["datasheet"] = self._datasheet.as_table()
+        self._table["datasheet"] = self._datasheet.as_table()
 
     def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
         self._estimator.restart()
