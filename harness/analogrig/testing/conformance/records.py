@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
 from analogrig.datasheet import Datasheet
 from analogrig.devices.device import Device
 from analogrig.rigs.description import open_rig
@@ -102,6 +102,10 @@ class Answered:
         return tuple(itertools.chain.from_iterable(part.diagnoses for part in self.parts))
 
     @property
+    def misfits(self) -> tuple[ReportedMisfit, ...]:
+        return tuple(itertools.chain.from_iterable(part.misfits for part in self.parts))
+
+    @property
     def alarm_indices(self) -> list[int]:
         return [alarm.index for alarm in self.alarms]
 
@@ -109,7 +113,7 @@ class Answered:
         """SHA-256 of each quantity over the record; empty if it is not reported."""
         arrays = {name: self.array(name) for name in _ARRAYS}
         found = {name: "" if each is None else _digest(each.tobytes()) for name, each in arrays.items()}
-        events = {"alarms": self.alarms, "diagnoses": self.diagnoses}
+        events = {"alarms": self.alarms, "diagnoses": self.diagnoses, "misfits": self.misfits}
         rows = {name: [tuple(map(float, vars(each).values())) for each in every] for name, every in events.items()}
         return found | {name: _digest(repr(each).encode()) for name, each in rows.items()}
 

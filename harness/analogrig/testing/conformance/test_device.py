@@ -141,14 +141,15 @@ def check_complete(answered: Answered, stimulus: Stimulus) -> None:
         bad = np.flatnonzero(~np.isfinite(array.reshape(n, -1)).all(axis=1))
         assert not len(bad), f"{name} is non-finite at sample {bad[0]}"
     assert sheet.diagnoses or not answered.diagnoses, "reports diagnoses, which the data sheet does not state"
+    assert sheet.misfits or not answered.misfits, "reports misfits, which the data sheet does not state"
     assert sheet.alarms or not answered.alarms, "raises alarms, and the data sheet states that it has no trigger"
 
 
 def check_order(answered: Answered) -> None:
-    """Fail unless alarms and diagnoses ascend, and each comes with the answer to its sample."""
+    """Fail unless alarms, diagnoses and misfits ascend, and each comes with the answer to its sample."""
     first = 0
     for part in answered.parts:
-        for found in (part.alarms, part.diagnoses):
+        for found in (part.alarms, part.diagnoses, part.misfits):
             indices = [each.index for each in found]
             assert indices == sorted(indices), f"{indices} are out of order"
             assert all(first <= each < first + len(part) for each in indices), (
@@ -278,7 +279,7 @@ def test_answers_without_messages_are_those_over_the_line(
         pytest.skip("has not the capability blocks")
     with description.direct() as device:
         found = play(device, stimulus)
-    check_same(found, reference, without=("flags", "diagnoses"))
+    check_same(found, reference, without=("flags", "diagnoses", "misfits"))
     with description.direct(alarms_only=True) as device:
         assert play(device, stimulus).alarm_indices == reference.alarm_indices
 
