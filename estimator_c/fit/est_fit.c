@@ -161,7 +161,8 @@ static uint32_t find_region(const est_fit_watch_t* const self) {
 
 /// Limit an innovation, and follow the magnitude of the innovations.
 static float limit_innovation(est_fit_watch_t* const self, const float innovation) {
-    const float size   = minimum(magnitude(innovation), CLIP * self->deviation);
+    const float most   = minimum(CLIP * self->deviation, EST_CODE_LIMIT);
+    const float size   = minimum(magnitude(innovation), most);
     const float memory = (self->settling_n > 0U) ? MAGNITUDE_SETTLING_N : MAGNITUDE_N;
     self->deviation    = maximum(self->deviation + ((size - self->deviation) / memory), MAGNITUDE_MIN);
     return (innovation < 0.0F) ? -size : size;

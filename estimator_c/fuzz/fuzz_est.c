@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: MIT
-/// libFuzzer target for the public API of core and isolation: any configuration, any samples, any number of slices of
+/// libFuzzer target for the public API of core, isolation and fit: any configuration, any samples, any number of slices of
 /// work. The invariants must hold after every step, and the sanitizers must find nothing. `make fuzz` builds and runs
 /// it.
 
 #include "est.h"
+#include "est_fit.h"
 #include "est_isolation.h"
 
 #include <stddef.h>
@@ -111,6 +112,16 @@ static void isolate(est_isolation_t* const isolation,
     expect(diagnosis.onset_high_n < EST_ISOLATION_KEPT_N);
 }
 
+/// Enter a step into the watch of the fit.
+static void
+watch(est_fit_watch_t* const fit, const est_t* const estimator, const est_sample_t sample, const est_step_t step) {
+    est_fit_enter(fit, estimator, sample, step);
+    const est_misfit_t misfit = est_fit_misfit(fit);
+    expect((misfit.kind <= EST_MISFIT_EXCITATION) && (misfit.strength >= 0.0F));
+    expect((misfit.frequency >= 0.0F) && (misfit.frequency <= (0.5F / (float)EST_FIT_SUM_N)));
+    expect((misfit.kind == EST_MISFIT_NONE) == (misfit.strength <= 1.0F));
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
     input_t            input  = { .bytes = data, .n = size };
     const est_config_t config = configuration(&input);
@@ -122,6 +133,8 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
     est_isolation_t isolation;
     const bool      isolates = est_isolation_init(&isolation, &config, (float)byte(&input));
     const uint8_t   slices   = (uint8_t)(byte(&input) % 32U);
+    est_fit_watch_t fit;
+    const bool      watches = est_fit_init(&fit, &config);
     while (input.n > 0U) {
         const uint8_t repeats = (uint8_t)(1U + (byte(&input) % 32U));
         const bool    valid   = (byte(&input) % 16U) != 0U;
@@ -135,6 +148,9 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
             expect(number_is_finite(step.innovation) && number_is_finite(step.statistic));
             if (isolates) {
                 isolate(&isolation, &estimator, sample, step, slices);
+            }
+            if (watches) {
+                watch(&fit, &estimator, sample, step);
             }
         }
     }

@@ -6,8 +6,11 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 import random
+import subprocess
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -59,12 +62,18 @@ M = TypeVar("M", bound=Message)
 
 NONCE = 0xC0FFEE
 
+ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
+CODECS = Path("build/generated")
+DEVICE_SOURCES = [
+    path for part in ("core", "isolation", "fit", "device", "ports/library") for path in (ESTIMATOR / part).glob("*.c")
+]
+
 
 class Device:
     """A device and the numbering of what it is told."""
 
-    def __init__(self, catalogue_hash: int = CATALOGUE_HASH) -> None:
-        self.link = FramedLink(MemoryWire(NONCE, catalogue_hash=catalogue_hash))
+    def __init__(self, catalogue_hash: int = CATALOGUE_HASH, library: Path = LIBRARY) -> None:
+        self.link = FramedLink(MemoryWire(NONCE, catalogue_hash=catalogue_hash, library=library))
         self.seq = 0
 
     def tell(self, message: Message) -> list[Message]:
@@ -354,6 +363,20 @@ def test_watch_of_the_fit_leaves_the_estimates_alone(idle: Device, device: Devic
     with_it, without = ([m for k in range(len(u)) for m in each.sample(k, u[k], y[k])] for each in (device, idle))
     assert of(Misfit, with_it)
     assert np.array_equal(theta_of(with_it), theta_of(without))
+
+
+def test_build_without_the_watch_of_the_fit_has_the_setting_only_as_false(tmp_path: Path) -> None:
+    sources, library = [*DEVICE_SOURCES, *CODECS.glob("*.c")], tmp_path / "device.so"
+    folders = [f"-I{path}" for path in {each.parent for each in sources}]
+    options = ["-std=c99", "-ffp-contract=off", "-shared", "-fPIC", "-DEST_NC_MAX=2U", "-DDEVICE_WITH_FIT=0"]
+    subprocess.run([os.environ.get("CC", "cc"), *options, *folders, "-o", library, *sources], check=True)
+    device = Device(library=library)
+    device.tell(Identify(0))
+    answer = device.configure(Key.MISFIT, 1.0)
+    assert (answer.result, answer.value) == (Result.OUT_OF_RANGE, 0.0)
+    assert device.configure(Key.MISFIT, 0.0).result == Result.APPLIED
+    device.control(Command.START)
+    assert misfits_of(device, *hum_codes(2000, 2000)) == []
 
 
 # ---- blocks
