@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.judging.statistics import lower_rate, upper_rate
+from analogrig.judging.statistics import lower_rate
 from tests.estimator_c.est_driver import Estimator, compile_driver
 from tests.estimator_c.performance import (
     ARL0,

@@ -7,9 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from analogrig.catalogue import Cause
+from analogrig.judging.verdict import CURES
 from analogrig.plant import Plant
 from analogrig.testing.played import Played, rate_below
-from tests.harness.runs import made_run
+from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(294.0, 3021.0, 24500.0)
 
@@ -56,3 +58,16 @@ def test_rate_counts_the_same_play_once_and_says_how_many_samples_it_takes() -> 
     assert finding.why.endswith("; to show 1e-05 with so many alarms takes 3453878 samples")
     alone = rate_below(1e-5, [once], confidence=0.999, burst=1.0)
     assert alone.why.endswith("; to show 1e-05 with so many alarms takes 690776 samples")
+
+
+def test_rate_leaves_out_the_plays_with_a_misfit_if_asked_and_names_their_causes() -> None:
+    watching = {**ESTIMATOR, "misfit": True}
+    quiet = Played(made_run(np.linspace(0.0, 2900.0, 1000), [(0, FRONT)], estimator=watching))
+    alarms, misfits = [100, 200, 300], [(250, Cause.HUM, 0.0025, 3.0)]
+    poor = Played(made_run(np.zeros(1000), [(0, FRONT)], alarms=alarms, misfits=misfits, estimator=watching))
+    assert not rate_below(0.003, [quiet, poor], confidence=0.9, burst=1.0)
+    finding = rate_below(0.003, [quiet, poor], confidence=0.9, burst=1.0, or_misfit=True)
+    assert finding
+    assert finding.why.endswith(f"misfit in 1 of 2 plays: hum at 50 Hz in samples 250-999: {CURES['hum']}")
+    assert rate_below(0.003, [poor], confidence=0.9, burst=1.0, or_misfit=True)
+    assert not rate_below(1e-6, [quiet, poor], confidence=0.9, or_misfit=True)

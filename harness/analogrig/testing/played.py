@@ -190,21 +190,38 @@ def _failure_at_instant(tweak: ChangeVerdict, within: float | None) -> str:
     return f"{tweak.what} at {tweak.sample}: {latency}, allowed {allowed}" if late else ""
 
 
-def rate_below(rate: float, played: Iterable[Played], *, confidence: float, burst: float = BURST) -> Finding:
+def rate_below(
+    rate: float, played: Iterable[Played], *, confidence: float, burst: float = BURST, or_misfit: bool = False
+) -> Finding:
     """Finding: with ``confidence`` (0 to 1) the false-alarm rate is below ``rate`` alarms per sample.
 
     The number of plays must be fixed beforehand. The finding does not hold if one of them is not valid. A play counts
     once, with the samples in which its trigger was armed (``analogrig.judging.exposure``).
 
     :param burst: mean number of alarms of a burst that the bound covers; 1: alarms are taken as independent.
+    :param or_misfit: leave out the plays in which the device reports a misfit; the finding names the causes.
     :raises ValueError: ``rate``, ``confidence`` or ``burst`` is out of range.
     """
     plays = list({_samples_of(each.run): each for each in played}.values())
-    finding = _rate_below(rate, plays, confidence, burst)
+    explained = [each for each in plays if or_misfit and each.verdict.fit]
+    finding = _rate_below(rate, [each for each in plays if each not in explained], confidence, burst)
+    if explained:
+        finding = _with_misfits(finding, explained, len(plays))
     if plays:
-        finding = dataclasses.replace(finding, statement=_of_all(plays, rate, confidence, burst), run=plays[0].run)
+        statement = _of_all(plays, rate, confidence, burst, or_misfit=or_misfit)
+        finding = dataclasses.replace(finding, statement=statement, run=plays[0].run)
         plays[0].note(finding)
     return finding
+
+
+def _with_misfits(finding: Finding, explained: Sequence[Played], plays_n: int) -> Finding:
+    """Finding about the plays without a misfit, which may be none, with the causes of the others."""
+    periods = {period.cause: period for each in explained for period in each.verdict.fit or ()}
+    why = f"misfit in {len(explained)} of {number_of(plays_n, 'play')}: "
+    why += "; ".join(f"{period.text}: {period.cure}" for period in periods.values())
+    if len(explained) == plays_n:
+        return Finding(holds=True, why=why)
+    return dataclasses.replace(finding, why=f"{finding.why}; {why}")
 
 
 def _rate_below(rate: float, plays: Sequence[Played], confidence: float, burst: float) -> Finding:
@@ -231,7 +248,9 @@ def _samples_of(run: Run) -> tuple[str, bytes]:
     return str(run.conditions.dut["name"]), hashlib.sha256(run.codes.tobytes()).digest()
 
 
-def _of_all(plays: Sequence[Played], rate: float, confidence: float, burst: float) -> Statement | None:
+def _of_all(
+    plays: Sequence[Played], rate: float, confidence: float, burst: float, *, or_misfit: bool
+) -> Statement | None:
     """Statement about all plays; None if a scenario and its first seed do not describe them all."""
     conditions = [each.run.conditions for each in plays]
     first = conditions[0]
@@ -240,4 +259,4 @@ def _of_all(plays: Sequence[Played], rate: float, confidence: float, burst: floa
     ):
         return None
     arguments = {"rate": rate, "confidence": confidence, "plays": len(plays), "burst": burst}
-    return Statement("rate_of_plays_below", arguments)
+    return Statement("rate_of_plays_below", arguments | ({"or_misfit": True} if or_misfit else {}))

@@ -95,10 +95,19 @@ def _check_valid(*plays: Played) -> None:
 
 @experiment
 def rate_of_plays_below(
-    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plays: int, burst: float = BURST
+    play: Play,
+    scenario: Scenario,
+    seed: int,
+    rate: float,
+    confidence: float,
+    plays: int,
+    burst: float = BURST,
+    *,
+    or_misfit: bool = False,
 ) -> Finding:
     """Finding of ``analogrig.testing.played.rate_below`` for a given number of plays."""
-    return rate_below(rate, _play_all(play, scenario, seed, plays), confidence=confidence, burst=burst)
+    played = _play_all(play, scenario, seed, plays)
+    return rate_below(rate, played, confidence=confidence, burst=burst, or_misfit=or_misfit)
 
 
 @experiment
