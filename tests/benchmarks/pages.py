@@ -17,6 +17,7 @@ TITLES: Mapping[str, str] = {
     "detection": "Detection on the thesis's profile",
     "statistics": "Detection delay and false alarms of simulated plants",
     "isolation": "Isolation",
+    "fit": "Watch of the fit",
     "trials": "Closed-loop trials and certificates",
     "certificates": "Error probabilities of certificates",
     "calibration": "Calibration of drawn rigs",
