@@ -166,8 +166,8 @@ def test_what_an_exchange_needs_is_the_sum_of_its_frames() -> None:
     load = exchange_load(CanLine(1_000_000), in_blocks=False, parameters=6, report_interval_n=1, period_s=2e-3)
     assert load.sample_s == pytest.approx(9 * 135e-6)
     assert load.utilisation == pytest.approx(9 * 135e-6 / 2e-3)
-    # One that has begun, the sample, alarm and diagnosis, the next sample, 7 estimates, the end.
-    assert load.latency_s == pytest.approx((1 + 1 + 2 + 1 + 7 + 1) * 135e-6)
+    # One that has begun, the sample, alarm, diagnosis and misfit, the next sample, 7 estimates, the end.
+    assert load.latency_s == pytest.approx((1 + 1 + 3 + 1 + 7 + 1) * 135e-6)
     assert load.most_samples_per_s == pytest.approx(1 / 1215e-6)
 
 

@@ -23,7 +23,7 @@ PUBLIC = """
 
 DEVICES = """
     LOST UNARMED UNREPORTED AdaptedDescription Answers Capability Datasheet Device DeviceDescription DeviceRefused
-    LinkClosed ModelOrders RaisedAlarm ReportedDiagnosis Samples SteppedFlag Thing TimeLimitReached
+    LinkClosed ModelOrders RaisedAlarm ReportedDiagnosis ReportedMisfit Samples SteppedFlag Thing TimeLimitReached
 """.split()
 RIGS = """
     CAPABILITIES CHANNELS Block Channel Hindsight Performance Rig RigClosed RigDescription RigRefused RigTimeout Segment
