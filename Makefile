@@ -142,7 +142,7 @@ tools: ## install the tools of the tests from the operating system (apt, sudo if
 	@$(PYTHON) -m tests.tools install
 	@$(MAKE) --no-print-directory $(BUILD)/can_guest/linux
 
-fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, FUZZ_S seconds each; findings stay in build/fuzz
+fuzz: $(PRODUCTS) ## libFuzzer over core, isolation, fit and device, with sanitizers, FUZZ_S seconds each; findings stay in build/fuzz
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
 
 fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/docs/evidence/hostile-clients.md
@@ -157,7 +157,7 @@ hostile: $(PRODUCTS) ## 5,000 mutated recordings, 2,000 descriptions, 500 logs a
 defects: $(PRODUCTS) ## plant defects in the device, each of which a shipped property must find; the table of tests/properties/README.md
 	@$(BIN)/python -m tests.properties.planted
 
-coverage: $(PRODUCTS) ## lines and branches of core and isolation that their tests reach
+coverage: $(PRODUCTS) ## lines and branches of core, isolation and fit that their tests reach
 	@$(BIN)/python -m estimator_c.evidence.coverage
 
 cost: $(PRODUCTS) ## cost of the estimator on a Cortex-M: one table, and build/cost.json

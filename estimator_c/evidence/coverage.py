@@ -1,4 +1,4 @@
-"""Line and branch coverage of core and isolation by the tests. `make coverage`.
+"""Line and branch coverage of core, isolation and fit by the tests. `make coverage`.
 
 Runs their tests on a driver built with gcov's counters (without optimisation, asserts off, one copy of every
 line), and lists what none of them reached. 100 % is demanded of lines and branches.
@@ -21,7 +21,7 @@ from typing import Any
 __all__ = ["Coverage", "main", "measured"]
 
 ROOT = Path(__file__).parents[2]
-SOURCES = tuple(ROOT / "estimator_c" / name for name in ("core", "isolation"))
+SOURCES = tuple(ROOT / "estimator_c" / name for name in ("core", "isolation", "fit"))
 
 ELSEWHERE = {
     "a.na == b.na": "shapes differ only where a build knows one alone: tests/estimator_c/test_est_builds.py",
@@ -59,7 +59,7 @@ class Coverage:
 
 
 def measured(pytest_arguments: tuple[str, ...] = ()) -> Coverage:
-    """Runs the tests of core and isolation; raises CalledProcessError if one fails."""
+    """Runs the tests of core, isolation and fit; raises CalledProcessError if one fails."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         tests = sorted(str(path) for path in (ROOT / "tests" / "estimator_c").glob("test_est_*.py"))

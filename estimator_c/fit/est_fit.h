@@ -109,10 +109,11 @@ typedef struct {
 
 /// Prepare for the first sample of an estimator with this configuration. The configuration is not copied; it must
 /// stay unchanged. Returns false iff na is not 2; the tests of the excitation and of slow plants then do not apply
-/// and the state is unusable. Cost: constant. RAM: 0.7 kB. May be called from an interrupt.
+/// and the state is unusable. Cost: constant. RAM: 0.4 kB. May be called from an interrupt.
 EST_RESULT_USED bool est_fit_init(est_fit_watch_t* self, const est_config_t* config);
 
-/// Enter the input and result of an est_step(); to be called after every step. May be called from an interrupt.
+/// Enter the input and result of an est_step(); to be called after every step. Cost: some 200
+/// instructions on a Cortex-M4F, at most 350 (make cost). May be called from an interrupt.
 void est_fit_enter(est_fit_watch_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 
 /// Present misfit. Cost: constant. May be called from an interrupt.

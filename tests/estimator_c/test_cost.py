@@ -87,6 +87,12 @@ def test_cost_beyond_its_limit_does_not_grow(name: str, costs: Mapping[str, cost
     assert costs[name].value <= BEYOND[name]
 
 
+def test_watch_of_the_fit_costs_what_its_header_says(costs: Mapping[str, cost.Cost]) -> None:
+    assert costs["M4F, fit, a sample entered"].value <= 210
+    assert costs["M4F, fit, a sample entered, worst"].value <= 350
+    assert costs["M4F, state: sizeof(est_fit_watch_t)"].value <= 432
+
+
 def test_isolation_costs_what_its_header_says(costs: Mapping[str, cost.Cost]) -> None:
     assert costs["M4F, isolation, a sample entered"].value <= 180
     assert costs["M4F, isolation, a sample entered, worst"].value <= 2500

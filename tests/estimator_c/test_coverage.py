@@ -1,4 +1,4 @@
-"""Every line and branch of core and isolation is reached by a test through its public header."""
+"""Every line and branch of core, isolation and fit is reached by a test through its public header."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from estimator_c.evidence.coverage import measured
 
 
 @pytest.mark.tools("gcc", "gcov")
-def test_every_line_and_branch_of_core_and_isolation_is_tested() -> None:
+def test_every_line_and_branch_of_core_isolation_and_fit_is_tested() -> None:
     coverage = measured()
     assert coverage.lines > 700
     assert coverage.branches > 450

@@ -45,7 +45,7 @@ def final(watched: Watched) -> str:
 
 
 def test_innovations_of_a_model_that_fits_raise_no_misfit(estimator: Estimator) -> None:
-    watched = Steps(20_000).judged(estimator)
+    watched = Steps(70_000).judged(estimator)
     assert not watched.cause.any()
     assert watched.strength == 0.0
     assert watched.frequency == 0.0
@@ -68,6 +68,23 @@ def test_periodic_innovations_are_hum_with_its_frequency(estimator: Estimator, l
     watched = steps.judged(estimator)
     assert final(watched) == "hum"
     assert watched.frequency * BLOCK_N == pytest.approx(line, abs=0.34)
+
+
+def test_broad_peak_of_the_spectrum_is_no_hum(estimator: Estimator) -> None:
+    """The fast component takes the correlation away, so that the lines around are all that speaks against hum."""
+    steps = Steps()
+    steps.innovation *= 0.3
+    for line in range(9, 17):
+        steps.innovation += 0.5 * np.sin(2.0 * np.pi * line / BLOCK_N * steps.at + line**2)
+    steps.innovation += 2.7 * np.sin(2.0 * np.pi / 5.0 * steps.at)
+    assert final(steps.judged(estimator)) != "hum"
+
+
+def test_force_that_steps_all_the_time_has_no_edges_to_judge(estimator: Estimator) -> None:
+    steps = Steps()
+    steps.u = 4000.0 * steps.rng.integers(0, 2, N)
+    steps.innovation += 1e-4 * np.diff(steps.u, prepend=0.0)
+    assert final(steps.judged(estimator)) == "none"
 
 
 def test_response_to_the_edges_that_follows_their_direction_is_edges_that_drift(estimator: Estimator) -> None:
