@@ -255,7 +255,8 @@ static float find_frequency(const est_fit_watch_t* const self) {
     const float shift   = share / (1.0F + share);
     const float line    = (float)self->peak;
     const float block_n = (2.0F * (float)EST_FIT_LINES_N) * (float)EST_FIT_SUM_N;
-    return (upwards ? (line + shift) : (line - shift)) / block_n;
+    const float place   = upwards ? (line + shift) : (line - shift);
+    return place / block_n;
 }
 
 // ---------------------------------------------         CAUSES         ---------------------------------------------
@@ -286,12 +287,12 @@ static float weigh_drift(const est_fit_watch_t* const self) {
 
 /// Weigh a line that is neither a harmonic of the excitation nor the peak of a broad spectrum.
 static float weigh_hum(const est_fit_watch_t* const self) {
-    const float power      = self->now[self->peak] + neighbour_power(self);  // it may lie between two lines
-    const float line       = quotient(power, energy_of(self));
-    const float share      = quotient(line, 0.5F * (float)self->sums.innovations_n);
-    const bool  is_apart   = (share > (REGIONS_HUM * regions_share(self))) && (share > (COLOUR_HUM * colour_of(self)));
-    const bool  stands_out = self->now[self->peak] > (LINE_ABOVE * power_around(self));
-    return (is_apart && stands_out) ? quotient(line, LINE) : 0.0F;
+    const float power    = self->now[self->peak] + neighbour_power(self);  // it may lie between two lines
+    const float line     = quotient(power, energy_of(self));
+    const float share    = quotient(line, 0.5F * (float)self->sums.innovations_n);
+    const bool  is_apart = (share > (REGIONS_HUM * regions_share(self))) && (share > (COLOUR_HUM * colour_of(self)));
+    const float above    = quotient(self->now[self->peak], LINE_ABOVE * power_around(self));
+    return is_apart ? minimum(line / LINE, above) : 0.0F;
 }
 
 /// Variance next to edges over that elsewhere.
