@@ -251,12 +251,11 @@ static float power_around(const est_fit_watch_t* const self) {
 /// Frequency of the line at the peak, from the powers of the peak and its larger neighbour [cycles per sample].
 static float find_frequency(const est_fit_watch_t* const self) {
     const bool  upwards = power_at(self, self->peak + 1U) > power_at(self, self->peak - 1U);
+    const float towards = upwards ? 1.0F : -1.0F;
     const float share   = square_root(quotient(neighbour_power(self), self->now[self->peak]));
-    const float shift   = share / (1.0F + share);
-    const float line    = (float)self->peak;
+    const float line    = (float)self->peak + (towards * (share / (1.0F + share)));
     const float block_n = (2.0F * (float)EST_FIT_LINES_N) * (float)EST_FIT_SUM_N;
-    const float place   = upwards ? (line + shift) : (line - shift);
-    return place / block_n;
+    return line / block_n;
 }
 
 // ---------------------------------------------         CAUSES         ---------------------------------------------
