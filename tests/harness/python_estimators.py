@@ -49,6 +49,7 @@ class Counting:
 
     def __init__(self, period: int = 10, sheet: dict[str, Any] | None = None) -> None:
         everything = {"theta_n": 2, "innovation": True, "statistic": True, "armed": True, "diagnoses": True}
+        everything["misfits"] = True
         self.datasheet = everything if sheet is None else sheet
         self._period, self._n = period, 0
 
@@ -62,6 +63,7 @@ class Counting:
             "statistic": n,
             "armed": n >= self._period,
             "diagnosis": {"change": "mass", "onset": n, "extent": 0.5} if alarm else None,
+            "misfit": {"cause": "hum", "frequency": 0.25} if alarm else None,
         }
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
 from analogrig.bench import Bench
-from analogrig.catalogue import Change, SteppedFlag
+from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.cli import main
 from analogrig.datasheet import Datasheet, ModelOrders
 from analogrig.devices.description import DeviceDescription
@@ -84,6 +84,7 @@ def test_every_quantity_arrives_at_its_sample() -> None:
     assert first.flags.tolist() == [UNARMED, UNARMED, UNARMED | SteppedFlag.MISSING, 0]
     assert first.alarms == (RaisedAlarm(0, statistic=0.0), RaisedAlarm(3, statistic=3.0))
     assert first.diagnoses[1] == ReportedDiagnosis(3, Change.MASS, 3, 0.5)
+    assert first.misfits[1] == ReportedMisfit(3, Cause.HUM, 0.25)
     assert second.theta is not None
     assert second.theta.tolist() == [[4, -4], [5, -5]]
     assert (len(second), second.alarms) == (2, ())
@@ -307,6 +308,12 @@ WRONG_ANSWERS: dict[str, tuple[object, object, str]] = {
         {"diagnoses": True},
         "onset must be a sample from 0 to 0, not 9",
     ),
+    "cause": ({"alarm": False, "misfit": {"cause": "age"}}, {"misfits": True}, "cause must be one of none, drift, "),
+    "frequency": (
+        {"alarm": False, "misfit": {"cause": "hum", "frequency": 50.0}},
+        {"misfits": True},
+        "frequency must be 0 to 0.5 cycles per sample, not 50.0",
+    ),
 }
 
 
@@ -324,6 +331,7 @@ WRONG_BLOCKS: dict[str, tuple[object, object, str]] = {
     "nan": ({"alarm": [False] * 2, "theta": [[1.0], [np.nan]]}, {"theta_n": 1}, "theta is .*: non-finite"),
     "armed": ({"alarm": [False] * 2}, {"armed": True}, "armed must be an array of 2 truth values, not None"),
     "diagnosis": ({"alarm": [False] * 2, "diagnosis": [None]}, {"diagnoses": True}, "diagnosis must be a list of 2"),
+    "misfit": ({"alarm": [False] * 2, "misfit": [None]}, {"misfits": True}, "misfit must be a list of 2"),
 }
 
 

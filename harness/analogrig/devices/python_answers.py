@@ -8,21 +8,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import LARGEST_FLOAT32, Answers, RaisedAlarm, ReportedDiagnosis, Samples
-from analogrig.catalogue import Change, SteppedFlag
+from analogrig.answers import LARGEST_FLOAT32, Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
+from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
-from analogrig.run import UNARMED, UNREPORTED
+from analogrig.run import MOST_FREQUENCY, UNARMED, UNREPORTED
 
-_QUANTITIES = ("alarm", "theta", "innovation", "statistic", "armed", "diagnosis")
+_QUANTITIES = ("alarm", "theta", "innovation", "statistic", "armed", "diagnosis", "misfit")
 """Names in an answer: keys of a mapping, or attributes of an object."""
 
 _CHANGES = {change.name.lower(): change for change in Change if change is not Change.UNDECIDED}
 
 _DIAGNOSIS = ("change", "onset", "extent")
 
+_CAUSES = {cause.name.lower().replace("_", " "): cause for cause in Cause}
+
+_MISFIT = ("cause", "frequency")
+
 _CURES = {name: f"datasheet.{name} = true" for name in _QUANTITIES} | {
     "theta": "datasheet.theta_n = number of elements",
     "diagnosis": "datasheet.diagnoses = true",
+    "misfit": "datasheet.misfits = true",
 }
 
 _MOST_SHOWN = 60
@@ -40,7 +45,7 @@ class Rows:
         reported = {"theta": sheet.theta_n > 0, "innovation": sheet.innovation, "statistic": sheet.statistic}
         self._shapes = {name: (sheet.theta_n,) if name == "theta" else () for name, is_in in reported.items() if is_in}
         """Shape of one row of each reported quantity of numbers."""
-        reported |= {"armed": sheet.armed, "diagnosis": sheet.diagnoses, "alarm": True}
+        reported |= {"armed": sheet.armed, "diagnosis": sheet.diagnoses, "misfit": sheet.misfits, "alarm": True}
         self._unstated = frozenset(name for name in _QUANTITIES if not reported[name])
         self._last = {name: np.zeros(shape) for name, shape in self._shapes.items()}
         """Last reported row of each, which stands for those that are not reported."""
@@ -59,6 +64,7 @@ class Rows:
         self._flags = np.where(block.valid, 0, SteppedFlag.MISSING).astype(np.uint8)
         self._alarms: list[int] = []
         self._diagnoses: list[ReportedDiagnosis] = []
+        self._misfits: list[ReportedMisfit] = []
         self.n = 0
 
     def add(self, result: object) -> None:
@@ -81,6 +87,8 @@ class Rows:
             self._flags[here] |= UNARMED
         if (diagnosis := answer.get("diagnosis")) is not None:
             self._diagnoses.append(_diagnosis(diagnosis, self.next_sample))
+        if (misfit := answer.get("misfit")) is not None:
+            self._misfits.append(_misfit(misfit, self.next_sample))
         if alarm:
             self._alarms.append(self.n)
         self.n += 1
@@ -101,10 +109,9 @@ class Rows:
                 self._last[name] = self._values[name][-1]
         if self._sheet.armed:
             self._flags[~_bools(answer.get("armed"), n, "armed")] |= UNARMED
-        diagnoses = answer.get("diagnosis") or [None] * n
-        if not isinstance(diagnoses, Sequence) or len(diagnoses) != n:
-            raise WrongAnswer(f"diagnosis must be a list of {n}, with None for no diagnosis, not {_shown(diagnoses)}")
+        diagnoses, misfits = (_list(answer.get(name), n, name) for name in ("diagnosis", "misfit"))
         self._diagnoses = [_diagnosis(each, first + at) for at, each in enumerate(diagnoses) if each is not None]
+        self._misfits = [_misfit(each, first + at) for at, each in enumerate(misfits) if each is not None]
         self._alarms = np.flatnonzero(alarm).tolist()
         self.n = n
 
@@ -138,6 +145,7 @@ class Rows:
             innovation=values.get("innovation"),
             statistic=statistic,
             diagnoses=tuple(self._diagnoses),
+            misfits=tuple(self._misfits),
         )
 
 
@@ -174,6 +182,35 @@ def _bools(value: object, n: int, name: str) -> NDArray[np.bool_]:
     if array.shape != (n,) or array.dtype != np.bool_:
         raise WrongAnswer(f"{name} must be an array of {n} truth values, not {_shown(value)}")
     return array
+
+
+def _list(value: object, n: int, name: str) -> Sequence[object]:
+    """Reports of n samples; None where there is none.
+
+    :raises WrongAnswer: the value is no such list.
+    """
+    given = value or [None] * n
+    if not isinstance(given, Sequence) or len(given) != n:
+        raise WrongAnswer(f"{name} must be a list of {n}, with None for no {name}, not {_shown(given)}")
+    return given
+
+
+def _misfit(value: object, index: int) -> ReportedMisfit:
+    """:raises WrongAnswer: the value is no misfit."""
+    given = _named(value, _MISFIT)
+    cause, frequency = given.get("cause"), given.get("frequency")
+    if not (isinstance(cause, str) and cause in _CAUSES):
+        raise WrongAnswer(f"misfit: cause must be one of {', '.join(_CAUSES)}, not {_shown(cause)}")
+    if frequency is None:
+        return ReportedMisfit(index, _CAUSES[cause])
+    if (
+        isinstance(frequency, bool)
+        or not isinstance(frequency, int | float | np.floating)
+        or not 0.0 <= frequency <= MOST_FREQUENCY
+    ):
+        wanted = f"must be 0 to {MOST_FREQUENCY:g} cycles per sample"
+        raise WrongAnswer(f"misfit: frequency {wanted}, not {_shown(frequency)}")
+    return ReportedMisfit(index, _CAUSES[cause], float(frequency))
 
 
 def _diagnosis(value: object, index: int) -> ReportedDiagnosis:

@@ -71,7 +71,7 @@ class MisfitPeriod:
     strength: float | None
     """Statistic over its limit at ``start``; None if the device does not report it."""
     frequency_hz: float | None
-    """Frequency of the disturbance; None unless the cause is ``hum``."""
+    """Frequency of the disturbance; None unless the cause is ``hum``, or if the device does not report it."""
 
     @property
     def text(self) -> str:
@@ -290,14 +290,15 @@ def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
         start = changes[i]
         record_end = min((record for record in run.conditions.records if record > start), default=run.samples)
         if cause != Cause.NONE:
-            is_hum = cause == Cause.HUM
+            frequency = float(run.misfit_frequency[i])
+            is_known = cause == Cause.HUM and frequency > 0.0
             out.append(
                 MisfitPeriod(
                     cause=cause.name.lower().replace("_", " "),
                     start=start,
                     end=min(changes[i + 1], record_end),
                     strength=float(run.misfit_strength[i]) or None,
-                    frequency_hz=float(run.misfit_frequency[i]) / run.conditions.sample_period_s if is_hum else None,
+                    frequency_hz=frequency / run.conditions.sample_period_s if is_known else None,
                 )
             )
     return tuple(out)
