@@ -76,6 +76,9 @@
 /// 1 + a1 + a2 below which the plant hardly moves between two samples.
 #define SLOW 0.0035F
 
+/// Alarms in a block that are too many for changes of such a plant.
+#define SLOW_ALARMS 1.0F
+
 static float magnitude(const float x) { return (x < 0.0F) ? -x : x; }
 
 static float minimum(const float a, const float b) { return (a < b) ? a : b; }
@@ -365,6 +368,9 @@ static est_misfit_t weigh_cause(const est_fit_watch_t* const self, const est_t* 
     case 4U:
         out.kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NOISE;
         out.strength = weigh_noise(self);
+        if (slow) {
+            out.strength = maximum(out.strength, (float)self->sums.alarms_n / SLOW_ALARMS);
+        }
         break;
     default:
         out.kind     = EST_MISFIT_EXCITATION;

@@ -148,6 +148,13 @@ def test_large_innovations_of_a_plant_that_hardly_moves_are_a_slow_plant(estimat
     assert final(steps.judged(estimator, SLOW_THETA)) == "slow plant"
 
 
+@pytest.mark.parametrize(("theta", "cause"), [(SLOW_THETA, "slow plant"), (THETA, "none")], ids=["slow", "usual"])
+def test_alarms_in_each_block_are_a_slow_plant_if_it_hardly_moves(
+    estimator: Estimator, theta: tuple[float, ...], cause: str
+) -> None:
+    assert final(Steps().judged(estimator, theta, alarms=np.arange(350, N, 300))) == cause
+
+
 def test_small_force_is_lack_of_excitation(estimator: Estimator) -> None:
     steps = Steps()
     steps.u *= 0.02
