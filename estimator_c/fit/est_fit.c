@@ -70,6 +70,9 @@
 /// not linear, the steps of u explain less than this part.
 #define STEPS_REGIONS 0.7F
 
+/// Growth of the spread of y since the first block with which a growth of the innovations is not linear.
+#define GROWTH 1.5F
+
 /// Equations next to edges in a block below which their variance is not judged.
 #define EDGES_MIN 12U
 
@@ -321,6 +324,18 @@ static float weigh_edges(const est_fit_watch_t* const self) {
     return maximum(next, maximum(drifts, jumps));
 }
 
+static float variance_of(const est_fit_watch_t* const self) {
+    return self->sums.squares / (float)self->sums.innovations_n;
+}
+
+/// Weigh innovations that have grown with y since the first block, or that the state of the plant explains.
+static float weigh_nonlinearity(const est_fit_watch_t* const self) {
+    const bool  grows  = (self->first_variance > 0.0F) && (self->spread > (GROWTH * self->first_spread));
+    const float before = maximum(self->first_variance, declared_variance(self));
+    const float growth = grows ? quotient(variance_of(self), NOISE * before) : 0.0F;
+    return maximum(growth, regions_share(self) / REGIONS);
+}
+
 static float weigh_noise(const est_fit_watch_t* const self) {
     const float n      = (float)self->sums.innovations_n;
     const float excess = quotient(self->sums.squares, n * declared_variance(self) * NOISE);
@@ -363,7 +378,7 @@ static est_misfit_t weigh_cause(const est_fit_watch_t* const self, const est_t* 
         break;
     case 3U:
         out.kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NONLINEAR;
-        out.strength = regions_share(self) / REGIONS;
+        out.strength = weigh_nonlinearity(self);
         break;
     case 4U:
         out.kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_NOISE;
@@ -421,6 +436,10 @@ static void conclude(est_fit_watch_t* const self) {
         self->misfit = self->found;
     }
     self->candidate = self->found.kind;
+    if ((self->first_variance <= 0.0F) && (self->sums.innovations_n >= ENOUGH_N)) {
+        self->first_variance = variance_of(self);
+        self->first_spread   = self->spread;
+    }
     begin_block(self);
 }
 

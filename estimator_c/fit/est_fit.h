@@ -102,8 +102,10 @@ typedef struct {
     float               regions[EST_FIT_REGIONS_N];    ///< sums of every second innovation, by region
     uint16_t            regions_n[EST_FIT_REGIONS_N];  ///< innovations in each of them
     est_fit_sums_t      sums;
-    est_misfit_t        found;      ///< in the block that is evaluated
-    est_misfit_kind_t   candidate;  ///< cause found in the last block
+    float               first_spread;    ///< at the end of the first block [codes]
+    float               first_variance;  ///< of the innovations of the first block [codes^2]; 0: none yet
+    est_misfit_t        found;           ///< in the block that is evaluated
+    est_misfit_kind_t   candidate;       ///< cause found in the last block
     est_misfit_t        misfit;
 } est_fit_watch_t;
 

@@ -113,6 +113,15 @@ def test_innovations_that_follow_the_level_of_y_are_nonlinear(estimator: Estimat
     assert final(steps.judged(estimator)) == "nonlinear"
 
 
+@pytest.mark.parametrize(("growth", "cause"), [(2.0, "nonlinear"), (1.0, "noise")], ids=["with y", "alone"])
+def test_innovations_that_grow_with_y_are_nonlinear(estimator: Estimator, growth: float, cause: str) -> None:
+    steps = Steps(4000)
+    later = steps.at > SETTLING_N + BLOCK_N + EVALUATION_N
+    steps.y[later] *= growth
+    steps.innovation[later] *= 3.0
+    assert final(steps.judged(estimator)) == cause
+
+
 @pytest.mark.parametrize("scale", [1.8, 5.0])
 def test_larger_innovations_than_declared_are_noise(estimator: Estimator, scale: float) -> None:
     steps = Steps()
