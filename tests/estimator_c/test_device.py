@@ -341,8 +341,9 @@ def test_cause_of_a_misfit_is_told_when_it_is_found_and_when_it_is_gone(device: 
 
 
 def test_start_begins_the_watch_anew(device: Device) -> None:
-    u, y = hum_codes(2000, 2000)
+    u, y = hum_codes(3000, 3000)
     before = misfits_of(device, u, y)
+    assert before
     device.control(Command.STOP)
     device.control(Command.START)
     assert [each._replace(seq=0) for each in misfits_of(device, u, y)] == [each._replace(seq=0) for each in before]
@@ -353,11 +354,11 @@ def test_fit_is_not_watched_where_it_is_off_or_cannot_be(idle: Device, settings:
     for key, value in settings.items():
         assert idle.configure(key, value).result == Result.APPLIED
     assert idle.control(Command.START) == Result.APPLIED
-    assert misfits_of(idle, *hum_codes(2000, 2000)) == []
+    assert misfits_of(idle, *hum_codes(3000, 3000)) == []
 
 
 def test_watch_of_the_fit_leaves_the_estimates_alone(idle: Device, device: Device) -> None:
-    u, y = hum_codes(2000, 2000)
+    u, y = hum_codes(3000, 3000)
     idle.configure(Key.MISFIT, 0.0)
     idle.control(Command.START)
     with_it, without = ([m for k in range(len(u)) for m in each.sample(k, u[k], y[k])] for each in (device, idle))
@@ -376,7 +377,7 @@ def test_build_without_the_watch_of_the_fit_has_the_setting_only_as_false(tmp_pa
     assert (answer.result, answer.value) == (Result.OUT_OF_RANGE, 0.0)
     assert device.configure(Key.MISFIT, 0.0).result == Result.APPLIED
     device.control(Command.START)
-    assert misfits_of(device, *hum_codes(2000, 2000)) == []
+    assert misfits_of(device, *hum_codes(3000, 3000)) == []
 
 
 # ---- blocks
