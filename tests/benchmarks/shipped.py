@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from analogrig.answers import Answers, Samples
+from analogrig.catalogue import Cause
+from analogrig.devices.device import Device
 from analogrig.devices.direct import DirectDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.run import Channel
@@ -15,6 +20,9 @@ from .played import CARD, FORCE, Played
 ONSET_N, ONSET_SPAN_N = 2500, 400
 """Earliest sample of a change, and span of the instants. The device has settled, even if a fifth of the samples is
 missing: its warm-up counts equations."""
+
+MOST_CODE = 65535
+"""Largest code of a message."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +37,13 @@ def shipped() -> DirectDevice:
     """Device with its default settings."""
     device = InprocDevice(name="shipped").direct(alarms_only=True)
     assert isinstance(device, DirectDevice)
+    _prepare(device)
+    return device
+
+
+def _prepare(device: Device) -> None:
     low_v, lsb_v = CARD.ranges_v[FORCE][0], float(CARD.lsb_v[FORCE])
     device.prepare({"force": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
-    return device
 
 
 def settling_n(device: DirectDevice) -> int:
@@ -40,12 +52,29 @@ def settling_n(device: DirectDevice) -> int:
 
 
 def reported_misfits(played: Played) -> Sequence[Misfit]:
-    """Misfits that the device reports in a run, in the order of their samples.
+    """Misfits that the device reports in a run through its messages, in the order of their samples.
 
-    :raises LookupError: the device reports no misfits at all.
+    :raises LookupError: the device reports no misfits, or the codes do not fit in its messages.
     """
-    del played
-    raise LookupError("the device reports no misfits")
+    device = _behind_its_line()
+    if not device.datasheet.misfits:
+        raise LookupError("the device reports no misfits")
+    if max(played.u.max(), played.y.max()) > MOST_CODE:
+        raise LookupError(f"messages carry codes up to {MOST_CODE}")
+    device.start()
+    codes = (signal.astype(np.uint16) for signal in (played.u, played.y))
+    answers = list(device.play([Samples(0, *codes, played.valid)]))
+    device.stop()
+    misfits = [each for part in answers for each in part.misfits if each.cause != Cause.NONE]
+    return [Misfit(Cause(each.cause).name.lower().replace("_", "-"), each.index) for each in misfits]
+
+
+@functools.cache
+def _behind_its_line() -> Device:
+    """Device with its default settings, behind its line; it reports no estimates."""
+    device = InprocDevice(name="shipped", exchange="block", report_interval_n=60_000).open()
+    _prepare(device)
+    return device
 
 
 def answers_to(device: DirectDevice, played: Played) -> Answers:
