@@ -23,7 +23,7 @@ from tests.estimator_c.est_driver import (
     PREDICTION_ERROR,
     Estimator,
 )
-from tests.estimator_c.reference import ReferenceEstimator
+from analogrig.testing.reference.estimator import ReferenceEstimator
 
 FRONT = (115.0, 3021.0, 24500.0)
 PERIOD_S = 0.01

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from analogrig.devices.estimator import Estimator, StepStatus
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
-from tests.estimator_c.reference import ReferenceEstimator
+from analogrig.testing.reference.estimator import ReferenceEstimator
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 900

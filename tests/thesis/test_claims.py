@@ -20,7 +20,7 @@ from analogrig.config import fixtures
 from analogrig.run import Run
 from analogrig_thesis.chapter4 import SCHEMES
 from analogrig_thesis.reproduction import CLAIMS, PAGE, RECORDINGS, reproduce
-from tests.estimator_c.reference import ReferenceEstimator
+from analogrig.testing.reference.estimator import ReferenceEstimator
 from tests.thesis.oracle import (
     CHANGES,
     PERIOD_S,

@@ -1,0 +1,115 @@
+"""Triggers of the reference estimator: statistic of the innovations, and the decision that a plant has changed."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from analogrig.estimator_config import EstimatorConfig
+
+NOISE_RATE, NOISE_CLIP, NOISE_KEPT = 0.005, 9.0, 0.9851
+"""Rate at which the noise variance is followed, and the clipping of squared innovations, with what it leaves."""
+
+GAIN, DRIFT = 0.375, 0.69314718
+"""Log-likelihood ratio of a fourfold variance: GAIN z^2 - DRIFT."""
+
+
+class Decision(Enum):
+    """Meaning of an innovation."""
+
+    QUIET = 0
+    ALARM = 1
+    SLIP = 2
+    """The edges of the force have moved by one sample; the plant has not changed."""
+
+
+class ReferenceTrigger:
+    """Trigger of one estimator, with the noise variance by which it scales innovations."""
+
+    def __init__(self, config: EstimatorConfig) -> None:
+        self._config = config
+        self._ceiling = config.statistic_ceiling or 0.0
+        self.noise_variance = config.noise_variance
+        self.rivals = [0.0, 0.0]
+        """Statistics under the readings that recent edges came one sample early, and late."""
+        self.restart(config.warm_up_n)
+
+    def restart(self, quiet_n: int) -> None:
+        """Begin anew; the statistic is zero for ``quiet_n`` innovations."""
+        self.statistic, self._quiet_n = 0.0, quiet_n
+        self._mean, self._mean_n = 0.0, 0
+
+    @property
+    def doubts_edges(self) -> bool:
+        """True if the trigger considers other readings of an edge."""
+        return self._config.edge_instants == "may-slip" and self._config.trigger == "cusum"
+
+    @property
+    def has_rival(self) -> bool:
+        """True if another reading of the edges explains the innovations better than the recorded one."""
+        return min(self.rivals) < self.statistic
+
+    @property
+    def comes_late(self) -> bool:
+        """True if the better of the other readings has late edges."""
+        return self.rivals[1] < self.rivals[0]
+
+    def begin_doubt(self) -> None:
+        """Start the other readings from the present statistic."""
+        self.rivals = [self.statistic, self.statistic]
+
+    def end_doubt(self) -> Decision:
+        """End a doubt at a gap: a slip if nothing but another reading has prevented an alarm."""
+        if self.statistic >= self._ceiling:
+            return Decision.SLIP
+        self.statistic = min(self.statistic, *self.rivals)
+        return Decision.QUIET
+
+    def settle(self) -> None:
+        """Continue with the better of the other readings, after a slip."""
+        self.statistic = min(self.rivals)
+
+    def follow_noise(self, innovation: float, variance: float) -> None:
+        """Follow the noise variance. ``variance``: of the innovation, in noise variances."""
+        if self._config.noise_estimated:
+            square = min(innovation**2 / variance, NOISE_CLIP * self.noise_variance)
+            self.noise_variance += NOISE_RATE * (square / NOISE_KEPT - self.noise_variance)
+
+    def enter(
+        self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
+    ) -> Decision:
+        """Enter an innovation with its variance in noise variances.
+
+        :param readings: innovations under the other readings of the edges in doubt; None without doubt.
+        :param expires: the doubt ends with this sample.
+        """
+        if self._quiet_n:
+            self._quiet_n -= 1
+            return Decision.QUIET
+        trigger = self._config.trigger
+        if trigger == "none":
+            return Decision.QUIET
+        if trigger == "cusum":
+            return self._enter_cusum(innovation, variance * self.noise_variance, readings, expires=expires)
+        self.statistic = abs(innovation)
+        if trigger == "mean-between-faults":  # thesis 4.4.3
+            self._mean_n += 1
+            self._mean += ((abs(innovation) if self._config.absolute else innovation) - self._mean) / self._mean_n
+            self.statistic = abs(self._mean)
+        return Decision.ALARM if self.statistic >= self._ceiling else Decision.QUIET
+
+    def _enter_cusum(
+        self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
+    ) -> Decision:
+        self.statistic = _cusum(self.statistic, innovation, variance)
+        if readings is not None:
+            self.rivals = [_cusum(g, e, variance) for g, e in zip(self.rivals, readings, strict=True)]
+        if self.statistic < self._ceiling:
+            return Decision.QUIET
+        if readings is None or min(self.rivals) >= self._ceiling:
+            return Decision.ALARM
+        return Decision.SLIP if expires else Decision.QUIET
+
+
+def _cusum(before: float, innovation: float, variance: float) -> float:
+    """Cumulative sum of the log-likelihood ratio of a fourfold variance, at least zero."""
+    return max(0.0, before + GAIN * innovation * innovation / variance - DRIFT)
