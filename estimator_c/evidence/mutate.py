@@ -48,9 +48,11 @@ __all__ = [
     "EXPLAINED",
     "Mutant",
     "Outcome",
+    "Session",
     "explained",
     "main",
     "mutants",
+    "mutants_of",
     "recalled",
     "sampled",
     "sources",
@@ -117,7 +119,7 @@ OPERATOR = re.compile(rf"(?<= )({'|'.join(re.escape(op) for op in sorted(SWAPS, 
 
 NOT = re.compile(r"!(?=[\w(])")
 MINUS = re.compile(r"(?<=[(?:,=] )-(?=[\w(])|(?<=\()-(?=[\w(])")
-WHOLE = re.compile(r"\b(\d+)U\b")
+WHOLE = re.compile(r"\b(\d+)[Uu]\b")
 REAL = re.compile(r"\b(\d+\.\d+(?:e-?\d+)?)F\b")
 CONDITION = re.compile(r"\b(?:if|while) \((.*)\) \{$")
 STATEMENT = re.compile(r"^ +(?!return|break|const|static|float|bool|u?int\w*_t|est_\w+_t |\(void\))[\w*(][^;]*;$")
@@ -186,10 +188,11 @@ def altered(line: str) -> Iterator[str]:
 
 def mutants() -> list[Mutant]:
     """All of the core, in the order of the sources."""
-    return [mutant for path in sorted(CORE.glob("*.[ch]")) for mutant in _mutants_of(path)]
+    return [mutant for path in sorted(CORE.glob("*.[ch]")) for mutant in mutants_of(path)]
 
 
-def _mutants_of(path: Path) -> Iterator[Mutant]:
+def mutants_of(path: Path) -> Iterator[Mutant]:
+    """Mutants of one file, in the order of its lines."""
     for number, function, line in _lines_of(path):
         yield from (Mutant(path.name, number, function, line, after) for after in altered(line))
 
@@ -346,16 +349,28 @@ def _load_tests() -> None:
     estimator.__init__ = start_mutant
 
 
-class _Session:
+class Session:
     """A session of pytest: each test twice on the core as it is, to fill what is kept and to see how long it takes.
 
     Then ``work``, which has them run again in forks.
 
+    :param arguments: what pytest runs.
     :param noticed: how many mutants each test is known to have noticed.
+    :param begin: called in each fork before its first test.
+    :param deadline_s: longest time of a test, in seconds of the processor.
     """
 
-    def __init__(self, noticed: Mapping[str, int], work: Callable[[_Session], None]) -> None:
-        self._noticed, self._work = noticed, work
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        noticed: Mapping[str, int],
+        work: Callable[[Session], None],
+        *,
+        begin: Callable[[pytest.Session], None] = lambda _: None,
+        deadline_s: int = DEADLINE_S,
+    ) -> None:
+        self._arguments, self._noticed, self._work = arguments, noticed, work
+        self._begin, self._deadline_s = begin, deadline_s
         self._tests: list[pytest.Item] = []
         self._seconds: dict[str, float] = {}
         self._outside = sys.stdout
@@ -366,13 +381,13 @@ class _Session:
         """Run the session; RuntimeError if a test fails on the core as it is."""
         options = "-q --assert=plain -p no:xdist -p no:cacheprovider -o timeout=0 -s -p no:faulthandler".split()
         with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
-            status = pytest.main([*options, "-k", LONG, f"--rootdir={ROOT}", *TESTS], plugins=[self])
+            status = pytest.main([*options, *self._arguments], plugins=[self])
         if self._failed or status != pytest.ExitCode.OK:
             raise RuntimeError(f"the tests fail on the core as it is: {self._failed or status!r}")
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Replace the test loop of pytest."""
-        self._tests = session.items
+        self._tests, self._session = session.items, session
         if not (self._first_failure() or self._first_failure()):
             self._tests.sort(key=self._price)
             with contextlib.redirect_stdout(self._outside):
@@ -403,7 +418,8 @@ class _Session:
         receiver, sender = os.pipe()
         child = os.fork()
         if child == 0:
-            self._before_each = _set_deadline
+            self._before_each = functools.partial(_set_deadline, self._deadline_s)
+            self._begin(self._session)
             nothing = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nothing, 1)
             os.dup2(nothing, 2)
@@ -418,9 +434,9 @@ class _Session:
         return said if status == 0 else f"crash: {status}"
 
 
-def _set_deadline() -> None:
+def _set_deadline(deadline_s: int = DEADLINE_S) -> None:
     now = resource.getrusage(resource.RUSAGE_SELF)
-    ends = int(now.ru_utime + now.ru_stime) + DEADLINE_S
+    ends = int(now.ru_utime + now.ru_stime) + deadline_s
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
 
 
@@ -477,7 +493,7 @@ class _Build:
         return out
 
 
-_begun: list[tuple[_Session, tuple[_Build, _Build], str]] = []
+_begun: list[tuple[Session, tuple[_Build, _Build], str]] = []
 """The session, the core as it is, and its hash."""
 
 
@@ -519,7 +535,7 @@ def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tel
         _library = plain[0].linked("-shared")
         expected = _hash(plain[1].linked())
 
-        def work(session: _Session) -> None:
+        def work(session: Session) -> None:
             _begun.append((session, plain, expected))
             with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
                 for future in as_completed([pool.submit(_try, mutant) for mutant in chosen]):
@@ -528,7 +544,7 @@ def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tel
                     tell(dataclasses.replace(outcome, source=sources()[where]))
 
         _load_tests()
-        _Session(noticed, work).run()
+        Session(["-k", LONG, f"--rootdir={ROOT}", *TESTS], noticed, work).run()
 
 
 def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:

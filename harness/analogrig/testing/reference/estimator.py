@@ -5,6 +5,7 @@ It follows harness/docs/background/estimator.md and the manual est.h, not the C.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -94,10 +95,16 @@ class ReferenceEstimator:
         self.same_n = 0  # samples of constant y since an edge of u
         self.doubt: Doubt | None = None
         self.slipped: Vector | None = None  # theta after a slip, valid from the next sample on
+        self.deviation = 0.0  # predicted standard deviation of the last innovation, in codes
 
     @property
     def _past_n(self) -> int:
         return max(self.config.na, self.config.nb + self.config.nk - 1)
+
+    @property
+    def deviations(self) -> Vector:
+        """Standard deviations of theta."""
+        return [math.sqrt(each * self.trigger.noise_variance) for each in self.covariance.variances]
 
     @property
     def slips(self) -> int:
@@ -229,6 +236,7 @@ class ReferenceEstimator:
         self.trigger.follow_noise(innovation, variance)
         expires = self.doubt is not None and self.doubt.age_n >= DOUBT_N
         decision = self.trigger.enter(innovation, variance, readings, expires=expires)
+        self.deviation = math.sqrt(variance * self.trigger.noise_variance)
         step = self._stepped(self.trigger.statistic, 0, innovation, alarm=decision is Decision.ALARM)
         if decision is Decision.ALARM:
             self._alarm()

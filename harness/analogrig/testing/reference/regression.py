@@ -71,6 +71,12 @@ class Covariance:
         self.d, self.weight = list(self.prior), 1.0
         self.u = [[float(i == j) for j in range(n)] for i in range(n)]
 
+    @property
+    def variances(self) -> Vector:
+        """Diagonal of P."""
+        n = len(self.d)
+        return [sum(self.u[i][j] ** 2 * self.d[j] for j in range(i, n)) / self.weight for i in range(n)]
+
     def inflate(self, factor: float) -> None:
         """Multiply P by this factor, up to the prior."""
         self.d = [min(d * factor / self.weight, p) for d, p in zip(self.d, self.prior, strict=True)]

@@ -1,0 +1,111 @@
+"""Experiments that compare a device with the reference of the estimator that it describes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analogrig.devices.device import Device
+from analogrig.devices.registry import recorded
+from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator
+from analogrig.errors import DeviceRefused
+from analogrig.run import Run, missing_samples
+from analogrig.scenario import Scenario
+from analogrig.testing.properties.experiments import device_description
+from analogrig.testing.reference.cases import CASES, Case, SpoiledRig, U, Y
+from analogrig.testing.reference.comparison import Expected, expected_of
+from analogrig.testing.statement import Finding, Play, experiment
+
+ROUNDING = 0.1
+"""Largest deviation of an innovation from the reference, in standard deviations of that innovation: float32 may cost a
+tenth of what noise costs. Half of it is the most that was measured (harness/docs/background/properties.md)."""
+
+THETA_ROUNDING = 0.2
+"""The same of an element of theta, in its own standard deviations."""
+
+STATISTIC_ROUNDING = 0.1
+"""The same of the statistic, relative to the statistic and 1."""
+
+
+@experiment
+def computes_what_it_describes(play: Play, scenario: Scenario, seed: int, case: str) -> Finding:
+    """Finding: estimates, innovations, statistic, flags, alarms and counters are those of the reference.
+
+    :param case: name of one of ``analogrig.testing.reference.cases``.
+    """
+    description = described_estimator(play)
+    chosen = CASES[case]
+    rig = SpoiledRig(play.bench.rig, chosen.spoil) if chosen.spoil else play.bench.rig
+    with _configured(play, description, chosen) as device:
+        run = play.on(rig, device)(scenario, seed, allow_inconclusive=True).run
+    if run.conditions.faults or run.samples < scenario.samples:
+        return Finding(holds=False, why=f"{case}: {next(iter(run.conditions.faults), 'the run ended early')}", run=run)
+    wrong = next(differences(run, expected_for(run)), "")
+    return Finding(not wrong, f"{case}: {wrong or f'{run.samples} samples as described'}", run=run)
+
+
+def described_estimator(play: Play) -> CatalogueDescription:
+    """Description of the device, if it declares the estimator of the reference; else the test is skipped."""
+    description = device_description(play.bench.dut)
+    if not has_our_estimator(description):
+        pytest.skip(f"needs a device with the settings of EstimatorConfig, not {play.bench.dut.name}")
+    if description.core != "est":
+        pytest.skip(f"needs a device with core = 'est', not {description.core!r}")
+    return description
+
+
+@contextlib.contextmanager
+def _configured(play: Play, description: CatalogueDescription, case: Case) -> Iterator[Device]:
+    """The device with the settings of a case; the test is skipped if its build lacks them."""
+    with contextlib.ExitStack() as stack:
+        device = play.bench.dut
+        if case.exchange and "in-process" in description.capabilities:
+            device = stack.enter_context(dataclasses.replace(description, exchange=case.exchange).connect())
+        try:
+            device.configure(**case.settings)
+        except DeviceRefused as error:
+            if case.is_optional:
+                pytest.skip(str(error))
+            raise
+        yield device
+
+
+def expected_for(run: Run) -> Expected:
+    """Answers of the reference to the samples of a run."""
+    description = recorded(run.conditions.dut)
+    assert has_our_estimator(description)
+    u, y = (np.ascontiguousarray(run.codes[:, channel]) for channel in (U, Y))
+    return expected_of(description.estimator, u, y, ~missing_samples(run.clipped))
+
+
+def differences(run: Run, expected: Expected) -> Iterator[str]:
+    """Differences of a run from the reference, the most telling first."""
+    if not np.array_equal(run.flags, expected.flags):
+        at = int(np.argmax(run.flags != expected.flags))
+        yield f"flags at sample {at} are {run.flags[at]:#04x}, expected {expected.flags[at]:#04x}"
+    if tuple(run.alarm_index.tolist()) != expected.alarms:
+        yield f"alarms at {run.alarm_index.tolist()[:9]}, expected at {list(expected.alarms)[:9]}"
+    yield from _beyond("innovation", run.innovation, expected.innovation, ROUNDING * expected.deviation)
+    yield from _beyond("theta", run.theta, expected.theta, THETA_ROUNDING * expected.theta_deviation)
+    yield from _beyond("statistic", run.statistic, expected.statistic, STATISTIC_ROUNDING * (1.0 + expected.statistic))
+    for name, count in expected.counters.items():
+        if run.conditions.counters[name] != count:
+            yield f"{run.conditions.counters[name]} {name} counted, expected {count}"
+
+
+def _beyond(
+    name: str, found: NDArray[np.float32], expected: NDArray[np.float64], allowed: NDArray[np.float64]
+) -> Iterator[str]:
+    if found.shape != expected.shape:
+        yield f"{name} has the shape {found.shape}, expected {expected.shape}"
+        return
+    outside = np.argwhere(~(np.abs(found - expected) <= allowed + 1e-6 * (1.0 + np.abs(expected))))
+    if len(outside):
+        at = tuple(outside[0].tolist())
+        element = f"[{at[1]}]" if len(at) > 1 else ""
+        yield f"{name}{element} at sample {at[0]} is {found[at]:g}, expected {expected[at]:g} +- {allowed[at]:.2g}"

@@ -1,0 +1,151 @@
+"""Cases in which a device is compared with the reference: settings, a scenario, and what becomes of its samples."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.rigs.rig import Block, Performance, Rig
+from analogrig.run import CHANNELS
+from analogrig.scenario import PlantChoice, PotChange, Scenario
+from analogrig_emulator import Excitation
+
+U, Y = CHANNELS.index("force"), CHANNELS.index("displacement")
+
+Codes = NDArray[np.uint16]
+Spoil = Callable[[Codes, NDArray[np.bool_]], None]
+"""Change of the codes (n, 4), in place, and of the samples that are missing (n,)."""
+
+PLANT = PlantChoice("front", mass_kg=35.0, damping_n_s_per_m=2400.0, stiffness_n_per_m=24_500.0)
+"""A fast plant. Its prefilter amplifies rounding little: float32 stays within a twentieth of the noise."""
+
+_SQUARE = Excitation(low_v=0.1, high_v=3.0)
+_FREE = dataclasses.replace(_SQUARE, clock="free")
+
+
+def _scenario(name: str, excitation: Excitation, samples: int = 640, **changed: Any) -> Scenario:
+    changes = (PotChange(420, **changed),) if changed else ()
+    return Scenario(samples=samples, excitation=excitation, plant=PLANT, tweaks=changes, name=name)
+
+
+SOFTER = _scenario("softer", dataclasses.replace(_FREE, phase=0.133), stiffness_n_per_m=19_600.0)
+LOCKED = _scenario("softer, one clock", _SQUARE, stiffness_n_per_m=19_600.0)
+HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
+LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
+EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
+RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Settings of the estimator beside its defaults, and the samples that it receives."""
+
+    scenario: Scenario
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    spoil: Spoil | None = None
+    exchange: str = ""
+    """Exchange of the device, if it runs in this process; empty: that of the session."""
+    is_optional: bool = False
+    """True if a build of the device may lack the settings."""
+
+
+class SpoiledRig(Rig):
+    """Rig whose samples a case has changed."""
+
+    def __init__(self, rig: Rig, spoil: Spoil) -> None:
+        self._rig, self._spoil = rig, spoil
+        self.capabilities = rig.capabilities
+
+    def description(self) -> Mapping[str, Any]:
+        return self._rig.description()
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        performance = self._rig.perform(scenario, seed)
+        return dataclasses.replace(performance, blocks=self._blocks(performance.blocks))
+
+    def _blocks(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        every = list(blocks)
+        codes = np.concatenate([block.codes for block in every])
+        missing = np.zeros(len(codes), np.bool_)
+        self._spoil(codes, missing)
+        for block in every:
+            here = slice(block.first, block.first + len(block.codes))
+            clipped = block.clipped | missing[here, np.newaxis]
+            yield dataclasses.replace(block, codes=codes[here], clipped=clipped)
+
+
+def edges_of(codes: Codes) -> NDArray[np.int64]:
+    """Samples with another level of the force than the sample before."""
+    steps = np.abs(np.diff(codes[:, U].astype(np.int64)))
+    return np.flatnonzero(steps > steps.max() // 2) + 1
+
+
+# ------------------------------------------------------------------------------------------------- what becomes of them
+
+
+def leave_out(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """Single samples, pairs and stretches: at the start, beside edges, and after an alarm."""
+    edges = edges_of(codes)
+    missing[[0, 3, 40, 41, 90, 435, 436, 460]] = True
+    missing[200:230] = True
+    for number, edge in enumerate(edges[3:9].tolist()):
+        missing[edge + (-1, 0, 1, 2, 5, 11)[number % 6]] = True
+
+
+def saturate(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """Codes at the limits of the range, and one beside them."""
+    missing[[150]] = True
+    codes[[60, 61], Y] = (LOW, LOW + 1)
+    codes[[130, 131], Y] = (HIGH, HIGH - 1)
+    codes[170, U] = LOW
+    codes[180:184, U] = HIGH
+    codes[250, [U, Y]] = (LOW - 1, HIGH + 1)
+
+
+LOW, HIGH = 360, 1360
+
+
+def hold(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """A displacement that is stuck across edges, shortly and for long, and across a missing sample."""
+    edges = edges_of(codes).tolist()
+    codes[edges[2] - 2 : edges[2] + 7, Y] = codes[edges[2] - 2, Y]
+    codes[edges[4] - 2 : edges[4] + 8, Y] = codes[edges[4] - 2, Y]
+    codes[edges[6] - 30 : edges[6] + 60, Y] = codes[edges[6] - 30, Y]
+    missing[edges[6] + 20] = True
+
+
+_FREE_ALARMS = {"warm_up_n": 60, "refresh_n": 0}
+_TWO_B = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked"}
+
+CASES: Mapping[str, Case] = {
+    "default": Case(SOFTER),
+    "default in blocks": Case(SOFTER, exchange="block"),
+    "one clock": Case(LOCKED, {**_TWO_B, "forgetting": 0.997}),
+    "anywhere": Case(SOFTER, {"edge_instants": "anywhere", "edge_codes": 500.0}),
+    "edges become late": Case(LATE, {"warm_up_n": 100}),
+    "edges become early": Case(EARLY, {"warm_up_n": 100}),
+    "missing": Case(SOFTER, {"warm_up_n": 100}, leave_out),
+    "saturated": Case(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
+    "stuck": Case(HEALTHY, {"stuck_n": 8}, hold),
+    "idle": Case(RARE_EDGES, {"idle_n": 60}),
+    "noise estimated": Case(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
+    "random walk": Case(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
+    "extended": Case(SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0}, is_optional=True),
+    "first order": Case(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
+    "longest": Case(SOFTER, {"nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
+    "prediction error": Case(
+        SOFTER, {"trigger": "prediction-error", "ceiling": 12.0, "hold_off_n": 30, "reset": "all", **_FREE_ALARMS}
+    ),
+    "mean": Case(SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.6, "hold_off_n": 4, **_FREE_ALARMS}),
+    "mean of magnitudes": Case(
+        SOFTER, {"trigger": "mean-between-faults", "ceiling": 1.8, "absolute": True, "hold_off_n": 20, **_FREE_ALARMS}
+    ),
+    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 7}),
+    "often refreshed": Case(SOFTER, {"refresh_n": 18, "c": (-0.9, 0.2)}),
+    "low ceiling": Case(SOFTER, {"arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}),
+}

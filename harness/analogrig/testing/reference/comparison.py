@@ -1,0 +1,59 @@
+"""Expected answers of a device that computes what it describes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.estimator_config import EstimatorConfig
+from analogrig.testing.reference.estimator import ReferenceEstimator
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Answers of the reference to n samples."""
+
+    theta: NDArray[np.float64]
+    """(n, p)"""
+    theta_deviation: NDArray[np.float64]
+    """(n, p) standard deviation of theta."""
+    innovation: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+    """(n,) predicted standard deviation of the innovation."""
+    statistic: NDArray[np.float64]
+    flags: NDArray[np.uint8]
+    alarms: tuple[int, ...]
+    counters: Mapping[str, int]
+
+
+def expected_of(
+    config: EstimatorConfig, u: NDArray[np.uint16], y: NDArray[np.uint16], valid: NDArray[np.bool_]
+) -> Expected:
+    """Answers of the reference, which is run once for the same samples."""
+    return _expected(config, u.tobytes(), y.tobytes(), valid.tobytes())
+
+
+@functools.lru_cache(maxsize=256)
+def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expected:
+    reference = ReferenceEstimator(config)
+    force, displacement = (np.frombuffer(codes, np.uint16).tolist() for codes in (u, y))
+    theta, spread, deviation, steps = [], [], [], []
+    for sample in zip(force, displacement, np.frombuffer(valid, np.bool_).tolist(), strict=True):
+        steps.append(reference.step(sample[0], sample[1], valid=sample[2]))
+        theta.append(reference.theta)
+        spread.append(reference.deviations)
+        deviation.append(reference.deviation)
+    return Expected(
+        theta=np.array(theta),
+        theta_deviation=np.array(spread),
+        innovation=np.array([step.innovation for step in steps]),
+        deviation=np.array(deviation),
+        statistic=np.array([step.statistic for step in steps]),
+        flags=np.array([step.flags for step in steps], np.uint8),
+        alarms=tuple(k for k, step in enumerate(steps) if step.alarm),
+        counters=reference.counters,
+    )

@@ -1,0 +1,227 @@
+"""Mutants of the device against the shipped properties alone.
+
+`make mutants` draws mutants of core, isolation, device and codec with a seed, builds each as the library of the device
+in this process, and runs the shipped properties on it until one fails. It prints those that none fails. SURVIVORS.md
+explains them; one that it does not explain is a failure, and so is a score below LEAST.
+
+Only code that the library can reach counts: a mutant whose library has the same bytes is equivalent. The properties are
+loaded and run once on the device as it is, and forked for each mutant, those first that fail most in the least time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from estimator_c.evidence.mutate import Mutant, Outcome, Session, code_of, mutants_of, sampled, shown, table
+from tests.properties.planted import FOLDERS, FOUND_ONLY, GENERATED, ROOT, SOURCES
+
+PARTS = ("core", "isolation", "device")
+LEAST = 0.95
+"""Least part of the mutants with other code that the shipped properties fail."""
+
+DEADLINE_S = 60
+"""Longest time of one property on a mutant, which may not come to an end, in seconds of the processor."""
+
+EXPORTED = ("library_*", "serial_device_*", "can_device_*")
+"""Functions of the library that the harness calls."""
+
+OPTIONS = (
+    *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
+    *("-ffunction-sections", "-fdata-sections"),
+)
+"""One copy of each equation's code, as for ``make mutate``."""
+
+RECORD = ROOT / "build" / "mutants.json"
+PAGE = ROOT / "harness" / "docs" / "evidence" / "mutants.md"
+SURVIVORS = Path(__file__).with_name("SURVIVORS.md")
+
+
+def every_mutant() -> list[Mutant]:
+    """All of core, isolation, device and codec, in the order of the sources."""
+    files = [path for part in PARTS for path in sorted((SOURCES / part).glob("*.[ch]"))]
+    return [mutant for path in (*files, *sorted(GENERATED.glob("*.c"))) for mutant in mutants_of(path)]
+
+
+class Build:
+    """The device in a folder; only what a mutant alters is compiled again."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        self.folder = folder
+        self._exports = folder / "exports"
+        self._exports.write_text(f"{{ global: {'; '.join(EXPORTED)}; local: *; }};\n")
+        for part in (*PARTS, "ports/library"):
+            for path in sorted((SOURCES / part).glob("*.[ch]")):
+                shutil.copy(path, folder)
+        for path in GENERATED.glob("*.[ch]"):
+            shutil.copy(path, folder)
+        self._compile(self._sources())
+        self._bytes = self.linked().read_bytes()
+
+    def _sources(self) -> list[str]:
+        return sorted(path.name for path in self.folder.glob("*.c"))
+
+    def _compile(self, names: Sequence[str], into: Path | None = None) -> None:
+        for name in names:
+            out = (into or self.folder) / f"{Path(name).stem}.o"
+            command = ["gcc", *OPTIONS, f"-iquote{into or self.folder}", f"-I{self.folder}", "-c"]
+            source = (into / name) if into and (into / name).exists() else self.folder / name
+            subprocess.run([*command, str(source), "-o", str(out)], check=True, capture_output=True)
+
+    def linked(self, other: Path | None = None) -> Path:
+        """The library, with the objects of ``other`` in place of its own."""
+        objects = {path.name: path for folder in (self.folder, other) if folder for path in folder.glob("*.o")}
+        out = (other or self.folder) / "device.so"
+        command = ["gcc", "-shared", "-Wl,--gc-sections", "-Wl,--build-id=none", f"-Wl,--version-script={self._exports}"]
+        files = [str(path) for _, path in sorted(objects.items())]
+        subprocess.run([*command, *files, "-s", "-o", str(out)], check=True, capture_output=True)
+        return out
+
+    def mutated(self, mutant: Mutant, folder: Path) -> Path | None:
+        """The library with a mutant; None if it has the same bytes. CalledProcessError if it does not compile."""
+        lines = (self.folder / mutant.file).read_text(encoding="utf-8").splitlines()
+        lines[mutant.line - 1] = mutant.after
+        if mutant.file.endswith(".c"):
+            (folder / mutant.file).write_text("\n".join(lines) + "\n", encoding="utf-8")
+            names = [mutant.file]
+        else:  # sources include headers beside them first
+            names = [name for name in self._sources() if self._includes(name, mutant.file)]
+            for path in (*self.folder.glob("*.h"), *(self.folder / name for name in names)):
+                shutil.copy(path, folder)
+            (folder / mutant.file).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        self._compile(names, folder)
+        library = self.linked(folder)
+        return None if library.read_bytes() == self._bytes else library
+
+    def _includes(self, source: str, header: str) -> bool:
+        """True if a source may include a header: all do but those of the codec."""
+        return not source.startswith("analogrig_") or header.startswith("analogrig_")
+
+
+_library: list[Path] = []
+"""The library of the mutant in this process; the last one counts."""
+
+_begun: list[tuple[Session, Build]] = []
+
+
+def _load_mutants() -> None:
+    """Have ctypes load the mutant wherever the project's device is asked for."""
+    from analogrig.devices.library import LIBRARY
+
+    load: Callable[..., Any] = ctypes.CDLL
+
+    def load_mutant(name: Any, *args: Any, **kwargs: Any) -> Any:
+        return load(str(_library[-1]) if name == str(LIBRARY) else name, *args, **kwargs)
+
+    ctypes.CDLL = load_mutant  # type: ignore[assignment,misc]
+
+
+def _forget_devices(session: pytest.Session) -> None:
+    """Close the devices of the session: the next one is the mutant."""
+    from analogrig.testing.plugin.devices import DEVICES
+
+    session.config.stash[DEVICES].close()
+
+
+def _try(mutant: Mutant) -> Outcome:
+    """Try a mutant in a worker of the pool, a fork of the process that has begun the session."""
+    session, build = _begun[-1]
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            library = build.mutated(mutant, Path(scratch))
+        except subprocess.CalledProcessError:
+            return Outcome(mutant, "invalid")
+        if library is None:
+            return Outcome(mutant, "equivalent")
+        _library.append(library)
+        failed = session.first_failure()
+        return Outcome(mutant, "killed", failed) if failed else Outcome(mutant, "survived")
+
+
+def try_all(
+    chosen: Sequence[Mutant],
+    jobs: int,
+    noticed: Mapping[str, int],
+    tell: Callable[[Outcome], None],
+    only: str = "",
+) -> None:
+    """Report each outcome as soon as it is known; RuntimeError if a property fails on the device as it is."""
+    with tempfile.TemporaryDirectory() as scratch:
+        build = Build(Path(scratch, "device"))
+        _library.append(build.folder / "device.so")
+        _load_mutants()
+
+        def work(session: Session) -> None:
+            _begun.append((session, build))
+            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
+                for future in as_completed([pool.submit(_try, mutant) for mutant in chosen]):
+                    tell(future.result())
+
+        arguments = [
+            *("-c", os.devnull, f"--rootdir={scratch}", "-p", "no:randomly", "-p", FOUND_ONLY, "--tb=no"),
+            *("--pyargs", "analogrig.testing.properties", "--hil-dut", "inproc", "--hil-runs-dir", f"{scratch}/runs"),
+            *(("-k", only) if only else ()),
+        ]
+        Session(arguments, noticed, work, begin=_forget_devices, deadline_s=DEADLINE_S).run()
+
+
+def main() -> int:
+    """Print what survived; the exit status is 1 if something is unexplained, or the score is too low."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sample", type=int, help="so many mutants, by chance")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="mutants of the files whose name matches this")
+    parser.add_argument("--properties", default="", help="properties to run, as for pytest -k")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--again", action="store_true", help="the survivors of the last run alone")
+    parser.add_argument("--out", type=Path, default=RECORD)
+    arguments = parser.parse_args()
+    every = [mutant for mutant in every_mutant() if re.search(arguments.only, mutant.file)]
+    chosen = sampled(every, len(every), arguments.seed)[: arguments.sample]
+    before = [Outcome(**{**each, "mutant": Mutant(**each["mutant"])}) for each in _recorded(arguments.out)]
+    noticed = Counter(outcome.by for outcome in before if outcome.fate == "killed")
+    if arguments.again:
+        chosen = [outcome.mutant for outcome in before if outcome.fate == "survived"]
+    outcomes: list[Outcome] = []
+
+    def tell(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        if outcome.fate == "survived":
+            print(shown(outcome.mutant.key), f"   line {outcome.mutant.line}", flush=True)
+
+    print(f"{len(chosen)} of {len(every)} mutants, seed {arguments.seed}", flush=True)
+    try_all(chosen, arguments.jobs, noticed, tell, arguments.properties)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
+    print(table(every, outcomes))
+    fates = Counter(outcome.fate for outcome in outcomes)
+    score = fates["killed"] / max(fates["killed"] + fates["survived"], 1)
+    print(f"score {score:.1%}: {fates['killed']} killed, {fates['survived']} survived,"
+          f" {fates['equivalent']} equivalent, {fates['invalid']} do not compile")
+    print(Counter(outcome.by for outcome in outcomes if outcome.fate == "killed").most_common(60))
+    return 0
+
+
+def _recorded(path: Path) -> list[dict[str, Any]]:
+    return json.loads(path.read_text()) if path.exists() else []
+
+
+if __name__ == "__main__":
+    sys.exit(main())
