@@ -31,6 +31,9 @@ THETA_ROUNDING = 0.2
 STATISTIC_ROUNDING = 0.1
 """The same of the statistic, relative to the statistic and 1."""
 
+EXTENT_ROUNDING = 5e-4
+"""The same of the extent of a change, relative to it."""
+
 
 @experiment
 def computes_what_it_describes(play: Play, scenario: Scenario, seed: int, case: str) -> Finding:
@@ -93,9 +96,20 @@ def differences(run: Run, expected: Expected) -> Iterator[str]:
     yield from _beyond("innovation", run.innovation, expected.innovation, ROUNDING * expected.deviation)
     yield from _beyond("theta", run.theta, expected.theta, THETA_ROUNDING * expected.theta_deviation)
     yield from _beyond("statistic", run.statistic, expected.statistic, STATISTIC_ROUNDING * (1.0 + expected.statistic))
+    yield from _other_diagnoses(run, expected)
     for name, count in expected.counters.items():
         if run.conditions.counters[name] != count:
             yield f"{run.conditions.counters[name]} {name} counted, expected {count}"
+
+
+def _other_diagnoses(run: Run, expected: Expected) -> Iterator[str]:
+    named = np.column_stack([run.diagnosis_index, run.diagnosis_change, run.diagnosis_onset]).tolist()
+    wanted = [list(each[:3]) for each in expected.diagnoses]
+    if named != wanted:
+        yield f"diagnoses (sample, change, onset) {named}, expected {wanted}"
+        return
+    extents = np.array([each[3] for each in expected.diagnoses])
+    yield from _beyond("extent", run.diagnosis_extent, extents, EXTENT_ROUNDING * extents)
 
 
 def _beyond(

@@ -35,6 +35,16 @@ def _scenario(name: str, excitation: Excitation, samples: int = 640, **changed: 
 
 SOFTER = _scenario("softer", dataclasses.replace(_FREE, phase=0.133), stiffness_n_per_m=19_600.0)
 LOCKED = _scenario("softer, one clock", _SQUARE, stiffness_n_per_m=19_600.0)
+_SINGLE = {
+    "M falls": {"mass_kg": 30.1},
+    "M rises": {"mass_kg": 45.5},
+    "B falls": {"damping_n_s_per_m": 1920.0},
+    "B rises": {"damping_n_s_per_m": 2880.0},
+    "K falls": {"stiffness_n_per_m": 19_600.0},
+    "K rises": {"stiffness_n_per_m": 28_000.0},
+    "B and K fall": {"damping_n_s_per_m": 1500.0, "stiffness_n_per_m": 17_500.0},
+    "M and K rise": {"mass_kg": 60.0, "stiffness_n_per_m": 28_500.0},
+}
 HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
@@ -97,6 +107,12 @@ def leave_out(codes: Codes, missing: NDArray[np.bool_]) -> None:
         missing[edge + (-1, 0, 1, 2, 5, 11)[number % 6]] = True
 
 
+def leave_out_later(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """Few samples shortly before a change."""
+    missing[[edges_of(codes)[-3] - 9]] = True
+    missing[404] = True
+
+
 def saturate(codes: Codes, missing: NDArray[np.bool_]) -> None:
     """Codes at the limits of the range, and one beside them."""
     missing[[150]] = True
@@ -147,5 +163,15 @@ CASES: Mapping[str, Case] = {
     ),
     "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 7}),
     "often refreshed": Case(SOFTER, {"refresh_n": 18, "c": (-0.9, 0.2)}),
+    **{
+        name: Case(_scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed))
+        for number, (name, changed) in enumerate(_SINGLE.items())
+    },
+    "M falls, one clock": Case(
+        _scenario("M falls, one clock", _SQUARE, 530, **_SINGLE["M falls"]),
+        {"nb": 2, "nk": 1, "offset": True, "edge_instants": "locked", "forgetting": 0.995},
+    ),
+    "B rises, missing": Case(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
+    "no isolation": Case(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
     "low ceiling": Case(SOFTER, {"arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}),
 }

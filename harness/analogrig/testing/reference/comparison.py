@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.testing.reference.estimator import ReferenceEstimator
+from analogrig.testing.reference.isolation import ReferenceIsolation
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,8 @@ class Expected:
     statistic: NDArray[np.float64]
     flags: NDArray[np.uint8]
     alarms: tuple[int, ...]
+    diagnoses: tuple[tuple[int, int, int, float], ...]
+    """Sample after which each was sent, change, onset and extent."""
     counters: Mapping[str, int]
 
 
@@ -40,10 +43,16 @@ def expected_of(
 @functools.lru_cache(maxsize=256)
 def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expected:
     reference = ReferenceEstimator(config)
+    isolation = ReferenceIsolation(reference)
+    diagnoses, alarm = [], 0
     force, displacement = (np.frombuffer(codes, np.uint16).tolist() for codes in (u, y))
     theta, spread, deviation, steps = [], [], [], []
-    for sample in zip(force, displacement, np.frombuffer(valid, np.bool_).tolist(), strict=True):
-        steps.append(reference.step(sample[0], sample[1], valid=sample[2]))
+    samples = zip(force, displacement, np.frombuffer(valid, np.bool_).tolist(), strict=True)
+    for index, (at_u, at_y, is_valid) in enumerate(samples):
+        steps.append(reference.step(at_u, at_y, valid=is_valid))
+        alarm = index if steps[-1].alarm else alarm
+        if found := isolation.enter(at_u, at_y, steps[-1]):
+            diagnoses.append((index, int(found.change), alarm - found.onset_n, found.extent))
         theta.append(reference.theta)
         spread.append(reference.deviations)
         deviation.append(reference.deviation)
@@ -55,5 +64,6 @@ def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expe
         statistic=np.array([step.statistic for step in steps]),
         flags=np.array([step.flags for step in steps], np.uint8),
         alarms=tuple(k for k, step in enumerate(steps) if step.alarm),
+        diagnoses=tuple(diagnoses),
         counters=reference.counters,
     )
