@@ -1,0 +1,178 @@
+"""Experiment that compares a device's answers with those that the catalogue and the reference demand."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import pytest
+
+from analogrig.catalogue import Configure, Configured, Element, Estimate, Firmware, Hello, Identify, Key, Message, Result, SampleBlock
+from analogrig.devices.catalogue_description import CatalogueDescription
+from analogrig.errors import AnalogrigError, LinkTimeout
+from analogrig.estimator_config import EstimatorConfig
+from analogrig.links.can_link import CanLink
+from analogrig.links.link import FramedLink, Link
+from analogrig.links.python_can import can
+from analogrig.scenario import Scenario
+from analogrig.testing.properties.described import described_estimator
+from analogrig.testing.properties.experiments import device_with_faults
+from analogrig.testing.reference.device import ReferenceDevice
+from analogrig.testing.reference.scripts import SCRIPTS, Foreign, Garbage, Numbered, Script, is_for
+from analogrig.testing.reference.settings import ORDERS, Settings
+from analogrig.testing.statement import Finding, Play, experiment
+
+RELATIVE, ROUNDING, THETA_ROUNDING = 1e-2, 0.1, 2e-3
+"""Largest deviation of a value of an answer: relative to it, of innovation [codes] and statistic, of theta. The cases
+of ``described`` compare values more closely."""
+
+AT_ONCE = 64
+"""Messages that are sent together."""
+
+MOST_ORDER = 9
+
+PORTS = ("", "can", "can fd")
+"""Ports of a device in this process; "": that of the session."""
+
+
+@experiment
+def converses_as_catalogued(play: Play, scenario: Scenario, seed: int, script: str, port: str) -> Finding:
+    """Finding: the device answers a script of ``analogrig.testing.reference.scripts`` as the catalogue demands.
+
+    :param port: one of ``PORTS``.
+    """
+    del scenario, seed  # nothing of a rig takes part
+    description = _on_port(play, port)
+    if not is_for(script, can=getattr(description, "link", "serial") != "serial"):
+        pytest.skip(f"{script}: for lines of another kind")
+    try:
+        wrong = next(_wrong_answers(description, script), "")
+    except AnalogrigError as error:
+        wrong = str(error)
+    return Finding(not wrong, f"{script}: {wrong or 'as the catalogue demands'}")
+
+
+def _on_port(play: Play, port: str) -> CatalogueDescription:
+    described_estimator(play)
+    description = dataclasses.replace(device_with_faults(play), wire_faults="")
+    if not port:
+        return description
+    if description.kind != "inproc" or getattr(description, "library", ""):
+        pytest.skip(f"needs the project's device in this process, not {play.bench.dut.name}")
+    return dataclasses.replace(description, link="can", fd=port == "can fd", exchange="sample")
+
+
+def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[str]:
+    """Differences from the expected answers; the first ends the conversation."""
+    with contextlib.closing(description.open_link()) as link:
+        most = _largest_orders(_Talk(link, description.timeout_s))
+    with contextlib.closing(description.open_link()) as link:
+        talk = _Talk(link, description.timeout_s)
+        hello, firmware = talk.greet()
+        device = ReferenceDevice(hello, firmware, Settings(most), on_can=isinstance(link, CanLink))
+        if hello.theta_max < EstimatorConfig().parameters or not firmware.input_blocks:
+            yield f"{hello} and {firmware} state no room for the default configuration"
+        for batch in _batches(SCRIPTS[script](talk.numbers, Settings(most)), in_blocks=talk.carries_blocks):
+            if not isinstance(batch, list):
+                talk.disturb(batch)
+                _count(device, batch)
+                continue
+            expected = [answer for each in batch for answer in device.enter(each)]
+            talk.send(batch)
+            for due in expected:
+                found = talk.receive()
+                if found is None or not _agrees(found, due):
+                    yield f"expected {due}, received {found}"
+                    return
+        if (more := talk.receive(timeout_s=0.0)) is not None:
+            yield f"expected nothing, received {more}"
+
+
+class _Talk:
+    """Dialogue with a device, of messages with consecutive numbers and of bytes that are none."""
+
+    def __init__(self, link: Link, timeout_s: float) -> None:
+        self._link, self._timeout_s = link, timeout_s
+        self.numbers = Numbered(0)
+
+    def greet(self) -> tuple[Hello, Firmware]:
+        """:raises LinkTimeout: the device does not answer."""
+        self.send([Identify(self.numbers.next())])
+        match self.receive(), self.receive():
+            case (Hello() as hello, Firmware() as firmware):
+                return hello, firmware
+            case found:
+                raise LinkTimeout(f"expected Hello and Firmware, received {found}")
+
+    @property
+    def carries_blocks(self) -> bool:
+        return self._link.carries_blocks
+
+    def send(self, batch: Sequence[Message]) -> None:
+        self._link.send(batch)
+
+    def disturb(self, disturbance: Garbage | Foreign) -> None:
+        """Send what is no message. A line of the other kind has no such thing."""
+        if isinstance(disturbance, Garbage) and isinstance(self._link, FramedLink):
+            self._link.wire.write(disturbance.data)
+        elif isinstance(disturbance, Foreign) and isinstance(self._link, CanLink):
+            kind = {"is_extended_id": False, **disturbance.kind}
+            self._link.bus.send(can.Message(arbitration_id=disturbance.identifier, data=disturbance.data, **kind))
+
+    def receive(self, timeout_s: float | None = None) -> Message | None:
+        return self._link.receive(self._timeout_s if timeout_s is None else timeout_s)
+
+
+def _largest_orders(talk: _Talk) -> dict[Key, int]:
+    """Largest orders that the build accepts, one key at a time."""
+    talk.greet()
+    most = {}
+    for key in ORDERS:
+        accepted = []
+        for order in range(MOST_ORDER):
+            talk.send([Configure(talk.numbers.next(), key, float(order))])
+            answer = talk.receive()
+            if isinstance(answer, Configured) and answer.result == Result.APPLIED:
+                accepted.append(order)
+        most[key] = max(accepted, default=0)
+    return most
+
+
+def _batches(script: Script, *, in_blocks: bool) -> Iterator[list[Message] | Garbage | Foreign]:
+    """Messages that are sent at once, and disturbances. Blocks are left out where the line does not carry them."""
+    batch: list[Message] = []
+    for each in script:
+        if isinstance(each, SampleBlock) and not in_blocks:
+            continue
+        if isinstance(each, Garbage | Foreign):
+            if batch:
+                yield batch
+            batch = []
+            yield each
+            continue
+        batch.append(each)
+        if len(batch) == AT_ONCE:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+def _count(device: ReferenceDevice, disturbance: Garbage | Foreign) -> None:
+    """Count a disturbance as the device has to."""
+    if isinstance(disturbance, Garbage):
+        device.counters["frames_dropped"] += disturbance.dropped
+    elif disturbance.counter:
+        device.counters[disturbance.counter] += 1
+
+
+def _agrees(found: Message, due: Message) -> bool:
+    """True if all fields are equal, real numbers nearly."""
+    is_theta = isinstance(due, Estimate) and due.element != Element.INNOVATION
+    within = THETA_ROUNDING if is_theta else ROUNDING
+    return type(found) is type(due) and all(
+        math.isclose(one, other, rel_tol=RELATIVE, abs_tol=within) if isinstance(other, float) else one == other
+        for one, other in zip(found, due, strict=True)
+    )

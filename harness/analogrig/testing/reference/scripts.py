@@ -1,0 +1,313 @@
+"""Conversations that a device is to follow: each is a sequence of messages, and of bytes that are none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from analogrig.catalogue import (
+    BLOCK_SAMPLES,
+    CATALOGUE_HASH,
+    INDICES,
+    LAYOUTS,
+    RUN_SHIFT,
+    SEQS,
+    Alarm,
+    Command,
+    Configure,
+    Control,
+    Identify,
+    Key,
+    Message,
+    Sample,
+    SampleBlock,
+    SampleFlag,
+    pack,
+)
+from analogrig.links import frame
+from analogrig.testing.reference.settings import ORDERS, WHOLE, Settings
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """Bytes on a serial line that are no frame."""
+
+    data: bytes
+    dropped: int
+    """Frames that the device drops because of them."""
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """Frame on a CAN bus that is no message of the harness."""
+
+    identifier: int
+    data: bytes
+    counter: str
+    """Counter of the device that counts it; empty for none."""
+    kind: Mapping[str, bool] = field(default_factory=dict)
+    """Flags of python-can."""
+
+
+Script = Iterator[Message | Garbage | Foreign]
+
+RUN = 5
+
+
+class Numbered:
+    """Messages with consecutive sequence numbers."""
+
+    def __init__(self, seq: int) -> None:
+        self.seq = seq % SEQS
+
+    def next(self) -> int:
+        """Number of the next message."""
+        self.seq = (self.seq + 1) % SEQS
+        return (self.seq - 1) % SEQS
+
+    def control(self, command: int, argument: int = 0) -> Control:
+        return Control(self.next(), command, argument)
+
+    def configure(self, key: int, value: float) -> Configure:
+        return Configure(self.next(), key, float(np.float32(value)))
+
+    def sample(self, index: int, *, run: int = RUN, missing: bool = False) -> Sample:
+        flags = run << RUN_SHIFT | (SampleFlag.MISSING if missing else 0)
+        return Sample(self.next(), flags, index % INDICES, *_codes(index))
+
+    def block(self, index: int, samples: int = BLOCK_SAMPLES, missing: int = 0, run: int = RUN) -> SampleBlock:
+        codes = [code for i in range(BLOCK_SAMPLES) for code in _codes(index + i)]
+        return SampleBlock(self.next(), run << RUN_SHIFT | samples, index % INDICES, missing, tuple(codes))
+
+
+def _codes(index: int) -> tuple[int, int]:
+    """Codes of a sample, with bits in both bytes: a square wave, and a first-order answer to it."""
+    phase = index % 40
+    level = 1 if phase < 20 else 0
+    rest = math.exp(-(phase % 20 + 0.4) / 6.0)
+    answer = level + (1.0 - 2.0 * level) * rest
+    noise = (index * index * 7919 % 13 - 6) / 4.0
+    return 700 + 3100 * level + index % 3, round(900.0 + 2500.0 * answer + noise)
+
+
+def settings(numbers: Numbered, build: Settings) -> Script:
+    """Every key at its limits, beyond them, and between whole values; then configurations that do not go together."""
+    for key in range(max(Key) + 3):
+        limits = build.range_of(key)
+        values = [0.0, 1.0] if limits is None else list(_near(*limits, is_whole=key in WHOLE or key in ORDERS))
+        for value in (*values, math.nan, math.inf, -math.inf):
+            yield numbers.configure(key, value)
+    yield numbers.configure(255, 1.0)
+    default = dict(build.defaults().values)
+    for unfit in (
+        {Key.C1: -2.0, Key.C2: 1.0},
+        {Key.C1: 0.0, Key.C2: 1.0},
+        {Key.C1: 0.5, Key.C2: -0.6},
+        {Key.C1: 1.995, Key.C2: 0.999},
+        {Key.NA: 1, Key.C1: -1.0, Key.C2: 0.0},
+        {Key.NA: 1, Key.C1: -0.999, Key.C2: 0.0},
+        {Key.NC: build.most[Key.NC], Key.NB: build.most[Key.NB]},
+        {Key.CODE_LOW: 100.0, Key.CODE_HIGH: 50.0},
+        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 100.0, Key.EDGE_CODES: 101.0},
+        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 100.0, Key.EDGE_CODES: 100.0},
+        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.5},
+        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 3.5},
+    ):
+        yield from (numbers.configure(key, value) for key, value in default.items())
+        yield from (numbers.configure(key, value) for key, value in unfit.items())
+        yield numbers.control(Command.START, RUN)
+        yield numbers.control(Command.STOP)
+    yield numbers.control(Command.RESET)
+    yield from (numbers.configure(key, value) for key, value in default.items())
+
+
+def _near(low: float, high: float, *, is_whole: bool) -> Iterator[float]:
+    """Values at both limits, beside them, and between."""
+    if is_whole:
+        yield from (low, high, low - 1, high + 1, high - 0.5, 0.5, (low + high) // 2, 256.0, 65_536.0)
+        return
+    for limit in (np.float32(low), np.float32(high)):
+        with np.errstate(over="ignore", under="ignore"):
+            yield from (float(limit), *(float(np.nextafter(limit, np.float32(to))) for to in (-np.inf, np.inf)))
+    yield from (0.0, (low + high) / 2.0 if math.isfinite(high - low) else 0.0, 0.1)
+
+
+def _sure(numbers: Numbered) -> Script:
+    """Prior knowledge that keeps the first equations well-conditioned: rounding stays small."""
+    for key, value in ((Key.P0, 1e-7), (Key.P0_OFFSET, 1e-3), (Key.REFRESH_N, 0)):
+        yield numbers.configure(key, value)
+
+
+def control(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001 - scripts have one form
+    """Commands in every state, with arguments at their limits; samples that no run takes."""
+    yield from _sure(numbers)
+    yield numbers.control(Command.STATUS)
+    yield numbers.sample(0)
+    yield numbers.block(0)
+    for command, argument in (
+        *((0, 1), (6, 7), (255, 0xFFFFFFFF), (Command.STOP, 9), (Command.START, 8), (Command.START, 0x10003)),
+        *((Command.REPORT_INTERVAL, each) for each in (0, 65_535, 65_536, 1)),
+        *((Command.START, RUN), (Command.START, 6), (Command.REPORT_INTERVAL, 3)),
+    ):
+        yield numbers.control(command, argument)
+    yield numbers.configure(Key.P0, 5.0)
+    for index in range(7):
+        yield numbers.sample(index)
+    yield numbers.sample(7, run=4)
+    yield numbers.block(7, run=2)
+    for samples in (0, 15, 1, 4, 14):
+        yield numbers.block(7, samples, 0b1010)
+    yield Alarm(numbers.seq, 3, 4, 5.0)
+    yield numbers.control(Command.STATUS)
+    yield numbers.control(Command.STOP)
+    yield numbers.control(Command.STATUS)
+    yield numbers.sample(26)
+    yield numbers.control(Command.STOP)
+    yield numbers.configure(Key.P0, 5.0)
+    yield numbers.control(Command.START, 0)
+    yield numbers.control(Command.STATUS)
+    yield numbers.sample(0, run=0)
+    yield numbers.control(Command.RESET)
+    yield numbers.control(Command.STATUS)
+    yield numbers.sample(1, run=0)
+    yield from _sure(numbers)
+    yield numbers.control(Command.START, 7)
+    yield numbers.block(0, run=7)
+    yield numbers.control(Command.STOP)
+    yield numbers.control(Command.START, 7)
+    yield numbers.block(0, run=7)
+    yield Identify(numbers.next())
+    yield numbers.control(Command.STOP)
+    yield numbers.control(Command.STATUS)
+
+
+def order(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+    """Repeated, late and skipped messages and samples, and indices that wrap around."""
+    yield from _sure(numbers)
+    yield numbers.control(Command.START, RUN)
+    first = numbers.block(0)
+    yield from (first, first)
+    yield numbers.sample(14)
+    yield numbers.sample(14)
+    yield numbers.sample(3)
+    yield numbers.block(13, 3)
+    for interval, ahead in ((1, 1), (4, 3), (5, 11), (3, 1200)):
+        yield numbers.control(Command.REPORT_INTERVAL, interval)
+        at = 16 if interval == 1 else at + 9 + ahead
+        yield from (numbers.sample(at + ahead + i) for i in range(9))
+    yield numbers.control(Command.STATUS)
+    for behind in (1, 2, 31, 32, 33, 40, 0):
+        here = numbers.seq
+        numbers.seq = (here - behind) % SEQS
+        repeated = numbers.control(Command.STOP + 2, 2)  # a report interval
+        numbers.seq = (here if 1 <= behind <= 32 else repeated.seq + 1) % SEQS
+        yield repeated
+    numbers.seq = (numbers.seq + 3) % SEQS
+    yield numbers.control(Command.REPORT_INTERVAL, 1)
+    numbers.seq = (numbers.seq + 100) % SEQS
+    yield Identify(numbers.next())
+    at = (at + 9) % INDICES
+    for ahead in (30_000, 32_766, 32_767, 32_768, 20_000):
+        at = (at + ahead) % INDICES
+        yield numbers.sample(at)
+        if ahead >= INDICES // 2:
+            at = (at - ahead) % INDICES
+    edge = numbers.block(INDICES - 20)
+    yield edge
+    yield numbers.block(INDICES - 6)
+    yield numbers.block(8)
+    yield numbers.control(Command.STATUS)
+    yield numbers.control(Command.STOP)
+
+
+def alarms(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+    """Runs with alarms of each trigger, over single samples and over blocks with missing samples."""
+    yield from _sure(numbers)
+    for trigger, ceiling in ((3, 2.0), (1, 40.0), (2, 20.0)):
+        for key, value in ((Key.TRIGGER, trigger), (Key.CEILING, ceiling), (Key.WARM_UP_N, 10)):
+            yield numbers.configure(key, value)
+        yield numbers.control(Command.START, RUN)
+        for number in range(6):
+            yield numbers.block(number * BLOCK_SAMPLES, missing=(1 << 13 | 1, 0, 0x1555, 0, 0, 0x2)[number])
+        for index in range(6 * BLOCK_SAMPLES, 6 * BLOCK_SAMPLES + 12):
+            yield numbers.sample(index, missing=index % 7 == 5)
+        yield numbers.control(Command.STOP)
+        yield numbers.control(Command.STATUS)
+    yield numbers.control(Command.RESET)
+
+
+def crowd(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+    """More messages at once than their answers fit into the output of a port."""
+    yield from _sure(numbers)
+    yield numbers.control(Command.START, RUN)
+    for number in range(60):
+        yield numbers.block(number * BLOCK_SAMPLES)
+    for _ in range(20):
+        yield numbers.control(Command.STATUS)
+    yield numbers.control(Command.STOP)
+
+
+def damage(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+    """Bytes that are no frame, between frames; every damaged one is counted once, and harms no other."""
+    good = frame.encode(pack(Control(0, Command.REPORT_INTERVAL, 0x01000001)))
+    full = frame.encode(pack(SampleBlock(0, 14, 1, 1, tuple(range(257, 257 + 2 * BLOCK_SAMPLES)))))
+    for damaged, dropped in (
+        (b"\0\0\0", 0),
+        (b"\x05abc\0", 1),
+        (b"\x01\0", 1),
+        (b"\x02\x30\0\0\x01\x01\x01\0", 2),
+        (b"\xff" * 200 + b"\0", 1),
+        (full[:-1] + b"\x01\0", 1),
+        (full[:-1] + b"\x01" * 300 + b"\0", 1),
+        *((good[:cut] + b"\0", 1) for cut in range(2, len(good) - 1)),
+        *((good[:at] + bytes([good[at] ^ 0x40]) + good[at + 1 :], 1) for at in range(1, len(good) - 1)),
+        *((full[:at] + bytes([full[at] ^ 0x81]) + full[at + 1 :], 1) for at in range(2, len(full) - 1, 5)),
+        (frame.encode(bytes([0x7F]) + bytes(8)), 1),
+        *((frame.encode(bytes([layout.id]) + bytes(layout.length + more)), 1)
+          for layout in LAYOUTS.values() for more in (-1, 1)),
+        (frame.encode(pack(Control(0, 0, 0)), CATALOGUE_HASH ^ 1), 1),
+        (frame.encode(pack(Configure(0, 5, 1.0)), 0), 1),
+    ):  # fmt: skip
+        yield Garbage(damaged, dropped)
+        yield Identify(numbers.next())
+    yield numbers.control(Command.STATUS)
+
+
+def foreign(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+    """Frames of other nodes, of wrong lengths, and reports of errors, between frames of the harness."""
+    ours, eight = LAYOUTS["Control"].id, bytes([0, Command.REPORT_INTERVAL, 0, 0, 1, 0, 0, 1])
+    for each in (
+        Foreign(0x7FF, eight, "frames_foreign"),
+        Foreign(0x100 | ours, eight, "frames_foreign"),
+        Foreign(LAYOUTS["Stepped"].id, eight, "frames_foreign"),
+        Foreign(0, b"", "frames_foreign"),
+        Foreign(ours, eight, "frames_foreign", {"is_extended_id": True}),
+        Foreign(ours, b"", "frames_foreign", {"is_remote_frame": True}),
+        Foreign(ours, eight, "", {"is_error_frame": True}),
+        *(Foreign(ours, eight[:length], "frames_dropped") for length in (0, 1, 4, 7)),
+        Foreign(LAYOUTS["Sample"].id, eight[:6], "frames_dropped"),
+        Foreign(LAYOUTS["SampleBlock"].id, eight, "frames_dropped"),
+        Foreign(ours, eight + bytes(4), "frames_dropped", {"is_fd": True}),
+        Foreign(0x7F0, bytes(64), "frames_foreign", {"is_fd": True}),
+        Foreign(LAYOUTS["SampleBlock"].id, bytes(48), "frames_dropped", {"is_fd": True}),
+    ):
+        yield each
+        yield Identify(numbers.next())
+        yield numbers.control(Command.REPORT_INTERVAL, 1)
+    yield numbers.control(Command.STATUS)
+
+
+_ON_SERIAL, _ON_CAN = (damage,), (foreign,)
+
+
+def is_for(script: str, *, can: bool) -> bool:
+    """True unless the script is for lines of the other kind."""
+    return SCRIPTS[script] not in (_ON_SERIAL if can else _ON_CAN)
+
+
+SCRIPTS: Mapping[str, Callable[[Numbered, Settings], Script]] = {
+    each.__name__: each for each in (settings, control, order, alarms, crowd, damage, foreign)
+}
