@@ -36,7 +36,7 @@ PARTS = ("core", "isolation", "device")
 LEAST = 0.95
 """Least part of the mutants with other code that the shipped properties fail."""
 
-DEADLINE_S = 60
+DEADLINE_S = 30
 """Longest time of one property on a mutant, which may not come to an end, in seconds of the processor."""
 
 EXPORTED = ("library_*", *(f"{port}_device_{name}" for port in ("serial", "can") for name in ("size", "init", "run")))

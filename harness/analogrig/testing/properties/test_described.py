@@ -11,7 +11,7 @@ from analogrig.scenario import Scenario
 from analogrig.testing.properties.conversed import PORTS, converses_as_catalogued
 from analogrig.testing.properties.described import computes_what_it_describes
 from analogrig.testing.reference.cases import CASES
-from analogrig.testing.reference.scripts import SCRIPTS
+from analogrig.testing.reference.scripts import SCRIPTS, is_for
 from analogrig.testing.statement import Play
 
 SEED = 1
@@ -23,7 +23,10 @@ def test_device_computes_what_it_describes(hil_play: Play, case: str) -> None:
     assert computes_what_it_describes(hil_play, CASES[case].scenario, SEED, case=case)
 
 
-@pytest.mark.parametrize("port", PORTS, ids=[port or "own port" for port in PORTS])
-@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize(
+    ("script", "port"),
+    [(script, port) for script in SCRIPTS for port in PORTS if is_for(script, can=bool(port))],
+    ids=lambda value: value or "own port",
+)
 def test_device_converses_as_catalogued(hil_play: Play, script: str, port: str) -> None:
     assert converses_as_catalogued(hil_play, Scenario.load("healthy"), SEED, script=script, port=port)

@@ -107,6 +107,12 @@ def leave_out(codes: Codes, missing: NDArray[np.bool_]) -> None:
         missing[edge + (-1, 0, 1, 2, 5, 11)[number % 6]] = True
 
 
+def leave_out_near_edges(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """One sample near each edge, of each distance within a doubt."""
+    for number, edge in enumerate(edges_of(codes).tolist()):
+        missing[edge + (1, 0, 2, 5, 9, 11, 12, 3)[number % 8]] = True
+
+
 def leave_out_later(codes: Codes, missing: NDArray[np.bool_]) -> None:
     """Few samples shortly before a change."""
     missing[[edges_of(codes)[-3] - 9]] = True
@@ -145,6 +151,12 @@ CASES: Mapping[str, Case] = {
     "anywhere": Case(SOFTER, {"edge_instants": "anywhere", "edge_codes": 500.0}),
     "edges become late": Case(LATE, {"warm_up_n": 100}),
     "edges become early": Case(EARLY, {"warm_up_n": 100}),
+    "edges become late, delayed": Case(LATE, {"warm_up_n": 100, "nk": 1}),
+    "edges become early, delayed": Case(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
+    "missing while in doubt": Case(EARLY, {"noise_variance": 0.3, "ceiling": 200.0, "warm_up_n": 0}, leave_out_near_edges),
+    "strong prior": Case(
+        SOFTER, {"p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "refresh_n": 5, "noise_variance": 50.0}
+    ),
     "missing": Case(SOFTER, {"warm_up_n": 100}, leave_out),
     "saturated": Case(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
     "stuck": Case(HEALTHY, {"stuck_n": 8}, hold),
