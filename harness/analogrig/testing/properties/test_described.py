@@ -12,7 +12,7 @@ from analogrig.testing.properties.conversed import PORTS, converses_as_catalogue
 from analogrig.testing.properties.described import computes_what_it_describes
 from analogrig.testing.reference.cases import CASES
 from analogrig.testing.reference.scripts import SCRIPTS, is_for
-from analogrig.testing.statement import Play
+from analogrig.testing.statement import TRIES, Play
 
 SEED = 1
 
@@ -20,7 +20,7 @@ SEED = 1
 @pytest.mark.hil_needs("tweak", "excite")
 @pytest.mark.parametrize("case", CASES)
 def test_device_computes_what_it_describes(hil_play: Play, case: str) -> None:
-    assert computes_what_it_describes(hil_play, CASES[case].scenario, SEED, case=case)
+    assert computes_what_it_describes(hil_play, CASES[case].scenario, SEED, case=case, tries=TRIES)
 
 
 @pytest.mark.parametrize(

@@ -141,39 +141,47 @@ def hold(codes: Codes, missing: NDArray[np.bool_]) -> None:
     missing[edges[6] + 20] = True
 
 
+_FIXED = {"refresh_n": 0, "c": (-1.45, 0.51)}
+"""C near the plant's A. A refresh depends on whether A has moved by REFRESH_STEP, which rounding may decide."""
+
+_RESTLESS = {"forgetting": 0.97, "warm_up_n": 100}
+"""A short memory: A moves by more than REFRESH_STEP nearly always."""
+
 _FREE_ALARMS = {"warm_up_n": 60, "refresh_n": 0}
 _TWO_B = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked"}
 
 CASES: Mapping[str, Case] = {
     "default": Case(SOFTER),
     "default in blocks": Case(SOFTER, exchange="block"),
-    "one clock": Case(LOCKED, {**_TWO_B, "forgetting": 0.997}),
-    "anywhere": Case(SOFTER, {"edge_instants": "anywhere", "edge_codes": 500.0}),
-    "edges become late": Case(LATE, {"warm_up_n": 100}),
-    "edges become early": Case(EARLY, {"warm_up_n": 100}),
-    "edges become late, delayed": Case(LATE, {"warm_up_n": 100, "nk": 1}),
+    "one clock": Case(LOCKED, {**_TWO_B, **_FIXED, "forgetting": 0.997}),
+    "anywhere": Case(SOFTER, {**_RESTLESS, "edge_instants": "anywhere", "edge_codes": 500.0}),
+    "edges become late": Case(LATE, _RESTLESS),
+    "edges become early": Case(EARLY, _RESTLESS),
+    "edges become late, delayed": Case(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
     "edges become early, delayed": Case(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
-    "missing while in doubt": Case(EARLY, {"noise_variance": 0.3, "ceiling": 200.0, "warm_up_n": 0}, leave_out_near_edges),
+    "missing while in doubt": Case(EARLY, {**_FIXED, "noise_variance": 0.3, "ceiling": 200.0, "warm_up_n": 0}, leave_out_near_edges),
     "strong prior": Case(
         SOFTER, {"p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "refresh_n": 5, "noise_variance": 50.0}
     ),
-    "missing": Case(SOFTER, {"warm_up_n": 100}, leave_out),
+    "missing": Case(SOFTER, _RESTLESS, leave_out),
     "saturated": Case(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
-    "stuck": Case(HEALTHY, {"stuck_n": 8}, hold),
-    "idle": Case(RARE_EDGES, {"idle_n": 60}),
+    "stuck": Case(HEALTHY, {**_FIXED, "stuck_n": 8}, hold),
+    "idle": Case(RARE_EDGES, {**_RESTLESS, "idle_n": 60}),
     "noise estimated": Case(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
     "random walk": Case(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
-    "extended": Case(SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0}, is_optional=True),
+    "extended": Case(
+        SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "isolation": False, "ceiling": 40.0}, is_optional=True
+    ),
     "first order": Case(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
-    "longest": Case(SOFTER, {"nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
+    "longest": Case(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
     "prediction error": Case(
         SOFTER, {"trigger": "prediction-error", "ceiling": 12.0, "hold_off_n": 30, "reset": "all", **_FREE_ALARMS}
     ),
     "mean": Case(SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.6, "hold_off_n": 4, **_FREE_ALARMS}),
     "mean of magnitudes": Case(
-        SOFTER, {"trigger": "mean-between-faults", "ceiling": 1.8, "absolute": True, "hold_off_n": 20, **_FREE_ALARMS}
+        SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.5, "absolute": True, "hold_off_n": 20, **_FREE_ALARMS}
     ),
-    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 7}),
+    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 7, "forgetting": 0.97}),
     "often refreshed": Case(SOFTER, {"refresh_n": 18, "c": (-0.9, 0.2)}),
     **{
         name: Case(_scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed))

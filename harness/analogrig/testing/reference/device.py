@@ -165,8 +165,9 @@ class ReferenceDevice:
         if ahead >= INDICES // 2:
             self.counters["samples_ignored"] += 1
             return
-        for _ in range(min(ahead, GAP_MAX)):
-            self._estimator.step(0.0, 0.0, valid=False)
+        if ahead:
+            self._estimator.step(0.0, 0.0, valid=False)  # further ones are counted, and change nothing
+            self._estimator.counters["missing"] += min(ahead, GAP_MAX) - 1
         self.counters["samples_lost"] += ahead
         self._unreported_n = (self._unreported_n + ahead) % self._interval_n
         step = self._estimator.step(u, y, valid=is_valid)

@@ -148,7 +148,7 @@ def control(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001 - scr
     yield numbers.sample(0)
     yield numbers.block(0)
     for command, argument in (
-        *((0, 1), (6, 7), (255, 0xFFFFFFFF), (Command.STOP, 9), (Command.START, 8), (Command.START, 0x10003)),
+        *((0, 1), (6, 7), (255, 0xA5C3_963C), (7, 0x5A3C_69C3), (Command.STOP, 9), (Command.START, 8), (Command.START, 0x10003)),
         *((Command.REPORT_INTERVAL, each) for each in (0, 65_535, 65_536, 1)),
         *((Command.START, RUN), (Command.START, 6), (Command.REPORT_INTERVAL, 3)),
     ):
@@ -300,6 +300,18 @@ def foreign(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.control(Command.STATUS)
 
 
+def losses(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+    """So many lost and ignored samples that a counter fills all its bytes."""
+    yield numbers.control(Command.REPORT_INTERVAL, 65_535)
+    yield numbers.control(Command.START, RUN)
+    for number in range(1, 531):
+        yield numbers.sample(number * (INDICES // 2) - 1)
+        if number % 200 == 3:
+            yield numbers.sample(number * (INDICES // 2) - 9)
+    yield numbers.control(Command.STATUS)
+    yield numbers.control(Command.STOP)
+
+
 _ON_SERIAL, _ON_CAN = (damage,), (foreign,)
 
 
@@ -309,5 +321,5 @@ def is_for(script: str, *, can: bool) -> bool:
 
 
 SCRIPTS: Mapping[str, Callable[[Numbered, Settings], Script]] = {
-    each.__name__: each for each in (settings, control, order, alarms, crowd, damage, foreign)
+    each.__name__: each for each in (settings, control, order, alarms, crowd, losses, damage, foreign)
 }
