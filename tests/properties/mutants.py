@@ -36,7 +36,7 @@ PARTS = ("core", "isolation", "device")
 LEAST = 0.95
 """Least part of the mutants with other code that the shipped properties fail."""
 
-DEADLINE_S = 30
+DEADLINE_S = 15
 """Longest time of one property on a mutant, which may not come to an end, in seconds of the processor."""
 
 EXPORTED = ("library_*", *(f"{port}_device_{name}" for port in ("serial", "can") for name in ("size", "init", "run")))
@@ -203,13 +203,16 @@ def main() -> int:
 
     def tell(outcome: Outcome) -> None:
         outcomes.append(outcome)
+        if len(outcomes) % 50 == 0:
+            fates = Counter(each.fate for each in outcomes)
+            print(f"{len(outcomes)} of {len(chosen)}: {dict(fates)}", flush=True)
+            _write(arguments.out, outcomes)
         if outcome.fate == "survived":
             print(shown(outcome.mutant.key), f"   line {outcome.mutant.line}", flush=True)
 
     print(f"{len(chosen)} of {len(every)} mutants, seed {arguments.seed}", flush=True)
     try_all(chosen, arguments.jobs, noticed, tell, arguments.properties)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
+    _write(arguments.out, outcomes)
     print(table(every, outcomes))
     fates = Counter(outcome.fate for outcome in outcomes)
     score = fates["killed"] / max(fates["killed"] + fates["survived"], 1)
@@ -217,6 +220,11 @@ def main() -> int:
           f" {fates['equivalent']} equivalent, {fates['invalid']} do not compile")
     print(Counter(outcome.by for outcome in outcomes if outcome.fate == "killed").most_common(60))
     return 0
+
+
+def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
 
 
 def _recorded(path: Path) -> list[dict[str, Any]]:

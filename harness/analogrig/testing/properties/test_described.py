@@ -12,9 +12,11 @@ from analogrig.testing.properties.conversed import PORTS, converses_as_catalogue
 from analogrig.testing.properties.described import computes_what_it_describes
 from analogrig.testing.reference.cases import CASES
 from analogrig.testing.reference.scripts import SCRIPTS, is_for
-from analogrig.testing.statement import TRIES, Play
+from analogrig.testing.statement import Play
 
 SEED = 1
+TRIES = 40
+"""Most seeds of a case. One play in two or more is judged: 40 seeds fail with a probability of 1e-12."""
 
 
 @pytest.mark.hil_needs("tweak", "excite")

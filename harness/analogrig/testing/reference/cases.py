@@ -153,7 +153,7 @@ _TWO_B = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked"}
 CASES: Mapping[str, Case] = {
     "default": Case(SOFTER),
     "default in blocks": Case(SOFTER, exchange="block"),
-    "one clock": Case(LOCKED, {**_TWO_B, **_FIXED, "forgetting": 0.997}),
+    "one clock": Case(LOCKED, {**_TWO_B, **_FIXED, "forgetting": 0.997, "isolation": False}),
     "anywhere": Case(SOFTER, {**_RESTLESS, "edge_instants": "anywhere", "edge_codes": 500.0}),
     "edges become late": Case(LATE, _RESTLESS),
     "edges become early": Case(EARLY, _RESTLESS),

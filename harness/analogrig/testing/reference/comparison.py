@@ -31,6 +31,8 @@ class Expected:
     diagnoses: tuple[tuple[int, int, int, float], ...]
     """Sample after which each was sent, change, onset and extent."""
     counters: Mapping[str, int]
+    is_doubtful: bool
+    """True if rounding may decide a threshold: the answers of a sound device may differ."""
 
 
 def expected_of(
@@ -66,4 +68,5 @@ def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expe
         alarms=tuple(k for k, step in enumerate(steps) if step.alarm),
         diagnoses=tuple(diagnoses),
         counters=reference.counters,
+        is_doubtful=reference.is_doubtful or reference.trigger.is_doubtful or isolation.is_doubtful,
     )

@@ -32,6 +32,9 @@ SETTLED = 1.0001
 WEIGHT_DUE, WEIGHT_OVERDUE = 0.5, 0.25
 """Weights below which the d's are limited: in a step with little other work, and in any step."""
 
+NEAR = 0.1
+"""Relative distance from a threshold at which rounding may decide that A has moved."""
+
 COUNTERS = ("updated", "missing", "refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes")
 """Counters of the estimator, by their names in est_counters_t."""
 
@@ -95,6 +98,7 @@ class ReferenceEstimator:
         self.same_n = 0  # samples of constant y since an edge of u
         self.doubt: Doubt | None = None
         self.slipped: Vector | None = None  # theta after a slip, valid from the next sample on
+        self.is_doubtful = False  # rounding may have decided whether C was to follow A
         self.deviation = 0.0  # predicted standard deviation of the last innovation, in codes
 
     @property
@@ -309,6 +313,7 @@ class ReferenceEstimator:
 
     def _compare_c(self) -> None:
         step = sum((new - old) ** 2 for new, old in zip(self._contracted, self.whitener.c, strict=True))
+        self.is_doubtful |= any(abs(step / limit - 1.0) < NEAR for limit in (REFRESH_STEP, REFRESH_STRIDE))
         if step <= REFRESH_STEP:
             self.equations = -1
             return

@@ -36,6 +36,9 @@ WORTH_TELLING = 0.15
 EXTENT_KNOWN = 4000.0
 PRIOR, UNKNOWN = 0.5, 1e-3
 
+NEAR = 0.12
+"""Distance from a limit at which rounding, or the sum of likelihoods to 0.03, may decide [nats]."""
+
 SINGLE = (Change.MASS, Change.DAMPING, Change.STIFFNESS)
 _PUSH = 3
 
@@ -104,6 +107,8 @@ class ReferenceIsolation:
         self._since_n = 0
         self._is_active = False
         self._waiting_n = 0
+        self.is_doubtful = False
+        """True if rounding may have decided when a change was named, or since when."""
 
     def enter(self, u: float, y: float, step: ReferenceStep) -> ReferenceDiagnosis | None:
         """Enter a sample; return the diagnosis that was completed with it, if one was."""
@@ -179,6 +184,7 @@ class ReferenceIsolation:
             fit = self._process(self._waiting_n - 1)
             self._waiting_n -= 1
             if fit is not None:
+                self.is_doubtful |= named is None and fit.is_doubtful
                 named = named or fit.named()
                 found = fit.diagnosis(named) if named else None
         if found:
@@ -259,6 +265,8 @@ class Fit:
         alone = gain[:, np.newaxis] + vector * change
         self.any_alone = np.logaddexp.reduce(alone, axis=0, initial=0.0)
         best = alone.argmax(axis=0)
+        ranked = np.sort(np.array([alone[onsets == onset].max(axis=0) for onset in np.unique(onsets)]), axis=0)
+        self._is_onset_doubtful = (ranked[-1] - ranked[max(-2, -len(ranked))] < NEAR) & (len(ranked) > 1)
         at = (best, np.arange(3))
         self.known, self.change, self.onset_n = known[at], change[at], onsets[best]
         self.any_pair: dict[frozenset[int], float] = {}
@@ -274,19 +282,25 @@ class Fit:
             self.beside[i] = max(self.beside[i], relevant[:, 1].max())
             self.beside[j] = max(self.beside[j], relevant[:, 0].max())
 
-    def named(self) -> Change | None:
-        """The change that is sure, if one is."""
+    @property
+    def is_doubtful(self) -> bool:
+        """True if rounding may decide what is named, or its onset."""
+        low, high = self.named(-NEAR), self.named(NEAR)
+        return low != high or (high in SINGLE and bool(self._is_onset_doubtful[SINGLE.index(high)]))
+
+    def named(self, more: float = 0.0) -> Change | None:
+        """The change that is sure with ``more`` evidence, if one is."""
         one = int(self.any_alone.argmax())
         others = [other for other in range(3) if other != one]
-        if any(self.any_pair[frozenset((one, other))] - self.any_alone[one] > NOT_BY_CHANCE for other in others):
+        if any(self.any_pair[frozenset((one, other))] - self.any_alone[one] > NOT_BY_CHANCE - more for other in others):
             return Change.SEVERAL
         extent = self._extent(one)
         likely = self.any_alone[one] - 0.5 * (extent + 1.0 / extent - 2.0)
         is_sure = (
-            self.known[one] > EXTENT_KNOWN
-            and likely - self.beside[one] >= ALONE
-            and likely - self.any_pair[frozenset(others)] >= MORE_LIKELY
-            and all(likely - self.any_alone[other] >= SURE for other in others)
+            self.known[one] > EXTENT_KNOWN * (1.0 - 0.1 * more)
+            and likely - self.beside[one] >= ALONE - more
+            and likely - self.any_pair[frozenset(others)] >= MORE_LIKELY - more
+            and all(likely - self.any_alone[other] >= SURE - more for other in others)
         )
         return SINGLE[one] if is_sure else None
 

@@ -13,6 +13,10 @@ GAIN, DRIFT = 0.375, 0.69314718
 """Log-likelihood ratio of a fourfold variance: GAIN z^2 - DRIFT."""
 
 
+NEAR = 0.01
+"""Distance from the ceiling at which rounding may decide, relative to the ceiling and 1."""
+
+
 class Decision(Enum):
     """Meaning of an innovation."""
 
@@ -31,6 +35,8 @@ class ReferenceTrigger:
         self.noise_variance = config.noise_variance
         self.rivals = [0.0, 0.0]
         """Statistics under the readings that recent edges came one sample early, and late."""
+        self.is_doubtful = False
+        """True if rounding may have decided whether a statistic has reached the ceiling."""
         self.restart(config.warm_up_n)
 
     def restart(self, quiet_n: int) -> None:
@@ -89,13 +95,19 @@ class ReferenceTrigger:
         if trigger == "none":
             return Decision.QUIET
         if trigger == "cusum":
-            return self._enter_cusum(innovation, variance * self.noise_variance, readings, expires=expires)
+            decision = self._enter_cusum(innovation, variance * self.noise_variance, readings, expires=expires)
+            self._note_doubt()
+            return decision
         self.statistic = abs(innovation)
         if trigger == "mean-between-faults":  # thesis 4.4.3
             self._mean_n += 1
             self._mean += ((abs(innovation) if self._config.absolute else innovation) - self._mean) / self._mean_n
             self.statistic = abs(self._mean)
+        self._note_doubt()
         return Decision.ALARM if self.statistic >= self._ceiling else Decision.QUIET
+
+    def _note_doubt(self) -> None:
+        self.is_doubtful |= abs(self.statistic - self._ceiling) < NEAR * (1.0 + self._ceiling)
 
     def _enter_cusum(
         self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
