@@ -54,7 +54,7 @@ export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
-        cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects repositories line-faults packages kills \
+        cost coverage bit-exact analyze eva mutate mutants fuzz fuzz-serve faults hostile defects repositories line-faults packages kills \
         can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -174,6 +174,9 @@ eva: $(PRODUCTS) ## Frama-C over the core, all orders of the model: nothing unde
 
 mutate: $(PRODUCTS) ## alter the core, which the tests must notice; ARGS="--sample 60" takes so many mutants; build/mutation.json
 	@$(BIN)/python -m estimator_c.evidence.mutate $(ARGS)
+
+mutants: $(PRODUCTS) ## alter core, isolation, device or codec, which a shipped property must fail; ARGS="--sample 640 --seed 2" draws so many; build/mutants.json
+	@$(BIN)/python -m tests.properties.mutants $(ARGS)
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist

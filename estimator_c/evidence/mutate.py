@@ -235,11 +235,11 @@ def shown(key: tuple[str, str, str, str]) -> str:
     return f"@ {file} {function}\n- {before}\n+ {after}"
 
 
-def explained() -> dict[tuple[str, str, str, str], str]:
-    """The mutants of MUTATION.md, and the heading that each stands under."""
+def explained(path: Path = EXPLAINED) -> dict[tuple[str, str, str, str], str]:
+    """The mutants of MUTATION.md, or of another list like it, and the heading that each stands under."""
     found, heading, where = {}, "", ("", "")
     before = ""
-    for line in EXPLAINED.read_text().splitlines():
+    for line in path.read_text().splitlines():
         if line.startswith("## "):
             heading = line[3:]
         elif match := re.match(r"@ (\S+) (\S+)$", line):

@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 
 import analogrig.devices.estimator
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.testing.reference.estimator import ReferenceEstimator
 from tests.estimator_c.est_driver import (
     ANYWHERE,
     CUSUM,
@@ -23,7 +24,6 @@ from tests.estimator_c.est_driver import (
     PREDICTION_ERROR,
     Estimator,
 )
-from analogrig.testing.reference.estimator import ReferenceEstimator
 
 FRONT = (115.0, 3021.0, 24500.0)
 PERIOD_S = 0.01

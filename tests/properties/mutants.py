@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -29,8 +30,8 @@ from typing import Any
 
 import pytest
 
-from estimator_c.evidence.mutate import Mutant, Outcome, Session, code_of, mutants_of, sampled, shown, table
-from tests.properties.planted import FOLDERS, FOUND_ONLY, GENERATED, ROOT, SOURCES
+from estimator_c.evidence.mutate import Mutant, Outcome, Session, explained, mutants_of, sampled, shown, table
+from tests.properties.planted import FOUND_ONLY, GENERATED, ROOT, SOURCES
 
 PARTS = ("core", "isolation", "device")
 LEAST = 0.95
@@ -51,6 +52,8 @@ OPTIONS = (
 RECORD = ROOT / "build" / "mutants.json"
 PAGE = ROOT / "harness" / "docs" / "evidence" / "mutants.md"
 SURVIVORS = Path(__file__).with_name("SURVIVORS.md")
+UNEXPLAINED = "not explained"
+PROGRESS_N, MOST_SHOWN = 50, 20
 
 
 def every_mutant() -> list[Mutant]:
@@ -185,50 +188,118 @@ def try_all(
 def main() -> int:
     """Print what survived; the exit status is 1 if something is unexplained, or the score is too low."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sample", type=int, help="so many mutants, by chance")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--sample", type=int, help="so many mutants, by chance (default: all)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the draw")
     parser.add_argument("--only", default="", help="mutants of the files whose name matches this")
     parser.add_argument("--properties", default="", help="properties to run, as for pytest -k")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--again", action="store_true", help="the survivors of the last run alone")
+    parser.add_argument("--again", action="store_true", help="try only the survivors of the run that wrote --out")
     parser.add_argument("--out", type=Path, default=RECORD)
     arguments = parser.parse_args()
     every = [mutant for mutant in every_mutant() if re.search(arguments.only, mutant.file)]
     chosen = sampled(every, len(every), arguments.seed)[: arguments.sample]
-    before = [Outcome(**{**each, "mutant": Mutant(**each["mutant"])}) for each in _recorded(arguments.out)]
+    before = _recorded(arguments.out)
     noticed = Counter(outcome.by for outcome in before if outcome.fate == "killed")
-    if arguments.again:
-        chosen = [outcome.mutant for outcome in before if outcome.fate == "survived"]
     outcomes: list[Outcome] = []
+    if arguments.again:
+        outcomes = [outcome for outcome in before if outcome.fate != "survived"]
+        chosen = [outcome.mutant for outcome in before if outcome.fate == "survived"]
+    known = explained(SURVIVORS)
 
     def tell(outcome: Outcome) -> None:
         outcomes.append(outcome)
-        if len(outcomes) % 50 == 0:
-            fates = Counter(each.fate for each in outcomes)
-            print(f"{len(outcomes)} of {len(chosen)}: {dict(fates)}", flush=True)
-            _write(arguments.out, outcomes)
-        if outcome.fate == "survived":
-            print(shown(outcome.mutant.key), f"   line {outcome.mutant.line}", flush=True)
+        if outcome.fate == "survived" and outcome.mutant.key not in known:
+            _say(f"{shown(outcome.mutant.key)}   line {outcome.mutant.line}")
+        if len(outcomes) % PROGRESS_N == 0:
+            _say(f"{len(outcomes)} tried: {_score(outcomes)}")
+        _write(arguments.out, outcomes)
 
-    print(f"{len(chosen)} of {len(every)} mutants, seed {arguments.seed}", flush=True)
+    _say(f"{len(chosen)} of {len(every)} mutants, seed {arguments.seed}")
     try_all(chosen, arguments.jobs, noticed, tell, arguments.properties)
-    _write(arguments.out, outcomes)
-    print(table(every, outcomes))
+    survivors = {outcome.mutant.key for outcome in outcomes if outcome.fate == "survived"}
+    command = " ".join(["make mutants", *(['ARGS="' + " ".join(sys.argv[1:]) + '"'] if sys.argv[1:] else [])])
+    page = _page(command, arguments.seed, every, outcomes, {key: known.get(key, UNEXPLAINED) for key in survivors})
+    if not arguments.only:
+        PAGE.write_text(page, encoding="utf-8")
+    _say(page)
+    return 1 if survivors - known.keys() or _part_killed(outcomes) < LEAST else 0
+
+
+def _part_killed(outcomes: Sequence[Outcome]) -> float:
     fates = Counter(outcome.fate for outcome in outcomes)
-    score = fates["killed"] / max(fates["killed"] + fates["survived"], 1)
-    print(f"score {score:.1%}: {fates['killed']} killed, {fates['survived']} survived,"
-          f" {fates['equivalent']} equivalent, {fates['invalid']} do not compile")
-    print(Counter(outcome.by for outcome in outcomes if outcome.fate == "killed").most_common(60))
-    return 0
+    return fates["killed"] / max(fates["killed"] + fates["survived"], 1)
+
+
+def _score(outcomes: Sequence[Outcome]) -> str:
+    fates = Counter(outcome.fate for outcome in outcomes)
+    return (
+        f"{fates['killed']} failed by a property, {fates['survived']} survived ({_part_killed(outcomes):.1%}),"
+        f" {fates['equivalent']} of the same code, {fates['invalid']} do not compile"
+    )
+
+
+def _page(
+    command: str,
+    seed: int,
+    every: Sequence[Mutant],
+    outcomes: Sequence[Outcome],
+    survivors: Mapping[tuple[str, str, str, str], str],
+) -> str:
+    """Page of the documentation."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    killers = Counter(outcome.by for outcome in outcomes if outcome.fate == "killed").most_common(MOST_SHOWN)
+    headings = Counter(survivors.values())
+    lines = [
+        "# Mutants against the shipped properties",
+        "",
+        f"`{command}` on {time.strftime('%Y-%m-%d')}, commit {commit.stdout.strip()}, seed {seed}:",
+        "the shipped properties alone, on the device in this process, each mutant until the first property",
+        "fails.",
+        "",
+        f"**{_score(outcomes)}.**",
+        "",
+        table(every, outcomes),
+        "",
+        "A mutant has the same code if the library is the same to the byte: the linker drops what no",
+        "function that the harness calls can reach. `slcan` is part of the device program, not of the",
+        "library.",
+        "",
+        "## Survivors",
+        "",
+        "`tests/properties/SURVIVORS.md` explains each by name.",
+        "",
+        "| reason | survivors |",
+        "|---|---|",
+        *(f"| {heading} | {count} |" for heading, count in headings.most_common()),
+        "",
+        "## Properties that failed most",
+        "",
+        "| property | mutants |",
+        "|---|---|",
+        *(f"| `{name.partition('::')[2] or name}` | {count} |" for name, count in killers),
+        "",
+    ]
+    return "\n".join(lines)
 
 
 def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
+    """Write all outcomes at once: a run may be ended at any time."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
+    unfinished.replace(path)
 
 
-def _recorded(path: Path) -> list[dict[str, Any]]:
-    return json.loads(path.read_text()) if path.exists() else []
+def _recorded(path: Path) -> list[Outcome]:
+    tables = json.loads(path.read_text()) if path.exists() else []
+    return [Outcome(**{**each, "mutant": Mutant(**each["mutant"])}) for each in tables]
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

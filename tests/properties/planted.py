@@ -104,7 +104,8 @@ def tried(library: Path, name: str, folder: Path, *, shrunk: bool) -> Found:
     runs = folder / "runs"
     command: list[str | Path] = [
         *(sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", folder, "-p", "no:cacheprovider"),
-        *("-p", "no:xdist", "-p", "no:randomly", "--tb=short", "-x", "--pyargs", "analogrig.testing.properties", "-k", name),
+        *("-p", "no:xdist", "-p", "no:randomly", "--tb=short", "-x"),
+        *("--pyargs", "analogrig.testing.properties", "-k", name),
         *("--hil-dut", f"inproc:{library}", "--hil-runs-dir", runs),
         *(() if shrunk else ("-p", FOUND_ONLY)),
     ]

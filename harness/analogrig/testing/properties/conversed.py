@@ -9,7 +9,19 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 
-from analogrig.catalogue import Configure, Configured, Element, Estimate, Firmware, Hello, Identify, Key, Message, Result, SampleBlock
+from analogrig.catalogue import (
+    Configure,
+    Configured,
+    Element,
+    Estimate,
+    Firmware,
+    Hello,
+    Identify,
+    Key,
+    Message,
+    Result,
+    SampleBlock,
+)
 from analogrig.devices.catalogue_description import CatalogueDescription
 from analogrig.errors import AnalogrigError, LinkTimeout
 from analogrig.estimator_config import EstimatorConfig

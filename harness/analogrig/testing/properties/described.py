@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator
 from analogrig.devices.device import Device
 from analogrig.devices.estimator import Estimator
 from analogrig.devices.registry import recorded
-from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator
 from analogrig.errors import DeviceRefused
 from analogrig.run import Run, missing_samples
 from analogrig.scenario import Scenario

@@ -108,12 +108,8 @@ class ReferenceDevice:
             case Sample(flags=flags, sample_index=index, force=u, displacement=y):
                 if self._accepts(flags >> RUN_SHIFT, 1):
                     yield from self._enter_sample(index, u, y, is_valid=not flags & SampleFlag.MISSING)
-            case SampleBlock(flags=flags, sample_index=first, missing=missing, codes=codes):
-                samples = flags & _SAMPLES_MASK
-                if self._accepts(flags >> RUN_SHIFT, samples):
-                    for i in range(samples):
-                        u, y = codes[2 * i : 2 * i + 2]
-                        yield from self._enter_sample((first + i) % INDICES, u, y, is_valid=not missing >> i & 1)
+            case SampleBlock():
+                yield from self._enter_block(message)
 
     def _count(self, name: str) -> int:
         return self._estimator.counters[name] if name in COUNTERS else self.counters[name]
@@ -159,6 +155,15 @@ class ReferenceDevice:
             self.counters["samples_of_other_runs"] += samples
             return False
         return True
+
+    def _enter_block(self, block: SampleBlock) -> Iterator[Message]:
+        samples = block.flags & _SAMPLES_MASK
+        if not self._accepts(block.flags >> RUN_SHIFT, samples):
+            return
+        for i in range(samples):
+            u, y = block.codes[2 * i : 2 * i + 2]
+            is_valid = not block.missing >> i & 1
+            yield from self._enter_sample((block.sample_index + i) % INDICES, u, y, is_valid=is_valid)
 
     def _enter_sample(self, index: int, u: int, y: int, *, is_valid: bool) -> Iterator[Message]:
         ahead = (index - self._next_index) % INDICES

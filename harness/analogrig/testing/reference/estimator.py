@@ -139,14 +139,13 @@ class ReferenceEstimator:
             return self._stepped(statistic, SteppedFlag.REFUSED)
         self.counters["updated"] += 1
         self._enter_input(u)
-        if self.pending:
-            step = self._gather()
-        else:
-            step = self._equation(y)
+        step = self._gather() if self.pending else self._equation(y)
         self.y = [y, *self.y][: self.config.na]
         return step
 
-    def _stepped(self, statistic: float, flags: int = 0, innovation: float = 0.0, *, alarm: bool = False) -> ReferenceStep:
+    def _stepped(
+        self, statistic: float, flags: int = 0, innovation: float = 0.0, *, alarm: bool = False
+    ) -> ReferenceStep:
         is_idle = 0 < self.config.idle_n <= self.since_n
         return ReferenceStep(innovation, statistic, alarm, flags | (SteppedFlag.IDLE if is_idle else 0))
 

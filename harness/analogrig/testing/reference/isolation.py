@@ -120,7 +120,7 @@ class ReferenceIsolation:
             self._stop()
         else:
             self._keep(u, y, step)
-        return self._work() if self._is_active else None
+        return self._work(self._plant) if self._is_active and self._plant is not None else None
 
     def _keep(self, u: float, y: float, step: ReferenceStep) -> None:
         self._kept.append((u, y, step.innovation))
@@ -169,7 +169,7 @@ class ReferenceIsolation:
 
     # ---- work
 
-    def _work(self) -> ReferenceDiagnosis | None:
+    def _work(self, plant: Plant) -> ReferenceDiagnosis | None:
         """Spend the slices of one sample."""
         left = SLICES_N
         named, found = None, None
@@ -181,7 +181,7 @@ class ReferenceIsolation:
             self._slices_left -= spent
             if self._slices_left:
                 break
-            fit = self._process(self._waiting_n - 1)
+            fit = self._process(plant, self._waiting_n - 1)
             self._waiting_n -= 1
             if fit is not None:
                 self.is_doubtful |= named is None and fit.is_doubtful
@@ -197,10 +197,8 @@ class ReferenceIsolation:
             return 1 + 2 * len(ONSETS_N)
         return 1 + int(np.count_nonzero(worked_n + self._onsets > self._onsets[0]))
 
-    def _process(self, ago: int) -> Fit | None:
+    def _process(self, plant: Plant, ago: int) -> Fit | None:
         """Enter the sample so long ago into all onsets; return their fit after the alarm."""
-        plant = self._plant
-        assert plant is not None
         self._worked_n += 1
         self._enter_residual(plant, ago)
         ages_n = self._worked_n + self._onsets - self._onsets[0]

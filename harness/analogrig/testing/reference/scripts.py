@@ -148,7 +148,15 @@ def control(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001 - scr
     yield numbers.sample(0)
     yield numbers.block(0)
     for command, argument in (
-        *((0, 1), (6, 7), (255, 0xA5C3_963C), (7, 0x5A3C_69C3), (Command.STOP, 9), (Command.START, 8), (Command.START, 0x10003)),
+        *(
+            (0, 1),
+            (6, 7),
+            (255, 0xA5C3_963C),
+            (7, 0x5A3C_69C3),
+            (Command.STOP, 9),
+            (Command.START, 8),
+            (Command.START, 0x10003),
+        ),
         *((Command.REPORT_INTERVAL, each) for each in (0, 65_535, 65_536, 1)),
         *((Command.START, RUN), (Command.START, 6), (Command.REPORT_INTERVAL, 3)),
     ):
@@ -194,10 +202,11 @@ def order(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.sample(14)
     yield numbers.sample(3)
     yield numbers.block(13, 3)
+    at = 16
     for interval, ahead in ((1, 1), (4, 3), (5, 11), (3, 1200)):
         yield numbers.control(Command.REPORT_INTERVAL, interval)
-        at = 16 if interval == 1 else at + 9 + ahead
         yield from (numbers.sample(at + ahead + i) for i in range(9))
+        at += ahead + 9
     yield numbers.control(Command.STATUS)
     for behind in (1, 2, 31, 32, 33, 40, 0):
         here = numbers.seq
@@ -209,7 +218,6 @@ def order(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.control(Command.REPORT_INTERVAL, 1)
     numbers.seq = (numbers.seq + 100) % SEQS
     yield Identify(numbers.next())
-    at = (at + 9) % INDICES
     for ahead in (30_000, 32_766, 32_767, 32_768, 20_000):
         at = (at + ahead) % INDICES
         yield numbers.sample(at)

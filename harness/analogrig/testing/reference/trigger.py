@@ -16,6 +16,9 @@ GAIN, DRIFT = 0.375, 0.69314718
 NEAR = 0.01
 """Distance from the ceiling at which rounding may decide, relative to the ceiling and 1."""
 
+RIVAL_NEAR = 1e-3
+"""The same of the distance between two readings of an edge, which share most of their rounding."""
+
 
 class Decision(Enum):
     """Meaning of an innovation."""
@@ -36,7 +39,7 @@ class ReferenceTrigger:
         self.rivals = [0.0, 0.0]
         """Statistics under the readings that recent edges came one sample early, and late."""
         self.is_doubtful = False
-        """True if rounding may have decided whether a statistic has reached the ceiling."""
+        """True if rounding may have decided whether a statistic has reached the ceiling, or another reading leads."""
         self.restart(config.warm_up_n)
 
     def restart(self, quiet_n: int) -> None:
@@ -52,7 +55,9 @@ class ReferenceTrigger:
     @property
     def has_rival(self) -> bool:
         """True if another reading of the edges explains the innovations better than the recorded one."""
-        return min(self.rivals) < self.statistic
+        ahead = self.statistic - min(self.rivals)
+        self.is_doubtful |= 0.0 < abs(ahead) < RIVAL_NEAR * (1.0 + self.statistic)
+        return ahead > 0.0
 
     @property
     def comes_late(self) -> bool:
