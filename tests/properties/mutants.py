@@ -53,6 +53,8 @@ RECORD = ROOT / "build" / "mutants.json"
 PAGE = ROOT / "harness" / "docs" / "evidence" / "mutants.md"
 SURVIVORS = Path(__file__).with_name("SURVIVORS.md")
 UNEXPLAINED = "not explained"
+EQUIVALENT = "Equivalent: "
+"""Beginning of the headings of survivors that no input of the device could show."""
 PROGRESS_N, MOST_SHOWN = 50, 20
 
 
@@ -211,7 +213,7 @@ def main() -> int:
         if outcome.fate == "survived" and outcome.mutant.key not in known:
             _say(f"{shown(outcome.mutant.key)}   line {outcome.mutant.line}")
         if len(outcomes) % PROGRESS_N == 0:
-            _say(f"{len(outcomes)} tried: {_score(outcomes)}")
+            _say(f"{len(outcomes)} tried: {_score(outcomes, known)}")
         _write(arguments.out, outcomes)
 
     _say(f"{len(chosen)} of {len(every)} mutants, seed {arguments.seed}")
@@ -222,18 +224,22 @@ def main() -> int:
     if not arguments.only:
         PAGE.write_text(page, encoding="utf-8")
     _say(page)
-    return 1 if survivors - known.keys() or _part_killed(outcomes) < LEAST else 0
+    return 1 if survivors - known.keys() or _part_killed(outcomes, known) < LEAST else 0
 
 
-def _part_killed(outcomes: Sequence[Outcome]) -> float:
-    fates = Counter(outcome.fate for outcome in outcomes)
-    return fates["killed"] / max(fates["killed"] + fates["survived"], 1)
+def _part_killed(outcomes: Sequence[Outcome], known: Mapping[tuple[str, str, str, str], str]) -> float:
+    """Part of the mutants failed by a property, of those that are not known to be equivalent."""
+    killed = sum(outcome.fate == "killed" for outcome in outcomes)
+    missed = [outcome.mutant.key for outcome in outcomes if outcome.fate == "survived"]
+    others = sum(not known.get(key, UNEXPLAINED).startswith(EQUIVALENT) for key in missed)
+    return killed / max(killed + others, 1)
 
 
-def _score(outcomes: Sequence[Outcome]) -> str:
+def _score(outcomes: Sequence[Outcome], known: Mapping[tuple[str, str, str, str], str]) -> str:
     fates = Counter(outcome.fate for outcome in outcomes)
     return (
-        f"{fates['killed']} failed by a property, {fates['survived']} survived ({_part_killed(outcomes):.1%}),"
+        f"{fates['killed']} failed by a property, {fates['survived']} survived: {_part_killed(outcomes, {}):.1%}, or"
+        f" {_part_killed(outcomes, known):.1%} of those not known to be equivalent;"
         f" {fates['equivalent']} of the same code, {fates['invalid']} do not compile"
     )
 
@@ -258,7 +264,7 @@ def _page(
         "the shipped properties alone, on the device in this process, each mutant until the first property",
         "fails.",
         "",
-        f"**{_score(outcomes)}.**",
+        f"**{_score(outcomes, survivors)}.**",
         "",
         table(every, outcomes),
         "",

@@ -24,8 +24,8 @@ from analogrig.scenario import Scenario
 from analogrig.testing.properties.test_detection import SINGLY
 from tests.harness.firmware import needs_firmware
 
-LONG = "rarer_than or of_all_kinds or stay_rare or noticed_soon or faults_of_the_line"
-"""Properties for which a line is too slow; its faults are tried apart, with short time-outs."""
+LONG = "rarer_than or of_all_kinds or stay_rare or noticed_soon or faults_of_the_line or converses or computes_what"
+"""Properties for which a line is too slow; its faults and messages are tried apart, with short time-outs."""
 
 FIRMWARE = "found_once or come_to_the_truth or warm_up or answers_with_numbers"
 """Properties of short plays: QEMU takes 1500 samples a second."""
@@ -55,8 +55,9 @@ def test_device_program_has_every_property_that_a_line_has_time_for(tmp_path: Pa
     assert "10 passed" in run(tmp_path, "host?exchange=block", "-k", f"not ({LONG})")
 
 
-def test_faults_of_the_line_to_the_device_program_do_no_harm(tmp_path: Path) -> None:
-    assert "2 passed" in run(tmp_path, "host?exchange=block&timeout_s=0.5", "-k", "faults_of_the_line")
+def test_device_program_converses_and_faults_of_its_line_do_no_harm(tmp_path: Path) -> None:
+    told = run(tmp_path, "host?exchange=block&timeout_s=0.5", "-k", "faults_of_the_line or converses")
+    assert "9 passed" in told
 
 
 @pytest.mark.parametrize("core", [pytest.param("m4", marks=needs_firmware)])

@@ -160,10 +160,10 @@ CASES: Mapping[str, Case] = {
     "edges become late, delayed": Case(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
     "edges become early, delayed": Case(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
     "missing while in doubt": Case(
-        EARLY, {**_FIXED, "noise_variance": 0.3, "ceiling": 60.0, "warm_up_n": 0}, leave_out_near_edges
+        EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
     ),
     "strong prior": Case(
-        SOFTER, {**_FIXED, "p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "noise_variance": 50.0}
+        SOFTER, {**_FIXED, "p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "noise_variance": 50.0, "isolation": False}
     ),
     "missing": Case(SOFTER, _RESTLESS, leave_out),
     "saturated": Case(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
