@@ -30,7 +30,7 @@ tenth of what noise costs. Half of it is the most that was measured (harness/doc
 THETA_ROUNDING = 0.2
 """The same of an element of theta, in its own standard deviations."""
 
-STATISTIC_ROUNDING = 0.1
+STATISTIC_ROUNDING = 0.2
 """The same of the statistic, relative to the statistic and 1."""
 
 EXTENT_ROUNDING = 5e-4

@@ -172,7 +172,7 @@ CASES: Mapping[str, Case] = {
     "noise estimated": Case(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
     "random walk": Case(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
     "extended": Case(
-        SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "isolation": False, "ceiling": 40.0}, is_optional=True
+        SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True
     ),
     "first order": Case(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
     "longest": Case(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
@@ -183,17 +183,17 @@ CASES: Mapping[str, Case] = {
     "mean of magnitudes": Case(
         SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.5, "absolute": True, "hold_off_n": 20, **_FREE_ALARMS}
     ),
-    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 7, "forgetting": 0.97}),
-    "often refreshed": Case(SOFTER, {"refresh_n": 18, "c": (-0.9, 0.2)}),
+    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 35, "forgetting": 0.97}),
+    "often refreshed": Case(SOFTER, {**_RESTLESS, "refresh_n": 18, "c": (-0.9, 0.2)}),
     **{
         name: Case(_scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed))
         for number, (name, changed) in enumerate(_SINGLE.items())
     },
     "M falls, one clock": Case(
         _scenario("M falls, one clock", _SQUARE, 530, **_SINGLE["M falls"]),
-        {"nb": 2, "nk": 1, "offset": True, "edge_instants": "locked", "forgetting": 0.995},
+        {**_FIXED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995},
     ),
     "B rises, missing": Case(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
     "no isolation": Case(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
-    "low ceiling": Case(SOFTER, {"arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}),
+    "low ceiling": Case(SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}),
 }
