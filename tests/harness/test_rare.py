@@ -99,6 +99,19 @@ def test_rate_does_not_depend_on_how_loud_the_branches_are(monkeypatch: pytest.M
     assert 1e-8 < rate < 1e-5
 
 
+def test_rate_counts_only_the_samples_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exposure factor: with the same climbs in twice as many samples, alarms are half as frequent."""
+    rate, ground = false_alarm_rate(emulator(), device(100.0), HEALTHY, 0, 100).rate, rare._Climbs._ground
+
+    def sparser(self: Any, first: int) -> tuple[NDArray[np.intp], int]:
+        found, length = ground(self, first)
+        return found, 2 * length
+
+    monkeypatch.setattr(rare._Climbs, "_ground", sparser)
+    assert rate > 0.0
+    assert false_alarm_rate(emulator(), device(100.0), HEALTHY, 0, 100).rate == pytest.approx(rate / 2.0)
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer branches, within this process."""

@@ -24,6 +24,10 @@ Spoil = Callable[[Codes, NDArray[np.bool_]], None]
 PLANT = PlantChoice("front", mass_kg=35.0, damping_n_s_per_m=2400.0, stiffness_n_per_m=24_500.0)
 """A fast plant. Its prefilter amplifies rounding little: float32 stays within a twentieth of the noise."""
 
+RINGING = dataclasses.replace(PLANT, damping_n_s_per_m=900.0)
+CREEPING = dataclasses.replace(PLANT, damping_n_s_per_m=3600.0)
+"""Plants with complex poles, and with poles far apart."""
+
 _SQUARE = Excitation(low_v=0.1, high_v=3.0)
 _FREE = dataclasses.replace(_SQUARE, clock="free")
 
@@ -163,7 +167,8 @@ CASES: Mapping[str, Case] = {
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
     ),
     "strong prior": Case(
-        SOFTER, {**_FIXED, "p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "noise_variance": 50.0, "isolation": False}
+        SOFTER,
+        {**_FIXED, "p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "noise_variance": 50.0, "isolation": False},
     ),
     "missing": Case(SOFTER, _RESTLESS, leave_out),
     "saturated": Case(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
@@ -171,9 +176,7 @@ CASES: Mapping[str, Case] = {
     "idle": Case(RARE_EDGES, {**_RESTLESS, "idle_n": 60}),
     "noise estimated": Case(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
     "random walk": Case(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
-    "extended": Case(
-        SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True
-    ),
+    "extended": Case(SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True),
     "first order": Case(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
     "longest": Case(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
     "prediction error": Case(
@@ -192,6 +195,12 @@ CASES: Mapping[str, Case] = {
     "M falls, one clock": Case(
         _scenario("M falls, one clock", _SQUARE, 530, **_SINGLE["M falls"]),
         {**_FIXED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995},
+    ),
+    "ringing plant": Case(
+        dataclasses.replace(_scenario("ringing", _FREE, 530, stiffness_n_per_m=20_000.0), plant=RINGING), _RESTLESS
+    ),
+    "creeping plant": Case(
+        dataclasses.replace(_scenario("creeping", _FREE, 530, damping_n_s_per_m=2600.0), plant=CREEPING), _RESTLESS
     ),
     "B rises, missing": Case(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
     "no isolation": Case(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),

@@ -32,7 +32,7 @@ SETTLED = 1.0001
 WEIGHT_DUE, WEIGHT_OVERDUE = 0.5, 0.25
 """Weights below which the d's are limited: in a step with little other work, and in any step."""
 
-NEAR = 0.05
+NEAR = 0.1
 """Relative distance from a threshold at which rounding may decide that A has moved."""
 
 COUNTERS = ("updated", "missing", "refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes")
