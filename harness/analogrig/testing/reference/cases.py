@@ -123,6 +123,11 @@ def leave_out_later(codes: Codes, missing: NDArray[np.bool_]) -> None:
     missing[404] = True
 
 
+def leave_out_after_alarm(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """One sample between the alarm for a change of K and its diagnosis."""
+    missing[427] = True
+
+
 def saturate(codes: Codes, missing: NDArray[np.bool_]) -> None:
     """Codes at the limits of the range, and one beside them."""
     missing[[150]] = True
@@ -177,6 +182,9 @@ CASES: Mapping[str, Case] = {
     "noise estimated": Case(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
     "random walk": Case(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
     "extended": Case(SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True),
+    "extended by one": Case(
+        SOFTER, {**_TWO_B, "nc": 1, "c": (-0.5,), "refresh_n": 0, "trigger": "none"}, is_optional=True
+    ),
     "first order": Case(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
     "longest": Case(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
     "prediction error": Case(
@@ -186,7 +194,7 @@ CASES: Mapping[str, Case] = {
     "mean of magnitudes": Case(
         SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.5, "absolute": True, "hold_off_n": 20, **_FREE_ALARMS}
     ),
-    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 35, "forgetting": 0.97}),
+    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 35, "idle_n": 0, "forgetting": 0.97}),
     "often refreshed": Case(SOFTER, {**_RESTLESS, "refresh_n": 18, "c": (-0.9, 0.2)}),
     **{
         name: Case(_scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed))
@@ -201,6 +209,11 @@ CASES: Mapping[str, Case] = {
     ),
     "creeping plant": Case(
         dataclasses.replace(_scenario("creeping", _FREE, 530, damping_n_s_per_m=2600.0), plant=CREEPING), _RESTLESS
+    ),
+    "K falls, missing after the alarm": Case(
+        _scenario("K falls, missing", dataclasses.replace(_FREE, phase=0.133), 530, **_SINGLE["K falls"]),
+        _RESTLESS,
+        leave_out_after_alarm,
     ),
     "B rises, missing": Case(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
     "no isolation": Case(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
