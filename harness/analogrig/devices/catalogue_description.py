@@ -43,7 +43,7 @@ class CatalogueDescription(DeviceDescription):
     """Samples between two reports of the estimate. Alarms are always reported."""
     wire_faults: str = ""
     """Faults of the line, in the notation of ``WireFaults.parse``."""
-    core: Literal["est", "own"] = "est"
+    computes: Literal["est", "own"] = "est"
     """The estimator that the device computes: that of estimator_c/core, which the shipped properties compare with their
     reference, or one of your own."""
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)

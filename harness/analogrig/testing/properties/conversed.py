@@ -22,7 +22,8 @@ from analogrig.catalogue import (
     Result,
     SampleBlock,
 )
-from analogrig.devices.catalogue_description import CatalogueDescription
+from analogrig.devices.catalogue_description import CatalogueDescription, EitherDevice
+from analogrig.devices.inproc import InprocDevice
 from analogrig.errors import AnalogrigError, LinkTimeout
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.can_link import CanLink
@@ -33,7 +34,7 @@ from analogrig.testing.properties.described import described_estimator
 from analogrig.testing.properties.experiments import device_with_faults
 from analogrig.testing.reference.device import ReferenceDevice
 from analogrig.testing.reference.scripts import SCRIPTS, Foreign, Garbage, Numbered, Script, is_for
-from analogrig.testing.reference.settings import ORDERS, Settings
+from analogrig.testing.reference.settings import ORDERS, ReferenceSettings
 from analogrig.testing.statement import Finding, Play, experiment
 
 RELATIVE, ROUNDING, THETA_ROUNDING = 1e-2, 0.1, 2e-3
@@ -57,7 +58,7 @@ def converses_as_catalogued(play: Play, scenario: Scenario, seed: int, script: s
     """
     del scenario, seed  # nothing of a rig takes part
     description = _on_port(play, port)
-    if not is_for(script, can=getattr(description, "link", "serial") != "serial"):
+    if not is_for(script, can=isinstance(description, EitherDevice) and not description.is_serial):
         pytest.skip(f"{script}: for lines of another kind")
     try:
         wrong = next(_wrong_answers(description, script), "")
@@ -71,7 +72,7 @@ def _on_port(play: Play, port: str) -> CatalogueDescription:
     description = dataclasses.replace(device_with_faults(play), wire_faults="")
     if not port:
         return description
-    if description.kind != "inproc" or getattr(description, "library", ""):
+    if not isinstance(description, InprocDevice) or description.library:
         pytest.skip(f"needs the project's device in this process, not {play.bench.dut.name}")
     return dataclasses.replace(description, link="can", fd=port == "can fd", exchange="sample")
 
@@ -83,10 +84,10 @@ def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[s
     with contextlib.closing(description.open_link()) as link:
         talk = _Talk(link, description.timeout_s)
         hello, firmware = talk.greet()
-        device = ReferenceDevice(hello, firmware, Settings(most), on_can=isinstance(link, CanLink))
+        device = ReferenceDevice(hello, firmware, ReferenceSettings(most), on_can=isinstance(link, CanLink))
         if hello.theta_max < EstimatorConfig().parameters or not firmware.input_blocks:
             yield f"{hello} and {firmware} state no room for the default configuration"
-        for batch in _batches(SCRIPTS[script](talk.numbers, Settings(most)), in_blocks=talk.carries_blocks):
+        for batch in _batches(SCRIPTS[script](talk.numbers, ReferenceSettings(most)), in_blocks=talk.carries_blocks):
             if not isinstance(batch, list):
                 talk.disturb(batch)
                 _count(device, batch)
@@ -185,6 +186,6 @@ def _agrees(found: Message, due: Message) -> bool:
     is_theta = isinstance(due, Estimate) and due.element != Element.INNOVATION
     within = THETA_ROUNDING if is_theta else ROUNDING
     return type(found) is type(due) and all(
-        math.isclose(one, other, rel_tol=RELATIVE, abs_tol=within) if isinstance(other, float) else one == other
+        math.isclose(float(one), other, rel_tol=RELATIVE, abs_tol=within) if isinstance(other, float) else one == other
         for one, other in zip(found, due, strict=True)
     )

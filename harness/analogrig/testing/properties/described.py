@@ -19,7 +19,7 @@ from analogrig.errors import DeviceRefused
 from analogrig.run import Run, missing_samples
 from analogrig.scenario import Scenario
 from analogrig.testing.properties.experiments import device_description
-from analogrig.testing.reference.cases import CASES, Case, SpoiledRig, U, Y
+from analogrig.testing.reference.cases import CASES, ReferenceCase, SpoiledRig, U, Y
 from analogrig.testing.reference.comparison import Expected, expected_of
 from analogrig.testing.statement import Finding, Inconclusive, Play, experiment
 
@@ -63,13 +63,13 @@ def described_estimator(play: Play) -> CatalogueDescription:
     description = device_description(play.bench.dut)
     if not has_our_estimator(description):
         pytest.skip(f"needs a device with the settings of EstimatorConfig, not {play.bench.dut.name}")
-    if description.core != "est":
-        pytest.skip(f"needs a device with core = 'est', not {description.core!r}")
+    if description.computes != "est":
+        pytest.skip(f"needs a device with computes = 'est', not {description.computes!r}")
     return description
 
 
 @contextlib.contextmanager
-def _configured(play: Play, description: CatalogueDescription, case: Case) -> Iterator[Device]:
+def _configured(play: Play, description: CatalogueDescription, case: ReferenceCase) -> Iterator[Device]:
     """The device with the settings of a case; the test is skipped if its build lacks them."""
     with contextlib.ExitStack() as stack:
         device = play.bench.dut

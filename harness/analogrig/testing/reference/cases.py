@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,13 +56,13 @@ RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.
 
 
 @dataclass(frozen=True)
-class Case:
+class ReferenceCase:
     """Settings of the estimator beside its defaults, and the samples that it receives."""
 
     scenario: Scenario
     settings: Mapping[str, Any] = field(default_factory=dict)
     spoil: Spoil | None = None
-    exchange: str = ""
+    exchange: Literal["", "block"] = ""
     """Exchange of the device, if it runs in this process; empty: that of the session."""
     is_optional: bool = False
     """True if a build of the device may lack the settings."""
@@ -159,63 +159,67 @@ _RESTLESS = {"forgetting": 0.97, "warm_up_n": 100}
 _FREE_ALARMS = {"warm_up_n": 60, "refresh_n": 0}
 _TWO_B = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked"}
 
-CASES: Mapping[str, Case] = {
-    "default": Case(SOFTER),
-    "default in blocks": Case(SOFTER, exchange="block"),
-    "one clock": Case(LOCKED, {**_TWO_B, **_FIXED, "forgetting": 0.997, "isolation": False}),
-    "anywhere": Case(SOFTER, {**_RESTLESS, "edge_instants": "anywhere", "edge_codes": 500.0}),
-    "edges become late": Case(LATE, _RESTLESS),
-    "edges become early": Case(EARLY, _RESTLESS),
-    "edges become late, delayed": Case(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
-    "edges become early, delayed": Case(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
-    "missing while in doubt": Case(
+CASES: Mapping[str, ReferenceCase] = {
+    "default": ReferenceCase(SOFTER),
+    "default in blocks": ReferenceCase(SOFTER, exchange="block"),
+    "one clock": ReferenceCase(LOCKED, {**_TWO_B, **_FIXED, "forgetting": 0.997, "isolation": False}),
+    "anywhere": ReferenceCase(SOFTER, {**_RESTLESS, "edge_instants": "anywhere", "edge_codes": 500.0}),
+    "edges become late": ReferenceCase(LATE, _RESTLESS),
+    "edges become early": ReferenceCase(EARLY, _RESTLESS),
+    "edges become late, delayed": ReferenceCase(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
+    "edges become early, delayed": ReferenceCase(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
+    "missing while in doubt": ReferenceCase(
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
     ),
-    "strong prior": Case(
+    "strong prior": ReferenceCase(
         SOFTER,
         {**_FIXED, "p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "noise_variance": 50.0, "isolation": False},
     ),
-    "missing": Case(SOFTER, _RESTLESS, leave_out),
-    "saturated": Case(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
-    "stuck": Case(HEALTHY, {**_FIXED, "stuck_n": 8}, hold),
-    "idle": Case(RARE_EDGES, {**_RESTLESS, "idle_n": 60}),
-    "noise estimated": Case(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
-    "random walk": Case(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
-    "extended": Case(SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True),
-    "extended by one": Case(
+    "missing": ReferenceCase(SOFTER, _RESTLESS, leave_out),
+    "saturated": ReferenceCase(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
+    "stuck": ReferenceCase(HEALTHY, {**_FIXED, "stuck_n": 8}, hold),
+    "idle": ReferenceCase(RARE_EDGES, {**_RESTLESS, "idle_n": 60}),
+    "noise estimated": ReferenceCase(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
+    "random walk": ReferenceCase(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
+    "extended": ReferenceCase(
+        SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True
+    ),
+    "extended by one": ReferenceCase(
         SOFTER, {**_TWO_B, "nc": 1, "c": (-0.5,), "refresh_n": 0, "trigger": "none"}, is_optional=True
     ),
-    "first order": Case(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
-    "longest": Case(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
-    "prediction error": Case(
+    "first order": ReferenceCase(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
+    "longest": ReferenceCase(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
+    "prediction error": ReferenceCase(
         SOFTER, {"trigger": "prediction-error", "ceiling": 12.0, "hold_off_n": 30, "reset": "all", **_FREE_ALARMS}
     ),
-    "mean": Case(SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.6, "hold_off_n": 4, **_FREE_ALARMS}),
-    "mean of magnitudes": Case(
+    "mean": ReferenceCase(SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.6, "hold_off_n": 4, **_FREE_ALARMS}),
+    "mean of magnitudes": ReferenceCase(
         SOFTER, {"trigger": "mean-between-faults", "ceiling": 0.5, "absolute": True, "hold_off_n": 20, **_FREE_ALARMS}
     ),
-    "no trigger": Case(SOFTER, {"trigger": "none", "c": (), "refresh_n": 35, "idle_n": 0, "forgetting": 0.97}),
-    "often refreshed": Case(SOFTER, {**_RESTLESS, "refresh_n": 18, "c": (-0.9, 0.2)}),
+    "no trigger": ReferenceCase(SOFTER, {"trigger": "none", "c": (), "refresh_n": 35, "idle_n": 0, "forgetting": 0.97}),
+    "often refreshed": ReferenceCase(SOFTER, {**_RESTLESS, "refresh_n": 18, "c": (-0.9, 0.2)}),
     **{
-        name: Case(_scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed))
+        name: ReferenceCase(_scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed))
         for number, (name, changed) in enumerate(_SINGLE.items())
     },
-    "M falls, one clock": Case(
+    "M falls, one clock": ReferenceCase(
         _scenario("M falls, one clock", _SQUARE, 530, **_SINGLE["M falls"]),
         {**_FIXED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995},
     ),
-    "ringing plant": Case(
+    "ringing plant": ReferenceCase(
         dataclasses.replace(_scenario("ringing", _FREE, 530, stiffness_n_per_m=20_000.0), plant=RINGING), _RESTLESS
     ),
-    "creeping plant": Case(
+    "creeping plant": ReferenceCase(
         dataclasses.replace(_scenario("creeping", _FREE, 530, damping_n_s_per_m=2600.0), plant=CREEPING), _RESTLESS
     ),
-    "K falls, missing after the alarm": Case(
+    "K falls, missing after the alarm": ReferenceCase(
         _scenario("K falls, missing", dataclasses.replace(_FREE, phase=0.133), 530, **_SINGLE["K falls"]),
         _RESTLESS,
         leave_out_after_alarm,
     ),
-    "B rises, missing": Case(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
-    "no isolation": Case(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
-    "low ceiling": Case(SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}),
+    "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
+    "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
+    "low ceiling": ReferenceCase(
+        SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}
+    ),
 }

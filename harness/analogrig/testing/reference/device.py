@@ -38,7 +38,7 @@ from analogrig.catalogue import (
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.testing.reference.estimator import COUNTERS, ReferenceEstimator
-from analogrig.testing.reference.settings import Settings
+from analogrig.testing.reference.settings import ReferenceSettings
 
 LATE_MAX, GAP_MAX, MOST_INTERVAL = 32, 1024, 65_535
 """Sequence numbers that count as repeated, samples of a gap that are entered, and longest interval of reports."""
@@ -49,7 +49,7 @@ _SAMPLES_MASK = (1 << 4) - 1
 class ReferenceDevice:
     """Device whose answers are expected. ``enter`` a message, and compare the answers."""
 
-    def __init__(self, hello: Hello, firmware: Firmware, settings: Settings, *, on_can: bool) -> None:
+    def __init__(self, hello: Hello, firmware: Firmware, settings: ReferenceSettings, *, on_can: bool) -> None:
         """``hello`` and ``firmware``: answers to the first Identify, which state the limits of the build.
 
         :param on_can: messages that are not of the harness come from other nodes.

@@ -13,7 +13,7 @@ from enum import Enum
 from analogrig.catalogue import SteppedFlag
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.testing.reference.regression import Covariance, Vector, Whitener, dot, is_stable
-from analogrig.testing.reference.trigger import Decision, ReferenceTrigger
+from analogrig.testing.reference.trigger import Meaning, ReferenceTrigger
 
 DOUBT_N = 12
 """Samples after an edge during which a slip is considered."""
@@ -216,7 +216,7 @@ class ReferenceEstimator:
     def _gap(self) -> None:
         if not self.u:
             return
-        if self.doubt is not None and self.trigger.end_doubt() is Decision.SLIP:
+        if self.doubt is not None and self.trigger.end_doubt() is Meaning.SLIP:
             self._slip(self.doubt.theta)
         self._forget()
 
@@ -240,10 +240,10 @@ class ReferenceEstimator:
         expires = self.doubt is not None and self.doubt.age_n >= DOUBT_N
         decision = self.trigger.enter(innovation, variance, readings, expires=expires)
         self.deviation = math.sqrt(variance * self.trigger.noise_variance)
-        step = self._stepped(self.trigger.statistic, 0, innovation, alarm=decision is Decision.ALARM)
-        if decision is Decision.ALARM:
+        step = self._stepped(self.trigger.statistic, 0, innovation, alarm=decision is Meaning.ALARM)
+        if decision is Meaning.ALARM:
             self._alarm()
-        elif decision is Decision.SLIP and self.doubt is not None:
+        elif decision is Meaning.SLIP and self.doubt is not None:
             self._slip(self.doubt.theta)
             self._forget()
         return step

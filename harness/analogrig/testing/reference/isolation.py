@@ -55,7 +55,7 @@ class ReferenceDiagnosis:
     extent: float
 
 
-class Plant:
+class ReferencePlant:
     """Mechanics in units of samples, from theta and C of an estimator."""
 
     def __init__(self, estimator: ReferenceEstimator, force_zero: float) -> None:
@@ -102,7 +102,7 @@ class ReferenceIsolation:
             and config.edge_instants != "anywhere"
         )
         self._kept: deque[tuple[float, float, float]] = deque(maxlen=KEPT_N)  # u, y, innovation; newest last
-        self._plant: Plant | None = None
+        self._plant: ReferencePlant | None = None
         self._is_quiet = False
         self._since_n = 0
         self._is_active = False
@@ -143,7 +143,7 @@ class ReferenceIsolation:
 
     def _take_plant(self) -> None:
         try:
-            self._plant = Plant(self._estimator, self._estimator.config.force_zero)
+            self._plant = ReferencePlant(self._estimator, self._estimator.config.force_zero)
         except ValueError:
             self._plant = None
 
@@ -169,7 +169,7 @@ class ReferenceIsolation:
 
     # ---- work
 
-    def _work(self, plant: Plant) -> ReferenceDiagnosis | None:
+    def _work(self, plant: ReferencePlant) -> ReferenceDiagnosis | None:
         """Spend the slices of one sample."""
         left = SLICES_N
         named, found = None, None
@@ -197,7 +197,7 @@ class ReferenceIsolation:
             return 1 + 2 * len(ONSETS_N)
         return 1 + int(np.count_nonzero(worked_n + self._onsets > self._onsets[0]))
 
-    def _process(self, plant: Plant, ago: int) -> Fit | None:
+    def _process(self, plant: ReferencePlant, ago: int) -> Fit | None:
         """Enter the sample so long ago into all onsets; return their fit after the alarm."""
         self._worked_n += 1
         self._enter_residual(plant, ago)
@@ -211,14 +211,14 @@ class ReferenceIsolation:
         self._vector += self._nats * now * self._residuals[0]
         return self._fit() if self._worked_n > self._onsets[0] else None
 
-    def _enter_residual(self, plant: Plant, ago: int) -> None:
+    def _enter_residual(self, plant: ReferencePlant, ago: int) -> None:
         """Whiten y less the response of the plant before the change."""
         out = sum(a * self._ago(ago + i)[1] for i, a in enumerate(plant.a))
         out -= sum(b * self._ago(ago + i + plant.nk)[0] for i, b in enumerate(plant.b)) + plant.offset
         out -= plant.c[0] * self._residuals[0] + plant.c[1] * self._residuals[1]
         self._residuals = [out, self._residuals[0]]
 
-    def _driving(self, plant: Plant, ago: int) -> tuple[list[float], list[float]]:
+    def _driving(self, plant: ReferencePlant, ago: int) -> tuple[list[float], list[float]]:
         """Inputs of the effects of M, B and K: for an onset before, and for one at the sample before."""
         zero = self._estimator.config.force_zero
         u = [self._ago(ago + i)[0] - zero for i in range(len(plant.b) + plant.nk + 1)]

@@ -28,7 +28,7 @@ from analogrig.catalogue import (
     pack,
 )
 from analogrig.links import frame
-from analogrig.testing.reference.settings import ORDERS, WHOLE, Settings
+from analogrig.testing.reference.settings import ORDERS, WHOLE, ReferenceSettings
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def _codes(index: int) -> tuple[int, int]:
     return 700 + 3100 * level + index % 3, round(900.0 + 2500.0 * answer + noise)
 
 
-def settings(numbers: Numbered, build: Settings) -> Script:
+def settings(numbers: Numbered, build: ReferenceSettings) -> Script:
     """Every key at its limits, beyond them, and between whole values; then configurations that do not go together."""
     for key in range(max(Key) + 3):
         limits = build.range_of(key)
@@ -141,7 +141,7 @@ def _sure(numbers: Numbered) -> Script:
         yield numbers.configure(key, value)
 
 
-def control(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001 - scripts have one form
+def control(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001 - scripts have one form
     """Commands in every state, with arguments at their limits; samples that no run takes."""
     yield from _sure(numbers)
     yield numbers.control(Command.STATUS)
@@ -192,7 +192,7 @@ def control(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001 - scr
     yield numbers.control(Command.STATUS)
 
 
-def order(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+def order(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
     """Repeated, late and skipped messages and samples, and indices that wrap around."""
     yield from _sure(numbers)
     yield numbers.control(Command.START, RUN)
@@ -231,7 +231,7 @@ def order(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.control(Command.STOP)
 
 
-def alarms(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+def alarms(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
     """Runs with alarms of each trigger, over single samples and over blocks with missing samples."""
     yield from _sure(numbers)
     for trigger, ceiling in ((3, 2.0), (1, 40.0), (2, 20.0)):
@@ -247,7 +247,7 @@ def alarms(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.control(Command.RESET)
 
 
-def crowd(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+def crowd(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
     """More messages at once than their answers fit into the output of a port."""
     yield from _sure(numbers)
     yield numbers.control(Command.START, RUN)
@@ -258,7 +258,7 @@ def crowd(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.control(Command.STOP)
 
 
-def damage(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+def damage(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
     """Bytes that are no frame, between frames; every damaged one is counted once, and harms no other."""
     good = frame.encode(pack(Control(0, Command.REPORT_INTERVAL, 0x01000001)))
     full = frame.encode(pack(SampleBlock(0, 14, 1, 1, tuple(range(257, 257 + 2 * BLOCK_SAMPLES)))))
@@ -284,7 +284,7 @@ def damage(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.control(Command.STATUS)
 
 
-def foreign(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+def foreign(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
     """Frames of other nodes, of wrong lengths, and reports of errors, between frames of the harness."""
     ours, eight = LAYOUTS["Control"].id, bytes([0, Command.REPORT_INTERVAL, 0, 0, 1, 0, 0, 1])
     for each in (
@@ -308,7 +308,7 @@ def foreign(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
     yield numbers.control(Command.STATUS)
 
 
-def losses(numbers: Numbered, build: Settings) -> Script:  # noqa: ARG001
+def losses(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
     """So many lost and ignored samples that a counter fills all its bytes."""
     yield numbers.control(Command.REPORT_INTERVAL, 65_535)
     yield numbers.control(Command.START, RUN)
@@ -328,6 +328,6 @@ def is_for(script: str, *, can: bool) -> bool:
     return SCRIPTS[script] not in (_ON_SERIAL if can else _ON_CAN)
 
 
-SCRIPTS: Mapping[str, Callable[[Numbered, Settings], Script]] = {
+SCRIPTS: Mapping[str, Callable[[Numbered, ReferenceSettings], Script]] = {
     each.__name__: each for each in (settings, control, order, alarms, crowd, losses, damage, foreign)
 }

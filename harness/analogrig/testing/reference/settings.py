@@ -53,7 +53,7 @@ ORDERS = (Key.NA, Key.NB, Key.NK, Key.NC)
 
 
 @dataclasses.dataclass
-class Settings:
+class ReferenceSettings:
     """Settings of a device, by key."""
 
     most: Mapping[Key, int]
@@ -64,9 +64,9 @@ class Settings:
         if not self.values:
             self.values = {int(key): float(np.float32(value)) for key, value in _DEFAULT.settings()}
 
-    def defaults(self) -> Settings:
+    def defaults(self) -> ReferenceSettings:
         """The same build with default settings."""
-        return Settings(self.most)
+        return ReferenceSettings(self.most)
 
     def range_of(self, key: int) -> tuple[float, float] | None:
         """Least and largest value of a key; None if the build has none of that number."""

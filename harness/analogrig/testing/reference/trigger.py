@@ -20,7 +20,7 @@ RIVAL_NEAR = 1e-3
 """The same of the distance between two readings of an edge, which share most of their rounding."""
 
 
-class Decision(Enum):
+class Meaning(Enum):
     """Meaning of an innovation."""
 
     QUIET = 0
@@ -68,12 +68,12 @@ class ReferenceTrigger:
         """Start the other readings from the present statistic."""
         self.rivals = [self.statistic, self.statistic]
 
-    def end_doubt(self) -> Decision:
+    def end_doubt(self) -> Meaning:
         """End a doubt at a gap: a slip if nothing but another reading has prevented an alarm."""
         if self.statistic >= self._ceiling:
-            return Decision.SLIP
+            return Meaning.SLIP
         self.statistic = min(self.statistic, *self.rivals)
-        return Decision.QUIET
+        return Meaning.QUIET
 
     def settle(self) -> None:
         """Continue with the better of the other readings, after a slip."""
@@ -87,7 +87,7 @@ class ReferenceTrigger:
 
     def enter(
         self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
-    ) -> Decision:
+    ) -> Meaning:
         """Enter an innovation with its variance in noise variances.
 
         :param readings: innovations under the other readings of the edges in doubt; None without doubt.
@@ -95,10 +95,10 @@ class ReferenceTrigger:
         """
         if self._quiet_n:
             self._quiet_n -= 1
-            return Decision.QUIET
+            return Meaning.QUIET
         trigger = self._config.trigger
         if trigger == "none":
-            return Decision.QUIET
+            return Meaning.QUIET
         if trigger == "cusum":
             decision = self._enter_cusum(innovation, variance * self.noise_variance, readings, expires=expires)
             self._note_doubt()
@@ -109,22 +109,22 @@ class ReferenceTrigger:
             self._mean += ((abs(innovation) if self._config.absolute else innovation) - self._mean) / self._mean_n
             self.statistic = abs(self._mean)
         self._note_doubt()
-        return Decision.ALARM if self.statistic >= self._ceiling else Decision.QUIET
+        return Meaning.ALARM if self.statistic >= self._ceiling else Meaning.QUIET
 
     def _note_doubt(self) -> None:
         self.is_doubtful |= abs(self.statistic - self._ceiling) < NEAR * (1.0 + self._ceiling)
 
     def _enter_cusum(
         self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
-    ) -> Decision:
+    ) -> Meaning:
         self.statistic = _cusum(self.statistic, innovation, variance)
         if readings is not None:
             self.rivals = [_cusum(g, e, variance) for g, e in zip(self.rivals, readings, strict=True)]
         if self.statistic < self._ceiling:
-            return Decision.QUIET
+            return Meaning.QUIET
         if readings is None or min(self.rivals) >= self._ceiling:
-            return Decision.ALARM
-        return Decision.SLIP if expires else Decision.QUIET
+            return Meaning.ALARM
+        return Meaning.SLIP if expires else Meaning.QUIET
 
 
 def _cusum(before: float, innovation: float, variance: float) -> float:
