@@ -22,8 +22,8 @@ from analogrig.catalogue import (
     Result,
     SampleBlock,
 )
-from analogrig.devices.catalogue_description import CatalogueDescription, EitherDevice
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator
+from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, LinkTimeout
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.can_link import CanLink
@@ -58,7 +58,7 @@ def converses_as_catalogued(play: Play, scenario: Scenario, seed: int, script: s
     """
     del scenario, seed  # nothing of a rig takes part
     description = _on_port(play, port)
-    if not is_for(script, can=isinstance(description, EitherDevice) and not description.is_serial):
+    if not is_for(script, can=description.as_table().get("link", "serial") != "serial"):
         pytest.skip(f"{script}: for lines of another kind")
     try:
         wrong = next(_wrong_answers(description, script), "")
@@ -72,9 +72,12 @@ def _on_port(play: Play, port: str) -> CatalogueDescription:
     description = dataclasses.replace(device_with_faults(play), wire_faults="")
     if not port:
         return description
-    if not isinstance(description, InprocDevice) or description.library:
+    table = description.as_table()
+    if "in-process" not in description.capabilities or table.get("library") or "link" not in table:
         pytest.skip(f"needs the project's device in this process, not {play.bench.dut.name}")
-    return dataclasses.replace(description, link="can", fd=port == "can fd", exchange="sample")
+    on_can = recorded({**table, "link": "can", "fd": port == "can fd", "exchange": "sample"})
+    assert has_our_estimator(on_can)
+    return on_can
 
 
 def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[str]:
@@ -186,6 +189,8 @@ def _agrees(found: Message, due: Message) -> bool:
     is_theta = isinstance(due, Estimate) and due.element != Element.INNOVATION
     within = THETA_ROUNDING if is_theta else ROUNDING
     return type(found) is type(due) and all(
-        math.isclose(float(one), other, rel_tol=RELATIVE, abs_tol=within) if isinstance(other, float) else one == other
+        math.isclose(one, other, rel_tol=RELATIVE, abs_tol=within)
+        if isinstance(one, float) and isinstance(other, float)
+        else one == other
         for one, other in zip(found, due, strict=True)
     )
