@@ -180,7 +180,7 @@ CASES: Mapping[str, ReferenceCase] = {
     "stuck": ReferenceCase(HEALTHY, {**_FIXED, "stuck_n": 8}, hold),
     "idle": ReferenceCase(RARE_EDGES, {**_RESTLESS, "idle_n": 60}),
     "noise estimated": ReferenceCase(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
-    "random walk": ReferenceCase(SOFTER, {"random_walk": 1e-7, "forgetting": 1.0}),
+    "random walk": ReferenceCase(SOFTER, {"random_walk": 1e-5, "forgetting": 1.0}),
     "extended": ReferenceCase(
         SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True
     ),
