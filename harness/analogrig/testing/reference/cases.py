@@ -207,7 +207,7 @@ CASES: Mapping[str, ReferenceCase] = {
         {**_FIXED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995},
     ),
     "ringing plant": ReferenceCase(
-        dataclasses.replace(_scenario("ringing", _FREE, 530, stiffness_n_per_m=20_000.0), plant=RINGING), _RESTLESS
+        dataclasses.replace(_scenario("ringing", _FREE, 530, damping_n_s_per_m=1250.0), plant=RINGING), _RESTLESS
     ),
     "creeping plant": ReferenceCase(
         dataclasses.replace(_scenario("creeping", _FREE, 530, damping_n_s_per_m=2600.0), plant=CREEPING), _RESTLESS
