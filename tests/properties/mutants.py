@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -55,7 +56,7 @@ SURVIVORS = Path(__file__).with_name("SURVIVORS.md")
 UNEXPLAINED = "not explained"
 EQUIVALENT = "Equivalent: "
 """Beginning of the headings of survivors that no input of the device could show."""
-PROGRESS_N, MOST_SHOWN = 50, 20
+PROGRESS_N, MOST_SHOWN, WIDTH = 50, 20, 98
 
 
 def every_mutant() -> list[Mutant]:
@@ -260,11 +261,12 @@ def _page(
     lines = [
         "# Mutants against the shipped properties",
         "",
-        f"`{command}` on {time.strftime('%Y-%m-%d')}, commit {commit.stdout.strip()}, seed {seed}:",
+        f"`{command}`,",
+        f"{time.strftime('%Y-%m-%d')}, commit {commit.stdout.strip()}, seed {seed}:",
         "the shipped properties alone, on the device in this process, each mutant until the first property",
         "fails.",
         "",
-        f"**{_score(outcomes, survivors)}.**",
+        *textwrap.wrap(f"**{_score(outcomes, survivors)}.**", WIDTH),
         "",
         table(every, outcomes),
         "",
