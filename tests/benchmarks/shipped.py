@@ -62,8 +62,8 @@ def reported_misfits(played: Played) -> Sequence[Misfit]:
     if max(played.u.max(), played.y.max()) > MOST_CODE:
         raise LookupError(f"messages carry codes up to {MOST_CODE}")
     device.start()
-    codes = (signal.astype(np.uint16) for signal in (played.u, played.y))
-    answers = list(device.play([Samples(0, *codes, played.valid)]))
+    samples = Samples(0, played.u.astype(np.uint16), played.y.astype(np.uint16), played.valid)
+    answers = list(device.play([samples]))
     device.stop()
     misfits = [each for part in answers for each in part.misfits if each.cause != Cause.NONE]
     return [Misfit(Cause(each.cause).name.lower().replace("_", "-"), each.index) for each in misfits]
