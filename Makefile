@@ -69,7 +69,7 @@ run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="
 	@$(BIN)/analogrig run --out $(BUILD)/run $(ARGS)
 
 test: check $(if $(call found,arm-none-eabi-gcc),firmware,no-firmware) ## check, then every test that this machine can run; PYTEST_ARGS="-k frame" goes to pytest
-	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
+	@$(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 test-bare: ## make test on a PATH that has python3, a C compiler, make, git and coreutils alone
 	@$(PYTHON) -m tests.bare $(if $(PYTEST_ARGS),PYTEST_ARGS='$(PYTEST_ARGS)')

@@ -31,6 +31,14 @@ Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 ALLOWED_SKIPS = os.environ.get("ANALOGRIG_CI", "")
 """Empty: any. "bare": those for a missing tool. Anything else: none."""
 LACKING = pytest.StashKey[tuple[str, ...]]()
+SLOWEST = (
+    "test_foreign_repositories",
+    "test_readme_commands",
+    "test_coverage",
+    "test_shipped_properties",
+    "test_packaging",
+)
+"""Modules to start with: one that is left for the end has a processor to itself while others are idle."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -47,7 +55,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what each test needs, by its fixtures too; skip those whose tools are missing."""
+    """Mark what each test needs, by its fixtures too; skip those whose tools are missing; the slowest come first."""
     for item in items:
         for fixture in getattr(item, "fixturenames", ()):
             if fixture in tools.FIXTURES:
@@ -62,6 +70,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if lacking:
             item.stash[LACKING] = lacking
             item.add_marker(pytest.mark.skip(reason=tools.reason(lacking)))
+    items.sort(key=lambda item: item.path.stem not in SLOWEST)
 
 
 @pytest.hookimpl(wrapper=True)

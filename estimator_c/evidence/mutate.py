@@ -79,7 +79,7 @@ machine may be busy."""
 FLAGS = (
     *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
     *("-fsanitize=bounds-strict", "-fsanitize-undefined-trap-on-error"),
-    *(f"-I{path}" for path in (CORE.parent / "device", CORE.parent / "isolation", GENERATED)),
+    *(f"-I{path}" for path in (*(CORE.parent / part for part in ("device", "isolation", "fit")), GENERATED)),
 )
 """One copy of each equation's code: the others are for speed, and test_est_builds.py compares them."""
 
@@ -91,6 +91,7 @@ AROUND = {
         ROOT / "tests" / "estimator_c" / "est_driver.c",
         *(CORE.parent / "ports" / "library").glob("*.c"),
         *(CORE.parent / "isolation").glob("*.c"),
+        *(CORE.parent / "fit").glob("*.c"),
         CORE.parent / "device" / "settings.c",
     ),
     HASHED: (CORE.parent / "evidence" / "bit_exact.c", *(CORE.parent / "isolation").glob("*.c")),

@@ -34,6 +34,7 @@ RANGES: Mapping[Key, tuple[float, float]] = {
     Key.HOLD_OFF_N: _U16,
     Key.WARM_UP_N: _U16,
     Key.ISOLATION: (0, 1),
+    Key.MISFIT: (0, 1),
     Key.FORGETTING: (0.5, 1.0),
     Key.RANDOM_WALK: (0.0, 1e9),
     Key.P0: _VARIANCE,
