@@ -31,7 +31,6 @@ PACKAGES = {
     "gcc": "gcc",
     "gcov": "gcc",
     "bash": "bash",
-    "sed": "sed",
     "g++": "g++",
     "cmake": "cmake",
     "clang": "clang libclang-rt-dev",
