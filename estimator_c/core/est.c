@@ -4,6 +4,7 @@
 #include "est_assert.h"
 #include "est_edges.h"
 #include "est_equation.h"
+#include "est_scale.h"
 #include "est_trigger.h"
 
 #include <float.h>
@@ -35,12 +36,10 @@
 /// Square of the smallest ratio of the range of the codes to the standard deviation of the noise.
 #define NOISE_SHARE 1024.0F
 
-/// Rate at which the noise variance is followed. A squared innovation counts at most NOISE_CLIP times its expected
-/// value, so that a change of the plant is not taken for noise. Clipping leaves NOISE_KEPT of the variance of
-/// Gaussian noise.
-#define NOISE_RATE 0.005F
-#define NOISE_CLIP 9.0F
-#define NOISE_KEPT 0.9851F
+/// Longest gap that is bridged by predicted samples, and smallest precision of the whitening at which it is. Soon after
+/// a start the prediction would rest on few noisy samples.
+#define BRIDGED_MAX 8U
+#define BRIDGE_PRECISION 0.6F
 
 EST_SHARED void increment(uint16_t* const counter) {
     *counter = (uint16_t)(*counter + ((*counter < UINT16_MAX) ? 1U : 0U));
@@ -86,13 +85,14 @@ static bool codes_valid(const est_config_t* const config) {
 }
 
 static bool needs_adaptation(const est_config_t* const config) {
-    return (config->nc > 0U) || config->noise_estimated || (config->random_walk > 0.0F);
+    return (config->nc > 0U) || (config->random_walk > 0.0F);
 }
 
 /// True iff this build supports the configuration.
 static bool is_supported(const est_config_t* const config) {
     return same_shape(requested_shape(config), est_shape_of(config)) &&
            (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
+           (EST_WITH_ROBUSTNESS || !config->noise_estimated) &&
            (EST_WITH_ADAPTATION || (!needs_adaptation(config) && (config->refresh_n == 0U))) &&
            (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
 }
@@ -135,27 +135,52 @@ static void zero(float* const x, const uint_fast8_t n) {
 /// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
 /// u(k), or the reverse. Every parameter becomes less certain.
 static void follow_slip(est_t* const self, const bool late) {
-    const uint32_t     nb     = self->config->nb;
-    float* const       b      = &self->theta[self->config->na];
-    const float* const before = &self->edges.theta[self->config->na];
-    const uint32_t     place  = late ? UINT32_MAX : 1U;  // offset to the source of each b, modulo 2^32
-    for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
-        self->theta[i] = self->edges.theta[i];
+    const uint_fast8_t last = (uint_fast8_t)(self->config->nb - 1U);
+    float* const       b    = &self->theta[self->config->na];
+    (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
+    est_delta_to_plain(&b[1], b[0], last);
+    if (late) {
+        for (uint_fast8_t j = last; j > 0U; j--) {
+            b[j] = b[j - 1U];
+        }
+    } else {
+        (void)append(b, &b[1], last);
     }
-    for (uint32_t j = 0U; j < nb; j++) {
-        b[j] = ((j + place) < nb) ? before[j + place] : 0.0F;
-    }
+    b[late ? 0U : last] = 0.0F;
+    est_delta_from_plain(&b[1], b[0], last);
     est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
+}
+
+/// Copy theta in the plain form of est.h.
+EST_SHARED void copy_theta(const est_t* const self, const est_shape_t shape, float* const theta) {
+#if EST_WITH_ROBUSTNESS
+    float* const b = append(theta, self->theta, shape.na);
+    (void)append(b, &self->theta[shape.na], (uint_fast8_t)(EST_THETA_MAX - shape.na));
+    if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
+        b[shape.nb + shape.nc] += (theta[shape.na - 1U] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
+    }
+    if (est_delta_applies(self->config)) {
+        est_delta_to_plain(theta, 1.0F, shape.na);
+        est_delta_to_plain(&b[1], b[0], (uint_fast8_t)(shape.nb - 1U));
+    }
+#else
+    (void)append(theta, self->theta, est_shape_count(shape));
+#endif
 }
 
 /// Set c to the estimate of A, contracted. With noise on the output, the noise of the equations is coloured by A
 /// (thesis section 3.5).
 EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const c) {
     float factor = 1.0F;
+    float a[EST_NA_MAX];
+    (void)append(a, self->theta, na);
+    if (est_delta_applies(self->config)) {
+        est_delta_to_plain(a, 1.0F, na);
+    }
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         factor *= CONTRACTION;
-        c[i] = (i < na) ? (self->theta[i] * factor) : 0.0F;
+        c[i] = (i < na) ? (a[i] * factor) : 0.0F;
     }
 }
 
@@ -220,6 +245,42 @@ EST_SHARED void forget_samples(est_t* const self) {
     }
 }
 
+/// Set theta to zero.
+static void clear_theta(est_t* const self) {
+    zero(self->theta, EST_THETA_MAX);
+    if (est_delta_applies(self->config)) {
+        est_delta_from_plain(self->theta, 1.0F, self->config->na);
+    }
+}
+
+/// The output less the reference.
+EST_INLINE float relative_y(const est_t* const self, const float y) {
+#if EST_WITH_ROBUSTNESS
+    return est_shape_of(self->config).offset ? (y - self->reference_y) : y;
+#else
+    (void)self;
+    return y;
+#endif
+}
+
+/// The input less the reference. The first sample becomes the reference: the samples that follow are then small
+/// numbers, which float32 rounds less. Without an offset in the model, codes are what they are.
+EST_INLINE float relative_u(est_t* const self, const est_sample_t sample) {
+#if EST_WITH_ROBUSTNESS
+    if (est_shape_of(self->config).offset == 0U) {
+        return sample.u;  // MISRA D4
+    }
+    if ((self->counters.updated == 0U) && est_delta_applies(self->config)) {
+        self->reference_u = sample.u;
+        self->reference_y = sample.y;
+    }
+    return sample.u - self->reference_u;
+#else
+    (void)self;
+    return sample.u;
+#endif
+}
+
 /// True iff the code is finite and within +-EST_CODE_LIMIT.
 static bool is_plausible(const float code) { return within(code, -EST_CODE_LIMIT, EST_CODE_LIMIT); }
 
@@ -253,6 +314,19 @@ EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
     return (self->config->stuck_n > 0U) && (self->same_n >= self->config->stuck_n);
 }
 
+#if EST_WITH_ROBUSTNESS
+
+/// Innovation of the last equation, with the present theta.
+static float last_innovation(const est_t* const self) {
+    const uint_fast8_t count = est_theta_count(self);
+    float              out   = self->whitener.past[count].x[0];
+    for (uint_fast8_t i = 0U; i < count; i++) {
+        out -= self->whitener.past[i].x[0] * self->theta[i];
+    }
+    return out;
+}
+#endif
+
 /// Enter an edge into the doubt. It joins the doubt about earlier edges if another reading of these leads; otherwise it
 /// begins a new doubt.
 static void doubt_edge(est_t* const self) {
@@ -263,27 +337,80 @@ static void doubt_edge(est_t* const self) {
     self->doubt_n    = 1U;
     est_edges_begin(&self->edges, self->config, self->theta, step);
     est_trigger_begin_doubt(&self->trigger);
+#if EST_WITH_ROBUSTNESS
+    est_edges_begin_comparison(&self->edges, last_innovation(self));
+#endif
+}
+
+/// Position of the edges: as configured, unless the innovations show that it varies.
+EST_INLINE est_edge_instants_t edge_instants_of(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    if (self->edges_vary) {
+        return EST_EDGES_ANYWHERE;  // MISRA D4
+    }
+#endif
+    return self->config->edge_instants;
+}
+
+/// True while the last alarm is on trial: theta before the alarm occupies the place of theta before an edge.
+EST_INLINE bool is_on_trial(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return self->scale.trial_n > 0U;
+#else
+    (void)self;
+    return false;
+#endif
+}
+
+/// True iff the previous sample was predicted.
+static bool on_bridge(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return (self->bridged_n > 0U) && (self->bridge_at == (uint16_t)self->counters.updated);
+#else
+    (void)self;
+    return false;
+#endif
 }
 
 static void enter_edge(est_t* const self) {
+    if (on_bridge(self)) {
+        forget_samples(self);  // the instant of the edge is unknown
+        return;                // MISRA D4
+    }
+    const bool slope = self->edge_age_n <= 1U;  // u changes in every sample: no edges that could slip
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
         return;  // MISRA D4
     }
-    if ((self->config->edge_instants == EST_EDGES_MAY_SLIP) && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
+    const est_edge_instants_t instants = edge_instants_of(self);
+    if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) &&
+        (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
         doubt_edge(self);
-    } else if (self->config->edge_instants == EST_EDGES_ANYWHERE) {
+    } else if (instants == EST_EDGES_ANYWHERE) {
         self->pending_n = larger(self->pending_n, self->config->na);
     } else {
         // the b's absorb the edge
     }
 }
 
+/// True iff the next sample may be predicted: the model is known, and the whitening has nearly settled. The residuals
+/// of a missing sample are unknown.
+static bool can_bridge(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return self->known && (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) &&
+           (!on_bridge(self) || (self->bridged_n < BRIDGED_MAX)) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
+           (est_shape_of(self->config).nc == 0U);
+#else
+    (void)self;
+    return false;
+#endif
+}
+
 /// Enter u(k). Return EST_GATHERING while the equation of this sample needs unknown samples.
 static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
-    shift_u(self, sample.u);
+    shift_u(self, relative_u(self, sample));
     const bool edge = EST_KNOWS_EDGES && est_edges_is_edge(self->config, self->u) && self->known;
-    if (EST_WITH_WATCH && is_stuck(self, sample.y, edge)) {
+    if (EST_WITH_WATCH && is_stuck(self, relative_y(self, sample.y), edge)) {
         increment(&self->counters.stuck);
         return EST_REFUSED;  // MISRA D4
     }
@@ -320,6 +447,28 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
+/// Compare an innovation after an edge with the effect of a displaced edge. If every edge is displaced by another part
+/// of an interval, edges come anywhere from now on. The innovations so far are those of the wrong model.
+EST_INLINE void watch_edges(est_t* const self, const float e, const float early, const float late) {
+#if EST_WITH_ROBUSTNESS
+    est_edges_compare(&self->edges, e, early, late);
+    if ((self->doubt_n >= EST_DOUBT_N) && est_edges_displaced(&self->edges)) {
+        self->edges_vary      = true;
+        self->scale.inflation = 1.0F;
+        if (self->scale.share > 0.0F) {
+            self->scale.share = EST_SHARE_WARM;
+        }
+        est_scale_restart(&self->scale);
+        est_scale_apply(&self->scale, self->noise_variance);
+    }
+#else
+    (void)self;
+    (void)e;
+    (void)early;
+    (void)late;
+#endif
+}
+
 /// Enter the innovation under the other readings of the edges in doubt. They are compared with theta before the doubt,
 /// because the estimate has followed the recorded reading since.
 EST_INLINE est_finding_t judge_readings(est_t* const                self,
@@ -332,6 +481,7 @@ EST_INLINE est_finding_t judge_readings(est_t* const                self,
     float       early;
     float       late;
     est_edges_shares(&self->edges, shape, &self->whitener, self->u, self->doubt_n, self->edge_age_n, &early, &late);
+    watch_edges(self, e, early, late);
     return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - early, e - late, weight,
                                      self->doubt_n >= EST_DOUBT_N);
 }
@@ -355,15 +505,6 @@ static void store_residual(est_t* const self, const float* const phi) {
     (void)self;
     (void)phi;
 #endif
-}
-
-/// Update the noise variance. `precision`: noise variance over the variance of the innovation.
-static void follow_noise(est_t* const self, const float innovation, const float precision) {
-    const float square   = innovation * innovation * precision;
-    const float ceiling  = NOISE_CLIP * self->noise_variance;
-    const float clipped  = (square < ceiling) ? square : ceiling;
-    const float noise    = self->noise_variance + (NOISE_RATE * ((clipped / NOISE_KEPT) - self->noise_variance));
-    self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
 /// Squared distance between these coefficients and the present C.
@@ -418,6 +559,25 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
 
+/// Put an alarm of the cumulative sum on trial: the present estimate is kept and compared with the next one. An earlier
+/// trial ends.
+static void put_on_trial(est_t* const self, const bool overflown) {
+#if EST_WITH_ROBUSTNESS
+    if (self->scale.trial_n > 0U) {
+        est_scale_conclude(&self->scale);
+        est_scale_apply(&self->scale, self->noise_variance);
+    }
+    if (!overflown && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
+        est_scale_begin_trial(&self->scale);
+        (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
+    }
+    self->edges.misfit = 0.0F;
+#else
+    (void)self;
+    (void)overflown;
+#endif
+}
+
 /// Raise an alarm. The samples so far belong to the plant before the change. Extreme data can make theta overflow; the
 /// statistic then overflows too, and the estimate is discarded.
 static void raise_alarm(est_t* const self, est_step_t* const step) {
@@ -426,8 +586,9 @@ static void raise_alarm(est_t* const self, est_step_t* const step) {
     if (overflown) {
         step->statistic = FLT_MAX;
     }
+    put_on_trial(self, overflown);
     if (overflown || (self->config->trigger.reset == EST_RESET_ALL)) {
-        zero(self->theta, EST_THETA_MAX);
+        clear_theta(self);
     }
     if (EST_WITH_ADAPTATION && overflown) {  // P may have overflowed with the residuals in its regressors
         est_factors_reset(&self->factors, self->config);
@@ -446,31 +607,110 @@ EST_SHARED void note_slip(est_t* const self) {
     forget_samples(self);
 }
 
-static void enter_gap(est_t* const self, const est_status_t status) {
+/// Enter a sample that is not good. Return true iff its y is to be predicted; its u is taken for the last one.
+static bool enter_gap(est_t* const self, const est_status_t status) {
     if (status == EST_REFUSED) {
         increment(&self->counters.refused);
     } else {
         increment_long(&self->counters.missing);
     }
+    const bool bridged = can_bridge(self);
     if (EST_WITH_EDGES && self->known && (self->doubt_n > 0U)) {
-        if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
+        if (bridged && (self->doubt_n < (EST_DOUBT_N - 1U))) {  // its last sample decides and must be good
+            self->doubt_n++;
+        } else if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
             note_slip(self);
+        } else {
+            self->doubt_n = 0U;
         }
     }
+#if EST_WITH_ROBUSTNESS
+    if (bridged && self->known) {
+        self->bridged_n = (uint8_t)(on_bridge(self) ? (self->bridged_n + 1U) : 1U);
+        self->bridge_at = (uint16_t)self->counters.updated;
+        shift_u(self, self->u[0]);
+        increment(&self->edge_age_n);
+        return true;  // MISRA D4
+    }
+#endif
     forget_samples(self);
+    return false;
 }
 
 /// Update everything an equation determines besides theta.
-static void adapt(est_t* const self, const float* const phi, const float innovation, const float precision) {
+static void adapt(est_t* const self, const float* const phi) {
     const est_config_t* const config = self->config;
     if (config->random_walk > 0.0F) {
         est_factors_walk(&self->factors, config);
         est_factors_inflate(&self->factors, config, 1.0F);
     }
     store_residual(self, phi);
-    if (config->noise_estimated) {
-        follow_noise(self, innovation, precision);
+}
+
+/// Weight of a squared innovation of unit precision in the cumulative sum.
+EST_INLINE float weight_of(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return self->scale.weight;
+#else
+    return EST_CUSUM_GAIN / self->noise_variance;
+#endif
+}
+
+#if EST_WITH_ROBUSTNESS
+
+/// Update the scale after a block. A block that ends with a large statistic may contain a change and is discarded.
+/// Two steps, so that none is long.
+static void renew_scale(est_t* const self) {
+    est_scale_t* const scale = &self->scale;
+    if (!scale->followed) {
+        const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
+        if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
+            self->noise_variance = est_scale_follow(scale, self->noise_variance, warm ? EST_SHARE_MIN : EST_SHARE_WARM);
+        }
+        scale->followed = true;
+    } else {
+        est_scale_relax(scale);
+        est_scale_restart(scale);
+        est_scale_apply(scale, self->noise_variance);
     }
+}
+
+/// Continue the trial of the last alarm by one equation.
+EST_INLINE void
+try_alarm(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float precision) {
+    const float old = est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape));
+    const float e   = equation->innovation;
+    if (!est_scale_try(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
+        est_scale_conclude(&self->scale);
+        est_scale_apply(&self->scale, self->noise_variance);
+    }
+}
+#endif
+
+/// Enter the term of an innovation into the scale. Updates wait for a step without other optional work.
+EST_INLINE void watch_scale(est_t* const                self,
+                            const est_shape_t           shape,
+                            const est_equation_t* const equation,
+                            const float                 term,
+                            const float                 precision) {
+#if EST_WITH_ROBUSTNESS
+    if (est_scale_enter(&self->scale, term)) {
+        return;  // MISRA D4
+    }
+    if (self->scale.trial_n > 0U) {
+        try_alarm(self, shape, equation, precision);
+    } else if (self->renewal == EST_RENEWAL_NONE) {
+        renew_scale(self);
+    } else {
+        // the block waits
+    }
+#else
+    (void)self;
+    (void)shape;
+    (void)equation;
+    (void)term;
+    (void)precision;
+#endif
 }
 
 /// Limit P. Done in a step without other optional work, unless that comes too late.
@@ -483,6 +723,22 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
             est_factors_scale(&self->factors, self->config, shape, 1.0F);
         }
     }
+}
+
+/// Predict a missing y: replace the `y` of an equation by the one whose innovation is zero. With C close to A the next
+/// equations then lose nothing but the information of the missing sample.
+EST_SHARED void bridge(est_t* const self, const est_shape_t shape, const float y, const float innovation) {
+    est_past_t* const past = &self->whitener.past[est_shape_count(shape)];
+    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
+        float early;
+        float late;
+        est_edges_shares(&self->edges, shape, &self->whitener, self->u, self->doubt_n, self->edge_age_n, &early, &late);
+    }
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        past->x[i] -= innovation;  // the differences contain y(k) with the factor 1
+    }
+    shift_y(self, y - innovation);
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
@@ -501,24 +757,36 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
     est_equation_fill(self, shape, y, equation.phi);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
+    if (EST_WITH_ROBUSTNESS && (step->status != EST_UPDATED)) {
+        bridge(self, shape, y, equation.innovation);
+        return;  // MISRA D4
+    }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION && self->adaptive) {
-        adapt(self, equation.phi, equation.innovation, precision);
+        adapt(self, equation.phi);
     }
     const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
-    const float weight = (held ? 0.0F : EST_CUSUM_GAIN) * (precision / self->noise_variance);
-    est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, weight, held);
+    const float weight = precision * weight_of(self);
+    const float term   = est_trigger_term(equation.innovation, weight);
+    if (!held) {
+        est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, self->noise_variance, precision, term);
+    }
     step->innovation      = equation.innovation;
     step->statistic       = self->trigger.statistic;
     est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        finding = judge_readings(self, shape, &equation, weight);
+        finding = judge_readings(self, shape, &equation, held ? 0.0F : weight);
     }
     if (finding == EST_ALARM) {
         raise_alarm(self, step);
-    } else if (EST_WITH_EDGES && (finding == EST_SLIP)) {
+        return;  // MISRA D4
+    }
+    if (EST_WITH_EDGES && (finding == EST_SLIP)) {
         note_slip(self);
-    } else if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
+        return;  // MISRA D4
+    }
+    watch_scale(self, shape, &equation, term, precision);
+    if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
         self->refresh_in--;
     } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
         consider_refresh(self, shape);
@@ -566,7 +834,11 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     self->adaptive       = EST_WITH_ADAPTATION && needs_adaptation(config);
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
+#if EST_WITH_ROBUSTNESS
+    est_scale_init(&self->scale, config);
+#endif
     est_whitener_set(&self->whitener, config->c, config->na);
+    clear_theta(self);
     self->pending_n = count_past(config);
     est_factors_reset(&self->factors, config);
     est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
@@ -576,15 +848,16 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
-    est_step_t step = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
-    step.statistic  = self->trigger.statistic;
-    if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {
-        enter_gap(self, step.status);
-    } else {
-        if (step.status == EST_UPDATED) {
-            dispatch_equation(self, sample.y, &step);
-        }
-        shift_y(self, sample.y);
+    est_step_t step   = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
+    step.statistic    = self->trigger.statistic;
+    const bool  good  = (step.status == EST_UPDATED) || (step.status == EST_GATHERING);
+    const float y     = good ? relative_y(self, sample.y) : self->y[0];
+    const bool  known = good ? (step.status == EST_UPDATED) : enter_gap(self, step.status);
+    if (known) {
+        dispatch_equation(self, y, &step);
+    }
+    if (good) {
+        shift_y(self, y);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);
     return step;
@@ -597,17 +870,51 @@ uint8_t est_theta_count(const est_t* const self) {
 
 float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
-    return self->theta[index];
+    float theta[EST_THETA_MAX];
+    copy_theta(self, est_shape_of(self->config), theta);
+    return theta[index];
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
-    return est_factors_variance(&self->factors, est_theta_count(self), index);
+    const est_shape_t shape                      = est_shape_of(self->config);
+    float             factor[EST_THETA_MAX + 1U] = { 0.0F };  // after that of y(k); MISRA D2
+    factor[index + 1U]                           = 1.0F;
+    if (est_delta_applies(self->config)) {
+        est_delta_difference(factor, shape.na);
+        est_delta_difference(&factor[shape.na + 1U], (uint_fast8_t)(shape.nb - 1U));
+    }
+#if EST_WITH_ROBUSTNESS
+    if (est_is_offset(shape, index)) {  // see copy_theta()
+        factor[shape.na] += self->reference_y;
+        factor[shape.na + shape.nb] -= self->reference_u;
+    }
+#endif
+    return est_factors_variance(&self->factors, est_shape_count(shape), &factor[1]);
 }
 
 float est_noise_variance(const est_t* const self) {
     EST_ASSERT(self != NULL);
     return self->noise_variance;
+}
+
+float est_scale(const est_t* const self) {
+    EST_ASSERT(self != NULL);
+#if EST_WITH_ROBUSTNESS
+    return self->noise_variance * self->scale.inflation;
+#else
+    return self->noise_variance;
+#endif
+}
+
+bool est_misfit(const est_t* const self) {
+    EST_ASSERT(self != NULL);
+#if EST_WITH_ROBUSTNESS
+    return self->scale.inflation > EST_INFLATION_MISFIT;
+#else
+    (void)self;
+    return false;
+#endif
 }
 
 float est_prefilter(const est_t* const self, const uint8_t index) {

@@ -29,9 +29,13 @@
 ///         use(est_theta(&estimator, 0), ...);
 ///     }
 ///
-/// Units: signals are in codes of the converter, so that quantisation is 1. The defaults assume noise of about one code.
-/// If signals have another unit, say volts, either divide them by the volts per code, which needs no other change, or
-/// scale noise_variance, p0, edge_codes, code_low and code_high by the unit stated at each.
+/// The false-alarm rate holds from some 2,000 samples after est_init() on, whatever the noise: white noise of 0.3 to 4
+/// codes, 10 to 18 bits, poles from 0.3 to 0.999. If the model does not fit the plant, the trigger becomes less
+/// sensitive, and est_misfit() reports it.
+///
+/// Units: signals are in codes of the converter, so that quantisation is 1. The defaults assume noise of about one
+/// code. If signals have another unit, say volts, either divide them by the volts per code, which needs no other
+/// change, or scale noise_variance, p0, edge_codes, code_low and code_high by the unit stated at each.
 
 #ifndef EST_H_INCLUDED
 #define EST_H_INCLUDED
@@ -63,8 +67,10 @@ extern "C" {
 /// | EST_FIXED_OFFSET            | undefined  | 1U: the offset is estimated; 0U: it is not                         |
 /// | EST_WITH_EDGES              | 1          | 0 omits EST_EDGES_MAY_SLIP and EST_EDGES_ANYWHERE                  |
 /// | EST_WITH_TRIGGERS           | 1          | 0 omits the triggers other than the cumulative sum                 |
-/// | EST_WITH_ADAPTATION         | 1          | 0 omits nc, random_walk, noise_estimated and refresh_n             |
+/// | EST_WITH_ADAPTATION         | 1          | 0 omits nc, random_walk and refresh_n                              |
 /// | EST_WITH_WATCH              | 1          | 0 omits stuck_n, idle_n and the count of saturated samples         |
+/// | EST_WITH_ROBUSTNESS         | 1          | 0 omits noise_estimated, the delta form, est_misfit(), and bridges |
+/// |                             |            | over missing samples: for rigs that the model is known to fit      |
 /// | EST_WITH_CHECKS             | 1          | 0 omits the check of the configuration by est_init()               |
 /// | EST_ASSERT(x)               | assert(x)  | statement that must not continue if x is false: the caller made a  |
 /// |                             |            | mistake. Empty by default with NDEBUG or without an assert.h       |
@@ -109,6 +115,9 @@ extern "C" {
 #ifndef EST_WITH_CHECKS
 #define EST_WITH_CHECKS 1
 #endif
+#ifndef EST_WITH_ROBUSTNESS
+#define EST_WITH_ROBUSTNESS 1
+#endif
 
 /// Names with the maxima, as est_init_na2U_nb3U_nk1U_nc0U_theta6U. Private.
 #define EST_NAME_JOINED(name, a, b, k, c, n) name##_na##a##_nb##b##_nk##k##_nc##c##_theta##n  // MISRA D6
@@ -147,7 +156,7 @@ typedef enum {
     /// samples after an alarm. Thesis 4.4.3.
     EST_TRIGGER_MEAN_BETWEEN_FAULTS = 2,
     /// Cumulative sum of the normalised squared innovation. The ceiling is ln(ARL0), with ARL0 the mean number of
-    /// samples between false alarms. The default.
+    /// samples between false alarms, as measured. The default.
     EST_TRIGGER_CUSUM = 3,
     /// A function of the caller: see est_trigger_fn.
     EST_TRIGGER_CUSTOM = 4,
@@ -172,9 +181,9 @@ typedef struct {
     est_reset_t        reset;     ///< effect of an alarm
     bool               absolute;  ///< mean between faults: average |innovation| instead of the innovation
     uint16_t hold_off_n;          ///< innovations after an alarm during which the statistic is held at zero; usually 0
-    uint16_t warm_up_n;           ///< innovations after est_init() during which it is held at zero; usually 150
-    /// > 0, at most EST_CEILING_LIMIT. Cumulative sum: ln(ARL0), usually 9 .. 16. The two triggers of the thesis: [codes],
-    /// usually 4 .. 10 times the standard deviation of the noise.
+    uint16_t warm_up_n;           ///< innovations after est_init() during which it is held at zero; usually 550
+    /// > 0, at most EST_CEILING_LIMIT. Cumulative sum: ln(ARL0), usually 9 .. 16. The two triggers of the thesis:
+    /// [codes], usually 4 .. 10 times the standard deviation of the noise.
     float          ceiling;
     est_trigger_fn custom;   ///< for EST_TRIGGER_CUSTOM
     void*          context;  ///< first argument of custom
@@ -187,7 +196,8 @@ typedef enum {
     /// Nearly the same position, but it may drift across a sampling instant. The edge is then recorded one sample
     /// earlier or later than before, which is counted as a slip and raises no alarm. For a generator on its own
     /// clock, to some 20 ppm, whose period is a whole number of samples. Forgetting must follow the drift of the b's.
-    /// Requires the cumulative sum; with any other trigger the effect is that of EST_EDGES_LOCKED.
+    /// Requires the cumulative sum; with any other trigger the effect is that of EST_EDGES_LOCKED. If the innovations
+    /// after several edges show another position each time, the effect becomes that of EST_EDGES_ANYWHERE.
     EST_EDGES_MAY_SLIP = 1,
     /// Any position, different for each edge. The na equations that involve an edge are omitted, because the effect
     /// of the edge within its interval is unknown. For any generator. Cost: some 10 % of detection delay.
@@ -195,7 +205,8 @@ typedef enum {
 } est_edge_instants_t;
 
 /// Configuration of an estimator, fixed during a run. est_init() refuses a value out of its range; "usually" is a
-/// recommendation. P is in units of the noise variance: the prior variance of an a, b or c is p0 * noise_variance.
+/// recommendation. P is in units of the noise variance: the prior variance of a parameter is p0 * noise_variance. With
+/// EST_WITH_ROBUSTNESS the parameters of this prior are those of the delta form, such as 2 + a1 and 1 + a1 + a2.
 /// A count of 0 disables the feature. Counts are in samples.
 typedef struct {
     uint8_t  na;      ///< order of A; 1 .. EST_NA_MAX, usually 2
@@ -203,22 +214,23 @@ typedef struct {
     uint8_t  nk;      ///< delay of the first b; 0 .. EST_NK_MAX. A free-running generator needs 0: y(k) <- u(k)
     uint8_t  nc;      ///< coefficients of C to estimate (extended least squares, thesis Equ 3.11); 0 .. EST_NC_MAX
     bool     offset;  ///< estimate d. na + nb + nc + offset must not exceed EST_THETA_MAX
-    bool     noise_estimated;  ///< estimate the noise variance, starting from noise_variance
+    bool     noise_estimated;  ///< follow the noise variance, starting from noise_variance; usually true
     uint16_t refresh_n;        ///< equations after which C follows the estimate of A; 0: C is constant; usually 40
     uint8_t  stuck_n;          ///< samples of constant y after an edge of u that count as stuck; usually 8 .. 32
     uint16_t idle_n;           ///< samples without an edge of u that count as lost excitation; usually 20 periods of u
     /// Position of the edges of u.
     est_edge_instants_t edge_instants;
-    /// lambda of thesis Equ 3.21; 0.5 .. 1, usually 0.98 .. 0.999. The memory is 1 / (1 - forgetting) samples; 1 forgets
-    /// nothing.
+    /// lambda of thesis Equ 3.21; 0.5 .. 1, usually 0.98 .. 0.999. The memory is 1 / (1 - forgetting) samples; 1
+    /// forgets nothing.
     float forgetting;
     /// Variance added to each parameter per equation (thesis Equ 3.23), in the unit of p0; 0 .. 1e9. Usually 0 with
     /// forgetting < 1, else 1e-12 .. 1e-11: with 1e-9 theta follows a change of 10 % so fast that no alarm is raised.
     float random_walk;
     float p0;         ///< initial variance of each a, b and c; 1e-9 .. 1e9, usually 1 .. 100 [1 / codes^2]
     float p0_offset;  ///< initial variance of d; 1e-9 .. 1e9, usually 1e6 [noise variances]
-    /// Variance of e, to be measured at rest; 1e-9 .. 1e9 [codes^2], usually 0.1 .. 100. Too small a value causes false
-    /// alarms. Too large a value hides changes: the standard deviation is at most 1/32 of code_high - code_low.
+    /// Variance of e; 1e-9 .. 1e9 [codes^2], usually 0.1 .. 100; only the first value if the noise is estimated. Else
+    /// it is to be measured at rest: too small a value causes false alarms, too large a value hides changes. The
+    /// standard deviation is at most 1/32 of code_high - code_low.
     float noise_variance;
     float c[EST_NA_MAX];  ///< prefilter C = 1 + c[0] z^-1 + ...; zeros inside the unit circle; 0: none
     /// Smallest step of u that is an edge; > 0, at most code_high - code_low [codes]. Usually a tenth to a half of the
@@ -262,18 +274,18 @@ typedef struct {
 #endif
 
 /// Initialiser of an est_config_t for signals between these two codes. Outside them a sample is saturated, and
-/// est_init() refuses noise and edges that do not fit in between: the defaults in a range of volts, for example.
-/// The configuration is for a generator on a clock of its own: ARX(2, 3) with delay 0 and offset; forgetting 0.99; C
-/// from A, starting at (1 - 0.8 z^-1)^2; cumulative sum with ARL0 = 1e5, armed after 150 samples. A build with less
-/// room drops the offset first, then b's. In C++, needs designated initialisers: C++20, or the extension of gcc and
-/// clang. To change a value, define the object without const and assign before est_init().
+/// est_init() refuses noise and edges that do not fit in between: the defaults in a range of volts, for example. The
+/// configuration is for a generator on a clock of its own: ARX(2, 3) with delay 0 and offset; forgetting 0.995; C from
+/// A, starting at (1 - 0.8 z^-1)^2; noise of any variance; cumulative sum with ARL0 = 1e5, armed after 550 samples. A
+/// build with less room drops the offset first, then b's. In C++, needs designated initialisers: C++20, or the
+/// extension of gcc and clang. To change a value, define the object without const and assign before est_init().
 #define EST_CONFIG_FOR_CODES(low, high)                                                                                \
     {                                                                                                                  \
         .na = (uint8_t)EST_DEFAULT_NA, .nb = (uint8_t)EST_DEFAULT_NB, .nk = (uint8_t)EST_DEFAULT_NK,                   \
-        .nc = (uint8_t)EST_DEFAULT_NC, .offset = EST_DEFAULT_OFFSET, .noise_estimated = false,                         \
+        .nc = (uint8_t)EST_DEFAULT_NC, .offset = EST_DEFAULT_OFFSET, .noise_estimated = EST_WITH_ROBUSTNESS != 0,      \
         .refresh_n = EST_WITH_ADAPTATION ? 40U : 0U, .stuck_n = EST_WITH_WATCH ? 16U : 0U,                             \
         .idle_n        = EST_WITH_WATCH ? 1000U : 0U,                                                                  \
-        .edge_instants = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED, .forgetting = 0.99F,                  \
+        .edge_instants = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED, .forgetting = 0.995F,                 \
         .random_walk = 0.0F, .p0 = 10.0F, .p0_offset = 1.0e6F, .noise_variance = 1.2F, .c = EST_DEFAULT_C,             \
         .edge_codes = 64.0F, .code_low = (low), .code_high = (high),                                                   \
         .trigger = {                                                                                                   \
@@ -281,7 +293,7 @@ typedef struct {
             .reset      = EST_RESET_COVARIANCE,                                                                        \
             .absolute   = false,                                                                                       \
             .hold_off_n = 0U,                                                                                          \
-            .warm_up_n  = 150U,                                                                                        \
+            .warm_up_n  = EST_WITH_ROBUSTNESS ? 550U : 150U,                                                           \
             .ceiling    = 11.512925F,                                                                                  \
             .custom     = NULL,                                                                                        \
             .context    = NULL,                                                                                        \
@@ -303,7 +315,7 @@ typedef struct {
 /// Treatment of a sample.
 typedef enum {
     EST_UPDATED   = 0,  ///< the sample updated the estimate
-    EST_MISSING   = 1,  ///< the sample was not valid: theta and its covariance are unchanged
+    EST_MISSING   = 1,  ///< the sample was not valid: theta and its covariance are unchanged. See est_step()
     EST_REFUSED   = 2,  ///< u or y was non-finite, saturated or stuck: counted, otherwise as EST_MISSING
     EST_GATHERING = 3,  ///< the sample was stored, but its equation also needs samples that are still unknown
 } est_status_t;
@@ -346,24 +358,33 @@ typedef struct {
 #define EST_GAINS_KEPT 1U
 #endif
 
-/// Last values of one whitened signal, newest first. Private.
+/// Last whitened values of one signal, newest first; or the last one and its differences of order 1, 2, ... Private.
 typedef struct {
     float x[EST_NA_MAX];
 } est_past_t;
 
 /// Filter that whitens the noise of consecutive equations. Private to est_whitener.h.
 typedef struct {
-    float      c[EST_NA_MAX];
-    float      gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< one row an equation, newest first
-    float      precision[EST_NA_MAX];             ///< of the whitened equations, newest first; 0: no equation
-    est_past_t past[EST_THETA_MAX + 1U];          ///< one for each element of the equation
+    float c[EST_NA_MAX];
+    float gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< one row per equation, newest first
+    float precision[EST_NA_MAX];             ///< of the whitened equations, newest first; 0: no equation
+#if EST_WITH_ROBUSTNESS
+    float step[EST_NA_MAX];  ///< factors of the differences in est_past_t, from gain[0]
+#endif
+    est_past_t past[EST_THETA_MAX + 1U];  ///< one for each element of the equation
 } est_whitener_t;
 
 /// Effect of the recent edges of u if they had come one sample early or late. Private to est_edges.h.
 typedef struct {
     est_past_t early;                 ///< their share in the whitened equations
     est_past_t late;                  ///< the same for late edges
-    float      theta[EST_THETA_MAX];  ///< theta before the first of these edges
+    float      theta[EST_THETA_MAX];  ///< theta before the first of these edges, or before an alarm on trial
+#if EST_WITH_ROBUSTNESS
+    float along;   ///< sum of innovation times the effect of a displaced edge, since the edge
+    float span;    ///< sum of that effect squared
+    float energy;  ///< sum of the squared innovations, and of those before the edge
+    float misfit;  ///< evidence that each edge is displaced otherwise
+#endif
 } est_edges_t;
 
 /// Readings of the recent edges other than the recorded one: one sample early, one sample late.
@@ -376,6 +397,18 @@ typedef struct {
     uint16_t quiet_n;                    ///< remaining innovations during which the statistic is held at zero
     uint16_t mean_n;                     ///< innovations in the mean between faults; 0: the next one is the first
 } est_trigger_t;
+
+/// Scale of the innovations and the trial of the last alarm. Private to est_scale.h.
+typedef struct {
+    float   weight;  ///< of a squared innovation in the cumulative sum
+    float   sum;     ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
+    float   share;   ///< share of this block in the noise variance
+    float   inflation;  ///< factor for what the model does not explain
+    float   credit;     ///< alarms that may be justified
+    uint8_t left_n;     ///< equations left in this block; 0: it is complete, or an alarm is on trial
+    bool    followed;   ///< the noise variance contains this block
+    uint8_t trial_n;    ///< equations since the alarm on trial; 0: none is
+} est_scale_t;
 
 /// Work that a step leaves to the next one. Private.
 typedef enum {
@@ -391,24 +424,32 @@ typedef enum {
 /// below 128 bytes fits a short Thumb instruction.
 typedef struct {
     const est_config_t* config;
-    uint8_t             same_n;                      ///< samples of constant y since an edge of u
-    uint8_t             pending_n;                   ///< samples needed before the next equation is complete
-    bool                adaptive;                    ///< residuals, random walk or noise variance need an update
-    est_renewal_t       renewal;                     ///< work left by the last step
-    bool                known;                       ///< the previous sample is known; if not, pending_n > 0
-    bool                settled;                     ///< the gains of the whitener are c, and its variance is 1
-    uint16_t            refresh_in;                  ///< equations until C is compared with A; 0: never
-    uint16_t            edge_age_n;                  ///< samples since the last edge of u
-    uint8_t             doubt_n;                     ///< samples since the first edge in doubt, inclusive; 0: no doubt
-    float               noise_variance;              ///< [codes^2]
-    float               y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
-    float               u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...
-    est_trigger_t       trigger;
-    est_counters_t      counters;
-    float               theta[EST_THETA_MAX];
-    est_factors_t       factors;
-    est_whitener_t      whitener;
-    est_edges_t         edges;
+    uint8_t             same_n;          ///< samples of constant y since an edge of u
+    uint8_t             pending_n;       ///< samples needed before the next equation is complete
+    bool                adaptive;        ///< residuals, random walk or noise variance need an update
+    est_renewal_t       renewal;         ///< work left by the last step
+    bool                known;           ///< the previous sample is known; if not, pending_n > 0
+    bool                settled;         ///< the gains of the whitener are c, and its variance is 1
+    uint16_t            refresh_in;      ///< equations until C is compared with A; 0: never
+    uint16_t            edge_age_n;      ///< samples since the last edge of u
+    uint8_t             doubt_n;         ///< samples since the first edge in doubt, inclusive; 0: no doubt
+    float               noise_variance;  ///< [codes^2]
+#if EST_WITH_ROBUSTNESS
+    bool        edges_vary;   ///< edges come anywhere, against the configuration
+    uint8_t     bridged_n;    ///< predicted samples of the last bridge
+    uint16_t    bridge_at;    ///< low bits of the number of good samples before it
+    float       reference_u;  ///< codes of the first sample, subtracted from all if the offset is estimated
+    float       reference_y;
+    est_scale_t scale;
+#endif
+    float          y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
+    float          u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...
+    est_trigger_t  trigger;
+    est_counters_t counters;
+    float          theta[EST_THETA_MAX];
+    est_factors_t  factors;
+    est_whitener_t whitener;
+    est_edges_t    edges;
 #if EST_NC_MAX > 0
     float residual[EST_NC_MAX];  ///< of the previous equations, newest first
 #endif
@@ -424,7 +465,8 @@ est_config_t est_config_default(void);
 /// fail. Cost: constant. May be called from an interrupt.
 bool est_config_valid(const est_config_t* config);
 
-/// Prepare the estimator for the first sample: theta zero, P = P0, counters zero.
+/// Prepare the estimator for the first sample: theta zero, P = P0, counters zero. With an offset and the cumulative sum, d is
+/// that y after the first sample.
 /// The configuration is not copied. It must stay unchanged while the estimator is used: a static object, or a constant
 /// in flash, but no local variable of a function that returns. With assertions, est_step() detects most violations.
 /// Returns false iff the configuration is not valid; the state is then unusable. A build with -DEST_WITH_CHECKS=0 omits
@@ -432,10 +474,12 @@ bool est_config_valid(const est_config_t* config);
 EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 
 /// Enter one sample: whiten the equation, update theta and P (Bierman 1977), run the trigger.
-/// Bad data never fails and never enters the estimate: see est_status_t.
-/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.3 times a
-/// typical one if edges may slip, 1.2 times otherwise.
-/// RAM: the state, and stack: on a Cortex-M some 250 bytes, at -O0 2,400; on an AVR 280, at -O0 1,600 (make
+/// Bad data never fails and never enters the estimate: see est_status_t. Up to 8 samples in a row that are missing or
+/// refused are predicted, if C is that of the plant and u is the same before and after them; the next good sample then
+/// has its equation. After any other gap the equations begin anew, as after est_init().
+/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.4 times a
+/// typical one if edges may slip, 1.3 times otherwise.
+/// RAM: the state, and stack: on a Cortex-M 300 to 390 bytes, at -O0 4,000; on an AVR 340, at -O0 2,600 (make
 /// cost). May be called from an interrupt.
 est_step_t est_step(est_t* self, est_sample_t sample);
 
@@ -452,6 +496,15 @@ float est_variance(const est_t* self, uint8_t index);
 
 /// Noise variance [codes^2], configured or estimated. Cost: constant. May be called from an interrupt.
 float est_noise_variance(const est_t* self);
+
+/// Variance that the trigger expects of the noise [codes^2]: the noise variance times the inflation. Cost: constant.
+/// May be called from an interrupt.
+float est_scale(const est_t* self);
+
+/// True iff the model does not fit: two alarms or more that the new estimate did not justify have inflated the scale.
+/// Changes are then detected against the misfit. The inflation decreases by a factor of 4 in some 400,000 samples.
+/// Cost: constant. May be called from an interrupt.
+bool est_misfit(const est_t* self);
 
 /// One coefficient of the prefilter C; zero beyond the order of A. index is in [0, EST_NA_MAX), asserted. Cost:
 /// constant. May be called from an interrupt.

@@ -5,6 +5,7 @@
 #ifndef EST_EQUATION_H_INCLUDED
 #define EST_EQUATION_H_INCLUDED
 
+#include "est_delta.h"
 #include "est_factors.h"
 #include "est_shape.h"
 #include "est_whitener.h"
@@ -15,26 +16,28 @@ typedef struct {
     float variance;                 ///< variance of the equation's noise [noise variances]
 } est_equation_t;
 
-EST_SHARED float* append(float* const out, const float* const from, const uint_fast8_t n) {
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < n; i++) {
-        out[i] = from[i];
-    }
-    return &out[n];
-}
-
 /// Fill phi and y(k) from the stored samples.
 EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const phi) {
+    float past[EST_NA_MAX + 1U];  // y(k), y(k-1), ...; or their differences
+    past[0] = y;
+    (void)append(&past[1], self->y, shape.na);
+    const bool delta = est_delta_applies(self->config);
+    if (delta) {
+        est_delta_difference(past, shape.na);
+    }
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < shape.na; i++) {
-        phi[i] = -self->y[i];
+        phi[i] = -past[i + 1U];
     }
     float* out = append(&phi[shape.na], &self->u[shape.nk], shape.nb);
+    if (delta) {
+        est_delta_difference(&phi[shape.na], (uint_fast8_t)(shape.nb - 1U));
+    }
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
 #endif
     out[0]            = 1.0F;  // regressor of the offset; without one, y(k) overwrites it
-    out[shape.offset] = y;
+    out[shape.offset] = past[0];
 }
 
 /// Prediction error of y(k), the element that follows the regressor.
@@ -57,7 +60,7 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
     float              gain[EST_NA_MAX];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        gain[i] = whitener->gain[0][i];
+        gain[i] = est_filter_of(whitener)[i];
     }
     EST_UNROLL
     for (uint_fast8_t j = 0U; j <= count; j++) {

@@ -80,15 +80,19 @@ static inline void est_factors_walk(est_factors_t* const self, const est_config_
     }
 }
 
-/// One diagonal element of P.
+/// Variance of the sum of `factor` times the parameters.
 static inline float
-est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, const uint_fast8_t index) {
-    float sum = self->d[index];
-    for (uint_fast8_t k = (uint_fast8_t)(index + 1U); k < count; k++) {
-        const float u = self->upper[((k * (k - 1U)) / 2U) + index];
-        sum += u * u * self->d[k];
+est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, const float* const factor) {
+    float out = 0.0F;
+    for (uint_fast8_t k = 0U; k < count; k++) {
+        const float* const column = &self->upper[(k * (k - 1U)) / 2U];
+        float              sum    = factor[k];
+        for (uint_fast8_t i = 0U; i < k; i++) {
+            sum += column[i] * factor[i];
+        }
+        out += sum * sum * self->d[k];
     }
-    return sum / self->weight;
+    return out / self->weight;
 }
 
 #endif  // EST_FACTORS_H_INCLUDED

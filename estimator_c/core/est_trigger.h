@@ -76,23 +76,29 @@ static inline bool est_trigger_settle_late(est_trigger_t* const self) {
     return late;
 }
 
-/// Gain and drift of the cumulative sum. The likelihood ratio of "the innovation's variance has grown fourfold" is
-/// exp(0.375 z^2 - ln 2). Its mean is at most 1 for every conditionally 1-sub-Gaussian z. By Ville's inequality, a
-/// sum that restarts at zero then passes h at most once in exp(h) samples on average: the ceiling is ln(ARL0) without
-/// asymptotics.
-#define EST_CUSUM_GAIN (0.375F / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE))
-#define EST_CUSUM_DRIFT 0.69314718F
+/// Gain and drift of the cumulative sum: 1.15 times those of the likelihood ratio of "the innovation's variance has
+/// grown to 7.1 times its value", exp(0.43 z^2 - 0.983). Its mean is 1 for Gaussian z. By Ville's inequality, a sum
+/// that restarts at zero then passes h at most once in exp(h) samples on average. In fact it does so thirty times as
+/// rarely, because it rarely leaves zero. The factor makes the ceiling ln(ARL0) as measured, for an ARL0 of 1e3 to 1e7.
+#define EST_TERM_GAIN 0.4945F
+#define EST_CUSUM_DRIFT 1.1305F
+#define EST_CUSUM_GAIN (EST_TERM_GAIN / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE))
 
 /// Scale of the innovation before it is squared; a power of two, so that nothing is rounded. The scaled square
 /// overflows from 1.1e15 on, which no plant with codes below EST_CODE_LIMIT reaches: theta then has overflowed, or is
 /// about to.
 #define EST_INNOVATION_SCALE 16384.0F
 
-/// Add one innovation to a cumulative sum. The sum is infinite or NaN if the innovation is, or is extreme, whatever its
+/// Term of one innovation in a cumulative sum. It is infinite or NaN if the innovation is, or is extreme, whatever its
 /// weight. Comparisons with the ceiling are written such that this raises an alarm.
-EST_SHARED float est_trigger_sum(const float before, const float innovation, const float weight) {
+EST_INLINE float est_trigger_term(const float innovation, const float weight) {
     const float scaled = EST_INNOVATION_SCALE * innovation;
-    const float sum    = before + ((scaled * scaled * weight) - EST_CUSUM_DRIFT);
+    return scaled * scaled * weight;
+}
+
+/// Add one term to a cumulative sum.
+EST_SHARED float est_trigger_sum(const float before, const float term) {
+    const float sum = before + (term - EST_CUSUM_DRIFT);
     return (sum <= 0.0F) ? 0.0F : sum;
 }
 
@@ -105,8 +111,8 @@ static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
                                                       const float          late,
                                                       const float          weight,
                                                       const bool           expires) {
-    self->rival[0] = est_trigger_sum(self->rival[0], early, weight);
-    self->rival[1] = est_trigger_sum(self->rival[1], late, weight);
+    self->rival[0] = est_trigger_sum(self->rival[0], est_trigger_term(early, weight));
+    self->rival[1] = est_trigger_sum(self->rival[1], est_trigger_term(late, weight));
     if (self->statistic < ceiling) {
         return EST_QUIET;  // MISRA D4
     }
@@ -135,18 +141,18 @@ static inline float call_custom(est_trigger_t* const              self,
     return config->custom(config->context, innovation, variance, anew);
 }
 
-/// Statistic of the triggers other than the cumulative sum.
+/// Statistic of the triggers other than the cumulative sum. `variance`: of the innovation [codes^2].
 static inline float est_trigger_other_statistic(est_trigger_t* const              self,
                                                 const est_trigger_config_t* const config,
                                                 const float                       innovation,
-                                                const float                       weight) {
+                                                const float                       variance) {
     if (config->kind == EST_TRIGGER_PREDICTION_ERROR) {
         return est_magnitude(innovation);  // MISRA D4
     }
     if (config->kind == EST_TRIGGER_MEAN_BETWEEN_FAULTS) {
         return mean_between_faults(self, config->absolute, innovation);  // MISRA D4
     }
-    return call_custom(self, config, innovation, EST_CUSUM_GAIN / weight);
+    return call_custom(self, config, innovation, variance);
 }
 
 /// True iff the statistic is held at zero. Counts down the innovations of the hold.
@@ -158,16 +164,18 @@ EST_INLINE bool est_trigger_holds(est_trigger_t* const self, const est_trigger_k
     return kind == EST_TRIGGER_NONE;
 }
 
-/// Enter one innovation [codes] as recorded. `weight` is that of its square in the cumulative sum; 0 while it is held.
+/// Enter one innovation [codes] as recorded, with its term in the cumulative sum. Its variance is noise_variance over
+/// precision.
 EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
                                   const est_trigger_config_t* const config,
                                   const float                       innovation,
-                                  const float                       weight,
-                                  const bool                        held) {
-    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && !held) {
-        self->statistic = est_trigger_other_statistic(self, config, innovation, weight);
+                                  const float                       noise_variance,
+                                  const float                       precision,
+                                  const float                       term) {
+    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM)) {
+        self->statistic = est_trigger_other_statistic(self, config, innovation, noise_variance / precision);
     } else {
-        self->statistic = est_trigger_sum(self->statistic, innovation, weight);
+        self->statistic = est_trigger_sum(self->statistic, term);
     }
 }
 

@@ -42,6 +42,28 @@ EST_SHARED bool est_whitener_accepts(const float* const c, const uint_fast8_t na
     return true;
 }
 
+/// Determine the filter from the newest gains. With D = 1 - z^-1, its equation D^n w(k) = x(k) - sum of step[j] D^j
+/// w(k-1) is that of x(k) = w(k) + gain[0] w(k-1) + ..., without the rounding of products that cancel.
+EST_SHARED void prepare_filter(est_whitener_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    float sum[EST_NA_MAX];
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        sum[i] = self->gain[0][i];
+    }
+    EST_UNROLL
+    for (uint_fast8_t j = 0U; j < EST_NA_MAX; j++) {
+        EST_UNROLL
+        for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
+            sum[i - 1U] += (i > j) ? sum[i] : 0.0F;
+        }
+        self->step[j] = ((j % 2U) == 0U) ? (1.0F + sum[j]) : (1.0F - sum[j]);
+    }
+#else
+    (void)self;
+#endif
+}
+
 /// Set the first na coefficients of C. The filter continues from its present state.
 EST_SHARED void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
     EST_UNROLL
@@ -49,6 +71,7 @@ EST_SHARED void est_whitener_set(est_whitener_t* const self, const float* const 
         self->c[i]       = c[i];
         self->gain[0][i] = c[i];
     }
+    prepare_filter(self);
 }
 
 /// Restart: the next equation is the first.
@@ -90,6 +113,7 @@ EST_INLINE void remember(est_whitener_t* const self, const float* const gain, co
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->gain[0][i] = gain[i];
     }
+    prepare_filter(self);
 }
 
 /// Advance to the next equation. Return the variance of its whitened noise in variances of e, at least 1. Once it is
@@ -119,9 +143,30 @@ static inline float est_whitener_advance(est_whitener_t* const self, bool* const
     return variance;
 }
 
+/// Coefficients of the filter.
+EST_INLINE const float* est_filter_of(const est_whitener_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return self->step;
+#else
+    return self->gain[0];
+#endif
+}
+
 /// Filter one sample of one signal. Gains beyond the order of C are zero: a loop of fixed length is faster.
 EST_SHARED float est_filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
+#if EST_WITH_ROBUSTNESS
+    EST_UNROLL
+    for (uint_fast8_t i = EST_NA_MAX; i > 0U; i--) {
+        out -= gain[i - 1U] * past->x[i - 1U];
+    }
+    EST_UNROLL
+    for (uint_fast8_t i = EST_NA_MAX; i > 0U; i--) {
+        out += past->x[i - 1U];
+        past->x[i - 1U] = out;
+    }
+    return out;
+#else
     EST_UNROLL
     for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
         out -= gain[i] * past->x[i];
@@ -130,6 +175,7 @@ EST_SHARED float est_filter(const float* const gain, est_past_t* const past, con
     out -= gain[0] * past->x[0];
     past->x[0] = out;
     return out;
+#endif
 }
 
 #endif  // EST_WHITENER_H_INCLUDED

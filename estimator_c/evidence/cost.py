@@ -45,7 +45,7 @@ FLAGS = (
 CLOCK_MHZ, CYCLES = 168.0, 1.5
 """For estimates of time: the clock of a usual M4F, and cycles per instruction (1.2 to 2, as its memory has it)."""
 
-EVEN = 1.2
+EVEN = 1.25
 """Largest ratio of the instructions of the worst step to those of a typical step."""
 
 
@@ -104,7 +104,9 @@ OTHER = Orders(2, 2, 1, 1)
 """A shape for which est.c has no code of its own."""
 
 # A build with the default trigger and nothing that can be left out; its configuration has been checked on the host.
-TRIGGER_ALONE = tuple(f"-DEST_WITH_{what}=0" for what in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH", "CHECKS"))
+TRIGGER_ALONE = tuple(
+    f"-DEST_WITH_{what}=0" for what in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH", "CHECKS", "ROBUSTNESS")
+)
 
 
 # What footprint.c is to use.
@@ -341,13 +343,13 @@ def costs(folder: Path) -> Iterator[Cost]:
     yield from instructions(bench)
     yield from soft_float(bench)
     for name, flags, limit in (
-        ("code of the core at -Os, everything", EVERYTHING, 4096),
+        ("code of the core at -Os, everything", EVERYTHING, 4600),
         ("code of the core at -Os, trigger alone", TRIGGER_ALONE, 1536),
     ):
         text_bytes = bench.text_bytes(*flags)
         yield Cost(f"M4F, {name}", text_bytes, "B", limit, ratio=text_bytes / limit)
     state_bytes = bench.state_bytes("estimator")
-    yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 320, ratio=state_bytes / 320)
+    yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 400, ratio=state_bytes / 400)
     for build, level in itertools.product(stack.BUILDS, stack.LEVELS):
         yield Cost(f"{build.name}, stack of est_step() at {level}", stack.stack_bytes(build, level, folder), "B")
     yield from isolation(bench)
@@ -387,7 +389,7 @@ def fit(bench: ImageRunner) -> Iterator[Cost]:
 def instructions(bench: ImageRunner) -> Iterator[Cost]:
     """Costs in instructions, on the M4F."""
     rivals = {n: [bench.textbook(M4F, n, factors=factors) for factors in (False, True)] for n in (4, 6)}
-    for orders, at_run_time, at_compile_time in ((SMALL, 400, 260), (LARGE, 750, 520), (FREE, 750, 520)):
+    for orders, at_run_time, at_compile_time in ((SMALL, 400, 340), (LARGE, 750, 520), (FREE, 750, 520)):
         rival = rivals[orders.count][1]
         for fixed, limit in ((False, at_run_time), (True, at_compile_time)):
             yield from bench.estimator(M4F, orders, fixed=fixed).costs(limit, rival)

@@ -26,11 +26,12 @@ static est_fit_watch_t fit;
 #endif
 
 SUBJECT void subject_begin(void) {
-    config        = est_config_default();
-    config.na     = SUBJECT_NA;
-    config.nb     = SUBJECT_NB;
-    config.nk     = SUBJECT_NK;
-    config.offset = SUBJECT_OFFSET;
+    config                   = est_config_default();
+    config.na                = SUBJECT_NA;
+    config.nb                = SUBJECT_NB;
+    config.nk                = SUBJECT_NK;
+    config.offset            = SUBJECT_OFFSET;
+    config.trigger.warm_up_n = 150U;  // the change comes before the default ends
 #ifdef SUBJECT_LOCKED
     config.edge_instants = EST_EDGES_LOCKED;
 #endif

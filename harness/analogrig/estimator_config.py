@@ -88,15 +88,15 @@ class EstimatorConfig:
     nc: int = 0
     """Number of coefficients of C in theta (extended least squares)."""
     offset: bool = True
-    noise_estimated: bool = False
-    """Estimate the variance of the noise, starting from ``noise_variance``."""
+    noise_estimated: bool = True
+    """Follow the variance of the noise, starting from ``noise_variance``."""
     refresh_n: int = 40
     """Equations after which C is set from the estimate of A, and again each time A has moved; 0: never."""
     stuck_n: int = 16
     """Samples of constant displacement after an edge of the force that count as stuck, up to 255; 0: never."""
     idle_n: int = 1000
     """Samples without an edge of the force after which excitation counts as lost; 0: never."""
-    forgetting: float = 0.99
+    forgetting: float = 0.995
     random_walk: float = 0.0
     """Variance of each parameter's random walk per sample, in noise variances."""
     p0: float = 10.0
@@ -126,7 +126,7 @@ class EstimatorConfig:
     arl0: float | None = None
     """Mean samples between false alarms; for ``cusum``."""
     hold_off_n: int = 0
-    warm_up_n: int = 150
+    warm_up_n: int = 550
     absolute: bool = False
     reset: ResetName = "covariance"
 

@@ -148,9 +148,10 @@ class Estimator:
         return fields | {"c1": c1, "c2": c2}
 
     def init(self, **changes: float | tuple[float, float]) -> bool:
-        """est_init() with the default configuration and these changes."""
+        """est_init() with the default configuration and these changes; armed soon, because most records are short."""
         config = Config()
         self._c.driver_default(ctypes.byref(config))
+        config.warm_up_n = 150.0
         for name, value in changes.items():
             setattr(config, name, (ctypes.c_double * 2)(*value) if isinstance(value, tuple) else value)
         return bool(self._c.driver_init(ctypes.byref(config)))

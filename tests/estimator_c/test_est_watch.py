@@ -174,7 +174,7 @@ def test_own_trigger_is_told_the_variance_that_the_innovation_should_have(estima
     """In codes^2, so that the squared innovation is as large on average. 2 LSB of noise, and rounding."""
     u, y = suspension([(0, FRONT)], np.arange(10.0, 4000.0, 50.0), 4000, 2.0, 5)
     assert estimator.init(kind=CUSTOM, custom=2, ceiling=1e6, noise_variance=4.0 + 1.0 / 12.0, edge_instants=LOCKED)
-    assert estimator.run(u, y).statistic[200:].mean() == pytest.approx(1.0, rel=0.1)
+    assert estimator.run(u, y).statistic[800:].mean() == pytest.approx(1.0, rel=0.1)
 
 
 def test_variance_of_the_noise_is_followed(estimator: Estimator) -> None:

@@ -33,7 +33,7 @@ from analogrig.scenario import Scenario
 from analogrig.testing.counterexample import Counterexample
 from tests.harness.scripted_ecu import DBC, Answer, ScriptedEcu, write
 
-THESIS_HASH = "2ba8713bf6ac34db"
+THESIS_HASH = "9465dc32dad9bba0"
 SEED = 7
 MISSING = 0x01
 SHORT = dataclasses.replace(Scenario.load("healthy"), samples=12)

@@ -28,7 +28,7 @@ from analogrig.run import UNARMED, UNREPORTED
 from analogrig.scenario import Scenario
 
 ESTIMATORS = "tests.harness.python_estimators"
-THESIS_HASH, HEALTHY_HASH = "2ba8713bf6ac34db", "a84863c36d986882"
+THESIS_HASH, HEALTHY_HASH = "9465dc32dad9bba0", "7cfdea2e26d7eb6a"
 
 pytestmark = pytest.mark.usefixtures("_own_path")
 

@@ -1,0 +1,142 @@
+// SPDX-License-Identifier: MIT
+/// Scale of the innovations: the variance that the trigger expects of them. It is the noise variance, followed on line,
+/// times an inflation. The inflation grows with alarms that the new estimate does not justify: the model then does not
+/// fit the plant, and what cannot be told from the misfit must not raise alarms. EST_WITH_ROBUSTNESS=0 omits the
+/// module; the scale is then the configured noise variance.
+
+#ifndef EST_SCALE_H_INCLUDED
+#define EST_SCALE_H_INCLUDED
+
+#include "est_trigger.h"
+
+/// Equations between two updates of the scale. A change that raises an alarm within its block leaves the scale as it
+/// was before the change.
+#define EST_BLOCK_N 32U
+
+/// Smallest share of a new block in the noise variance: a memory of 1,000 equations. Before the trigger is armed the
+/// share is larger, because C and theta still change.
+#define EST_SHARE_MIN 0.032F
+#define EST_SHARE_WARM 0.25F
+
+/// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
+#define EST_MARGIN 2.0F
+
+/// Largest mean square of a block that counts, in noise variances. Before the trigger is armed, an outlier might pass
+/// all bounds; later it raises an alarm.
+#define EST_GROWTH_MAX 9.0F
+
+/// Inflation: factor per unjustified alarm, factor per block on the way back to 1 (a factor of 4 in 400,000 equations),
+/// largest value, and the value from which the model is reported not to fit: two unjustified alarms.
+#define EST_INFLATION_STEP 4.0F
+#define EST_INFLATION_DECAY 0.9998933F
+#define EST_INFLATION_MAX 1.0e6F
+#define EST_INFLATION_MISFIT 8.0F
+
+/// After an alarm, the old estimate is compared with the new one from equation EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N,
+/// and further until an edge of u came, but no further than EST_TRIAL_MAX_N. A trial that ends at an alarm needs
+/// EST_TRIAL_LEAST_N equations.
+#define EST_TRIAL_BEGIN_N 16U
+#define EST_TRIAL_LEAST_N 20U
+#define EST_TRIAL_N 56U
+#define EST_TRIAL_MAX_N 120U
+
+/// An alarm is justified if the squared errors of the old estimate exceed those of the new one by this factor.
+#define EST_JUSTIFIED 4.0F
+
+/// Number of alarms that may be justified in close succession, and its increase per block: one per 5,000 equations. A
+/// plant whose equations fit it only for a while justifies every alarm.
+#define EST_CREDIT_MAX 4.0F
+#define EST_CREDIT_PER_BLOCK ((float)EST_BLOCK_N / 5000.0F)
+
+/// Mean square of a block, of the sum of its terms over their weight.
+#define EST_MEAN_SQUARE (1.0F / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE * (float)EST_BLOCK_N))
+
+/// Equations to the end of the warm-up below which the noise variance is followed with its final memory.
+#define EST_WARM_N 64U
+
+#if EST_WITH_ROBUSTNESS
+
+/// Derive from the scale the weight of a squared innovation in the cumulative sum.
+static inline void est_scale_apply(est_scale_t* const self, const float noise_variance) {
+    self->weight = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
+}
+
+/// Begin a block.
+static inline void est_scale_restart(est_scale_t* const self) {
+    self->sum      = 0.0F;
+    self->left_n   = EST_BLOCK_N;
+    self->followed = false;
+}
+
+static inline void est_scale_init(est_scale_t* const self, const est_config_t* const config) {
+    self->inflation = 1.0F;
+    self->share     = config->noise_estimated ? 1.0F : 0.0F;
+    self->credit    = EST_CREDIT_MAX;
+    est_scale_restart(self);
+    est_scale_apply(self, config->noise_variance);
+}
+
+/// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
+EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
+    if (self->left_n == 0U) {
+        return false;  // MISRA D4
+    }
+    self->left_n--;
+    self->sum += term;
+    return true;
+}
+
+/// Noise variance after a complete block. `least`: smallest share of the next block.
+static inline float est_scale_follow(est_scale_t* const self, const float noise_variance, const float least) {
+    const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
+    const float most    = EST_GROWTH_MAX * noise_variance;
+    const float limited = (mean < most) ? mean : most;
+    const float noise   = noise_variance + (self->share * (limited - noise_variance));
+    const float share   = self->share / (1.0F + self->share);
+    self->share         = (share > least) ? share : least;
+    return (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
+}
+
+/// Let the inflation decrease, and the number of alarms that may be justified increase, by one block.
+static inline void est_scale_relax(est_scale_t* const self) {
+    const float inflation = self->inflation * EST_INFLATION_DECAY;
+    const float credit    = self->credit + EST_CREDIT_PER_BLOCK;
+    self->inflation       = (inflation > 1.0F) ? inflation : 1.0F;
+    self->credit          = (credit < EST_CREDIT_MAX) ? credit : EST_CREDIT_MAX;
+}
+
+/// Begin the trial of an alarm. The block restarts after it.
+static inline void est_scale_begin_trial(est_scale_t* const self) {
+    self->sum     = 0.0F;
+    self->trial_n = 1U;
+    self->left_n  = 0U;
+}
+
+/// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
+static inline void est_scale_conclude(est_scale_t* const self) {
+    const bool justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
+    if (justified && (self->credit >= 1.0F)) {
+        self->credit -= 1.0F;
+    } else if (self->inflation < EST_INFLATION_MAX) {
+        self->inflation *= EST_INFLATION_STEP;
+    } else {
+        // the scale is large enough
+    }
+    self->trial_n = 0U;
+    est_scale_restart(self);
+}
+
+/// Enter one equation into the trial of an alarm: the squared errors of the old and the new estimate, the latter
+/// relative to its variance. The sum is that of the trial instead of a block. Return false iff the equation is the last
+/// one.
+EST_INLINE bool
+est_scale_try(est_scale_t* const self, const float old_square, const float new_square, const uint_fast16_t edge_age_n) {
+    const uint_fast8_t n = ++self->trial_n;  // MISRA D3
+    if (n > EST_TRIAL_BEGIN_N) {
+        self->sum += old_square - (EST_JUSTIFIED * new_square);
+    }
+    return (n < EST_TRIAL_N) || ((edge_age_n >= n) && (n < EST_TRIAL_MAX_N));
+}
+#endif
+
+#endif  // EST_SCALE_H_INCLUDED
