@@ -393,11 +393,11 @@ static void enter_edge(est_t* const self) {
     }
 }
 
-/// True iff the next sample may be predicted: the model is known, and the whitening has nearly settled. The residuals
-/// of a missing sample are unknown.
+/// True iff the next sample may be predicted: the model is known, and the whitening has nearly settled. y must not be
+/// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
 static bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return self->known && (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) &&
+    return self->known && (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) && (self->same_n == 0U) &&
            (!on_bridge(self) || (self->bridged_n < BRIDGED_MAX)) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
            (est_shape_of(self->config).nc == 0U);
 #else

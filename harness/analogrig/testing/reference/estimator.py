@@ -10,9 +10,21 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+
 from analogrig.catalogue import SteppedFlag
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.regression import Covariance, Vector, Whitener, dot, is_stable
+from analogrig.testing.reference.regression import (
+    Covariance,
+    Vector,
+    Whitener,
+    differences,
+    dot,
+    is_stable,
+    to_delta,
+    to_plain,
+)
+from analogrig.testing.reference.scale import WARM_N
 from analogrig.testing.reference.trigger import Meaning, ReferenceTrigger
 
 DOUBT_N = 12
@@ -32,8 +44,17 @@ SETTLED = 1.0001
 WEIGHT_DUE, WEIGHT_OVERDUE = 0.5, 0.25
 """Weights below which the d's are limited: in a step with little other work, and in any step."""
 
+DISPLACED, DISPLACED_SUM = 0.5, 1.5
+"""Part of the energy that a displaced edge must explain, and the sum of the excess that suffices."""
+
+BRIDGED_MAX, BRIDGE_PRECISION = 8, 0.6
+"""Longest gap that is bridged, and smallest precision of the whitening at which it is."""
+
 NEAR = 0.1
 """Relative distance from a threshold at which rounding may decide that A has moved."""
+
+NEAR_SUM = 0.01
+"""The same of the evidence that edges are displaced."""
 
 COUNTERS = ("updated", "missing", "refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes")
 """Counters of the estimator, by their names in est_counters_t."""
@@ -64,6 +85,27 @@ class Doubt:
     """Effects of the early and late edges on the whitened equations, newest first."""
 
 
+@dataclass
+class Displacement:
+    """Innovations after an edge, compared with the effect of displacing it."""
+
+    energy: float = 0.0
+    along: float = 0.0
+    span: float = 0.0
+
+    def enter(self, innovation: float, effect: float) -> None:
+        """Enter an innovation and the effect on it."""
+        self.along += innovation * effect
+        self.span += effect**2
+        self.energy += innovation**2
+
+    @property
+    def part(self) -> float:
+        """Part of the energy that a displacement explains."""
+        whole = self.span * self.energy
+        return self.along**2 / whole if whole > 0.0 else 0.0
+
+
 class Refresh(Enum):
     """Next step of a refresh of C."""
 
@@ -73,7 +115,7 @@ class Refresh(Enum):
 
 
 class ReferenceEstimator:
-    """One estimator. ``theta`` is the estimate after the last step."""
+    """One estimator."""
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.config = config
@@ -82,7 +124,10 @@ class ReferenceEstimator:
         prior = [config.p0] * n
         if config.offset:
             prior[-1] = config.p0_offset
-        self.theta = [0.0] * n
+        self._is_delta = config.trigger == "cusum"
+        self.delta = self._zero
+        """Estimate after the last step, for differences of the samples less the first one."""
+        self.reference = (0.0, 0.0)  # codes of the first sample
         self.covariance = Covariance(prior)
         self.whitener = Whitener(c)
         self.trigger = ReferenceTrigger(config)
@@ -97,7 +142,11 @@ class ReferenceEstimator:
         self.since_n = 0  # samples since an edge of u
         self.same_n = 0  # samples of constant y since an edge of u
         self.doubt: Doubt | None = None
-        self.slipped: Vector | None = None  # theta after a slip, valid from the next sample on
+        self.displacement = Displacement()
+        self.misfit = 0.0  # evidence that each edge is displaced otherwise
+        self.edges_vary = False
+        self.bridged_n = 0  # samples before this one that were predicted
+        self.slipped: Vector | None = None  # delta after a slip, valid from the next sample on
         self.is_doubtful = False  # rounding may have decided whether C was to follow A
         self.deviation = 0.0  # predicted standard deviation of the last innovation, in codes
 
@@ -106,9 +155,33 @@ class ReferenceEstimator:
         return max(self.config.na, self.config.nb + self.config.nk - 1)
 
     @property
+    def _zero(self) -> Vector:
+        """theta = 0."""
+        a = [1.0, *([0.0] * self.config.na)]
+        return [*(to_delta(a) if self._is_delta else a)[1:], *([0.0] * (self.config.parameters - self.config.na))]
+
+    def _plain(self, delta: Vector, lead: float = 1.0) -> Vector:
+        """Parameters of the model of est.h, from those for differences. ``lead``: coefficient of y(k)."""
+        if not self._is_delta:
+            return list(delta)
+        first, last = self.config.na, self.config.na + self.config.nb
+        out = [*to_plain([lead, *delta[:first]])[1:], *to_plain(delta[first:last]), *delta[last:]]
+        if self.config.offset:
+            u, y = self.reference
+            out[-1] += delta[first - 1] * y - delta[last - 1] * u
+        return out
+
+    @property
+    def theta(self) -> Vector:
+        """Estimate after the last step, as in the model of est.h."""
+        return self._plain(self.delta)
+
+    @property
     def deviations(self) -> Vector:
         """Standard deviations of theta."""
-        return [math.sqrt(each * self.trigger.noise_variance) for each in self.covariance.variances]
+        columns = [self._plain(unit, 0.0) for unit in np.eye(self.config.parameters).tolist()]
+        variances = self.covariance.variances(np.transpose(columns).tolist())
+        return [math.sqrt(each * self.trigger.noise_variance) for each in variances]
 
     @property
     def slips(self) -> int:
@@ -133,8 +206,11 @@ class ReferenceEstimator:
             self.counters["missing"] += 1
             self._gap()
             return self._stepped(statistic, SteppedFlag.MISSING)
-        if self._is_refused(u, y):
+        is_saturated = self._is_saturated(u, y)
+        u, y = (u, y) if is_saturated else self._less_reference(u, y)
+        if is_saturated or self._is_stuck(u, y):
             self.counters["refused"] += 1
+            self.counters["saturated" if is_saturated else "stuck"] += 1
             self._gap()
             return self._stepped(statistic, SteppedFlag.REFUSED)
         self.counters["updated"] += 1
@@ -152,7 +228,7 @@ class ReferenceEstimator:
     def _gather(self) -> ReferenceStep:
         """Store a sample without an equation of its own, and do the work that the last one left."""
         self.pending -= 1
-        self.theta, self.slipped = self.slipped or self.theta, None
+        self.delta, self.slipped = self.slipped or self.delta, None
         if self.refresh is Refresh.TAKES:
             self._take_c()
             self.equations = 0
@@ -167,15 +243,16 @@ class ReferenceEstimator:
 
     # ---- samples
 
-    def _is_refused(self, u: float, y: float) -> bool:
+    def _is_saturated(self, u: float, y: float) -> bool:
         low, high = self.config.code_low, self.config.code_high
-        if not (low < u < high and low < y < high):
-            self.counters["saturated"] += 1
-            return True
-        if not self._is_stuck(u, y):
-            return False
-        self.counters["stuck"] += 1
-        return True
+        return not (low < u < high and low < y < high)
+
+    def _less_reference(self, u: float, y: float) -> tuple[float, float]:
+        if not (self._is_delta and self.config.offset):
+            return u, y
+        if not self.counters["updated"]:
+            self.reference = (u, y)
+        return u - self.reference[0], y - self.reference[1]
 
     def _is_edge(self, u: float) -> bool:
         return bool(self.u) and abs(u - self.u[0]) >= self.config.edge_codes
@@ -195,18 +272,29 @@ class ReferenceEstimator:
             self.doubt.age_n += 1
             if self.doubt.age_n > DOUBT_N:
                 self.doubt = None
+        bridged_n, self.bridged_n = self.bridged_n, 0
+        if edge and bridged_n:  # the instant of the edge is unknown
+            self.since_n += 1
+            self._forget()
+            self.u = [u]
+            return
+        is_slope = self.since_n == 0
         self.since_n = 0 if edge else self.since_n + 1
-        if edge and self.config.edge_instants == "anywhere":
+        instants = "anywhere" if self.edges_vary else self.config.edge_instants
+        if edge and instants == "anywhere":
             self.pending = max(self.pending, self.config.na)
-        if edge and self.trigger.doubts_edges:
+        may_slip = instants == "may-slip" and self.config.trigger == "cusum"
+        if edge and may_slip and not is_slope and not self.trigger.scale.is_on_trial:
             self._begin_doubt()
 
     def _begin_doubt(self) -> None:
         if self.doubt is not None and self.trigger.has_rival:
             return
-        self.doubt = Doubt(list(self.theta))
+        self.doubt = Doubt(list(self.delta))
         if not self.pending and self.config.nk == 0:  # one sample early, it would have entered the equation before
-            self.doubt.early = [self.theta[self.config.na] * (self.u[0] - self.u[1])]
+            self.doubt.early = [self.delta[self.config.na] * (self.u[0] - self.u[1])]
+        last = self._residual(self.whitener.past[0], self.delta) if self.whitener.past else 0.0
+        self.displacement = Displacement(2.0 * DOUBT_N * last**2)
         self.trigger.begin_doubt()
 
     def _forget(self) -> None:
@@ -214,29 +302,70 @@ class ReferenceEstimator:
         self.pending = max(self.pending, self._past_n)
 
     def _gap(self) -> None:
+        """Bridge a sample that is not good, or let the equations begin anew."""
         if not self.u:
             return
-        if self.doubt is not None and self.trigger.end_doubt() is Meaning.SLIP:
-            self._slip(self.doubt.theta)
-        self._forget()
+        bridges = self._can_bridge
+        if self.doubt is not None:
+            if bridges and self.doubt.age_n < DOUBT_N - 1:  # its last sample decides, and must be good
+                self.doubt.age_n += 1
+            elif self.trigger.end_doubt() is Meaning.SLIP:
+                self._slip(self.doubt.theta)
+                bridges = False
+            else:
+                self.doubt = None
+        if bridges:
+            self._bridge()
+        else:
+            self._forget()
+
+    @property
+    def _can_bridge(self) -> bool:
+        is_white = not any(self.whitener.c)  # the equations have no state that a prediction could continue
+        is_precise = bool(self.whitener.rows) and not is_white and 1.0 / self.whitener.rows[0][1] > BRIDGE_PRECISION
+        is_free = not (self.pending or self.same_n or self.trigger.quiet_n or self.config.nc)
+        return is_free and is_precise and self.bridged_n < BRIDGED_MAX
+
+    def _bridge(self) -> None:
+        """Predict a missing sample: u is the last one, the innovation zero."""
+        self.bridged_n += 1
+        self.u = [self.u[0], *self.u][: self.config.nb + self.config.nk + 1]
+        self.since_n += 1
+        equation = self._whitened(self.y[0])
+        innovation = self._residual(equation, self.delta)
+        self.whitener.past[0][-1] -= innovation
+        if self.doubt is not None:
+            self._enter_readings(self.doubt)
+        self.y = [self.y[0] - innovation, *self.y][: self.config.na]
 
     # ---- equations
 
-    def _regressor(self) -> Vector:
+    def _equation_of(self, y: float) -> Vector:
+        """Regressor, followed by the target."""
         config = self.config
-        phi = [-y for y in self.y] + self.u[config.nk : config.nk + config.nb] + self.residuals
-        return [*phi, 1.0] if config.offset else phi
+        outputs, inputs = [y, *self.y], self.u[config.nk : config.nk + config.nb]
+        if self._is_delta:
+            outputs, inputs = differences(outputs), differences(inputs)
+        target, *past = outputs
+        return [*(-x for x in past), *inputs, *self.residuals, *([1.0] if config.offset else []), target]
+
+    def _whitened(self, y: float) -> Vector:
+        self._limit()
+        equation, self.variance = self.whitener.whiten(self._equation_of(y))
+        self.settled = self.variance < SETTLED
+        return equation
+
+    @staticmethod
+    def _residual(equation: Vector, delta: Vector) -> float:
+        return equation[-1] - dot(equation[:-1], delta)
 
     def _equation(self, y: float) -> ReferenceStep:
-        self._limit()
-        (*phi, target), variance = self.whitener.whiten([*self._regressor(), y])
-        self.settled = variance < SETTLED
-        innovation = target - dot(phi, self.theta)
-        readings = self._rival_innovations(phi, target)
-        gain, variance = self.covariance.measure(phi, variance, self.config.forgetting)
-        self.theta = [t + g * innovation for t, g in zip(self.theta, gain, strict=True)]
-        self._adapt(phi, target)
-        self.trigger.follow_noise(innovation, variance)
+        equation = self._whitened(y)
+        innovation = self._residual(equation, self.delta)
+        readings = self._rival_innovations(equation)
+        gain, variance = self.covariance.measure(equation[:-1], self.variance, self.config.forgetting)
+        self.delta = [t + g * innovation for t, g in zip(self.delta, gain, strict=True)]
+        self._adapt(equation)
         expires = self.doubt is not None and self.doubt.age_n >= DOUBT_N
         decision = self.trigger.enter(innovation, variance, readings, expires=expires)
         self.deviation = math.sqrt(variance * self.trigger.noise_variance)
@@ -246,7 +375,23 @@ class ReferenceEstimator:
         elif decision is Meaning.SLIP and self.doubt is not None:
             self._slip(self.doubt.theta)
             self._forget()
+        else:
+            self._watch_scale(equation, innovation**2 / variance)
+            if self._considers_c:
+                self._refresh()
+            self.equations += 1
         return step
+
+    def _watch_scale(self, equation: Vector, square: float) -> None:
+        scale = self.trigger.scale
+        scale.enter(
+            square,
+            self._residual(equation, scale.old) ** 2 if scale.is_on_trial else 0.0,
+            self.since_n,
+            waits=self.refresh is not Refresh.WAITS,
+            warm=self.trigger.quiet_n >= WARM_N,
+            excess=self.trigger.excess,
+        )
 
     @property
     def _considers_c(self) -> bool:
@@ -259,20 +404,36 @@ class ReferenceEstimator:
         if self.covariance.weight < (WEIGHT_OVERDUE if long else WEIGHT_DUE):
             self.covariance.inflate(1.0)
 
-    def _rival_innovations(self, phi: Vector, target: float) -> tuple[float, float] | None:
+    def _rival_innovations(self, equation: Vector) -> tuple[float, float] | None:
         """Innovations under the hypotheses of early and late edges."""
-        doubt, config = self.doubt, self.config
-        if doubt is None:
+        if self.doubt is None:
             return None
-        b = doubt.theta[config.na : config.na + config.nb]
+        early, late = self._enter_readings(self.doubt)
+        innovation = self._residual(equation, self.doubt.theta)
+        self.displacement.enter(innovation, early - late)
+        if self.doubt.age_n >= DOUBT_N:
+            self._watch_edges()
+        return innovation - early, innovation - late
+
+    def _enter_readings(self, doubt: Doubt) -> tuple[float, float]:
+        """Effects of early and late edges on the present equation."""
+        config = self.config
+        b = to_plain(doubt.theta[config.na : config.na + config.nb])
         if self.since_n >= config.nb + config.nk:
             b = [0.0] * config.nb
         late = -sum(b[j] * self._height(config.nk + j, doubt.age_n) for j in range(config.nb))
         early = sum(b[j] * self._height(config.nk + j - 1, doubt.age_n) for j in range(config.nb))
         doubt.early = self._whitened_effect(doubt.early, early)
         doubt.late = self._whitened_effect(doubt.late, late)
-        innovation = target - dot(phi, doubt.theta)
-        return innovation - doubt.early[0], innovation - doubt.late[0]
+        return doubt.early[0], doubt.late[0]
+
+    def _watch_edges(self) -> None:
+        """Take edges for coming anywhere once every edge is displaced by another part of an interval."""
+        self.misfit = max(0.0, self.misfit + self.displacement.part - DISPLACED)
+        self.is_doubtful |= abs(self.misfit / DISPLACED_SUM - 1.0) < NEAR_SUM
+        if self.misfit > DISPLACED_SUM:
+            self.edges_vary = True
+            self.trigger.scale.forgive()
 
     def _height(self, lag: int, age_n: int) -> float:
         """Height of the step of u ``lag`` samples ago; 0 for one before the edges in doubt, which is noise."""
@@ -282,16 +443,13 @@ class ReferenceEstimator:
         gains = self.whitener.latest
         return [x - sum(g * w for g, w in zip(gains, past, strict=False)), *past][: max(len(gains), 1)]
 
-    def _adapt(self, phi: Vector, target: float) -> None:
+    def _adapt(self, equation: Vector) -> None:
         """Update what an equation determines besides theta."""
         config = self.config
         if config.random_walk > 0.0:
             self.covariance.walk(config.random_walk)
         if config.nc:
-            self.residuals = [target - dot(phi, self.theta), *self.residuals][: config.nc]
-        if self._considers_c:
-            self._refresh()
-        self.equations += 1
+            self.residuals = [self._residual(equation, self.delta), *self.residuals][: config.nc]
 
     def _refresh(self) -> None:
         """Do one step of a refresh of C: check that A is reliable, compare C with A, or take C from A."""
@@ -333,16 +491,19 @@ class ReferenceEstimator:
         """Shift the b's of the estimate ``before`` the edges by one place, since the edges moved by one sample."""
         config = self.config
         first, last = config.na, config.na + config.nb
-        b = before[first:last]
+        b = to_plain(before[first:last])
         moved = [*b[1:], 0.0] if not self.trigger.comes_late else [0.0, *b[:-1]]
-        self.slipped = [*before[:first], *moved, *before[last:]]
+        self.slipped = [*before[:first], *to_delta(moved), *before[last:]]
         self.covariance.inflate(SLIP_DOUBT)
         self.trigger.settle()
         self.counters["slips"] += 1
 
     def _alarm(self) -> None:
+        if self.config.trigger == "cusum":
+            self.trigger.scale.begin_trial(self.delta)
+        self.misfit = 0.0
         if self.config.reset == "all":
-            self.theta = [0.0] * len(self.theta)
+            self.delta = self._zero
         self.covariance.reset()
         self.equations, self.refresh = 0, Refresh.WAITS
         self.trigger.restart(self.config.hold_off_n)

@@ -1,13 +1,42 @@
-"""Parts of the reference estimator that know nothing of samples: whitening and covariance, in float64.
+"""Parts of the reference estimator that know nothing of samples: delta form, whitening, covariance, in float64.
 
-Both follow harness/docs/background/estimator.md.
+All follow harness/docs/background/estimator.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 Vector = list[float]
+
+
+def differences(values: Sequence[float]) -> Vector:
+    """Values x(k), x(k-1), ... as differences D^n x(k), D^(n-1) x(k-1), ..., x(k-n)."""
+    out = list(values)
+    for rest in range(len(out) - 1, 0, -1):
+        for i in range(rest):
+            out[i] -= out[i + 1]
+    return out
+
+
+def to_plain(coefficients: Sequence[float]) -> Vector:
+    """Coefficients of such differences as those of the values."""
+    out = list(coefficients)
+    for n in range(1, len(out)):
+        for i in range(n, 0, -1):
+            out[i] -= out[i - 1]
+    return out
+
+
+def to_delta(coefficients: Sequence[float]) -> Vector:
+    """Coefficients of the values as those of the differences."""
+    out = list(coefficients)
+    for n in range(len(out) - 1, 0, -1):
+        for i in range(n):
+            out[i + 1] += out[i]
+    return out
 
 
 class Whitener:
@@ -71,11 +100,10 @@ class Covariance:
         self.d, self.weight = list(self.prior), 1.0
         self.u = [[float(i == j) for j in range(n)] for i in range(n)]
 
-    @property
-    def variances(self) -> Vector:
-        """Diagonal of P."""
-        n = len(self.d)
-        return [sum(self.u[i][j] ** 2 * self.d[j] for j in range(i, n)) / self.weight for i in range(n)]
+    def variances(self, forms: Sequence[Sequence[float]]) -> Vector:
+        """Variances of linear forms in the parameters."""
+        roots = np.sqrt(np.array(self.d) / self.weight)
+        return [float(each) for each in np.square(np.array(forms) @ np.array(self.u) * roots).sum(axis=1)]
 
     def inflate(self, factor: float) -> None:
         """Multiply P by this factor, up to the prior."""

@@ -5,13 +5,10 @@ from __future__ import annotations
 from enum import Enum
 
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.testing.reference.scale import ReferenceScale
 
-NOISE_RATE, NOISE_CLIP, NOISE_KEPT = 0.005, 9.0, 0.9851
-"""Rate at which the noise variance is followed, and the clipping of squared innovations, with what it leaves."""
-
-GAIN, DRIFT = 0.375, 0.69314718
-"""Log-likelihood ratio of a fourfold variance: GAIN z^2 - DRIFT."""
-
+GAIN, DRIFT = 0.4945, 1.1305
+"""Terms of the sum: GAIN z^2 - DRIFT, a multiple of the log-likelihood ratio of a variance 7.1 times as large."""
 
 NEAR = 0.01
 """Distance from the ceiling at which rounding may decide, relative to the ceiling and 1."""
@@ -30,12 +27,12 @@ class Meaning(Enum):
 
 
 class ReferenceTrigger:
-    """Trigger of one estimator, with the noise variance by which it scales innovations."""
+    """Trigger of one estimator, with the scale of its innovations."""
 
     def __init__(self, config: EstimatorConfig) -> None:
         self._config = config
         self._ceiling = config.statistic_ceiling or 0.0
-        self.noise_variance = config.noise_variance
+        self.scale = ReferenceScale(config)
         self.rivals = [0.0, 0.0]
         """Statistics under the readings that recent edges came one sample early, and late."""
         self.is_doubtful = False
@@ -44,13 +41,18 @@ class ReferenceTrigger:
 
     def restart(self, quiet_n: int) -> None:
         """Begin anew; the statistic is zero for ``quiet_n`` innovations."""
-        self.statistic, self._quiet_n = 0.0, quiet_n
+        self.statistic, self.quiet_n = 0.0, quiet_n
         self._mean, self._mean_n = 0.0, 0
 
     @property
-    def doubts_edges(self) -> bool:
-        """True if the trigger considers other readings of an edge."""
-        return self._config.edge_instants == "may-slip" and self._config.trigger == "cusum"
+    def noise_variance(self) -> float:
+        """Noise variance, configured or followed."""
+        return self.scale.noise_variance
+
+    @property
+    def excess(self) -> float:
+        """Statistic over half the ceiling; 0 without a ceiling."""
+        return 2.0 * self.statistic / self._ceiling if self._ceiling else 0.0
 
     @property
     def has_rival(self) -> bool:
@@ -79,12 +81,6 @@ class ReferenceTrigger:
         """Continue with the better of the other readings, after a slip."""
         self.statistic = min(self.rivals)
 
-    def follow_noise(self, innovation: float, variance: float) -> None:
-        """Follow the noise variance. ``variance``: of the innovation, in noise variances."""
-        if self._config.noise_estimated:
-            square = min(innovation**2 / variance, NOISE_CLIP * self.noise_variance)
-            self.noise_variance += NOISE_RATE * (square / NOISE_KEPT - self.noise_variance)
-
     def enter(
         self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
     ) -> Meaning:
@@ -93,14 +89,14 @@ class ReferenceTrigger:
         :param readings: innovations under the other readings of the edges in doubt; None without doubt.
         :param expires: the doubt ends with this sample.
         """
-        if self._quiet_n:
-            self._quiet_n -= 1
+        if self.quiet_n:
+            self.quiet_n -= 1
             return Meaning.QUIET
         trigger = self._config.trigger
         if trigger == "none":
             return Meaning.QUIET
         if trigger == "cusum":
-            decision = self._enter_cusum(innovation, variance * self.noise_variance, readings, expires=expires)
+            decision = self._enter_cusum(innovation, variance * self.scale.expected, readings, expires=expires)
             self._note_doubt()
             return decision
         self.statistic = abs(innovation)
@@ -128,5 +124,5 @@ class ReferenceTrigger:
 
 
 def _cusum(before: float, innovation: float, variance: float) -> float:
-    """Cumulative sum of the log-likelihood ratio of a fourfold variance, at least zero."""
+    """Cumulative sum of the terms, at least zero."""
     return max(0.0, before + GAIN * innovation * innovation / variance - DRIFT)

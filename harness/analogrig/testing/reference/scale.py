@@ -1,0 +1,128 @@
+"""Scale of the innovations of the reference estimator: their variance as the trigger expects it, and its inflation."""
+
+from __future__ import annotations
+
+from analogrig.estimator_config import EstimatorConfig
+from analogrig.testing.reference.regression import Vector
+
+BLOCK_N = 32
+"""Equations between two updates."""
+
+SHARE_MIN, SHARE_WARM, WARM_N = 0.032, 0.25, 64
+"""Smallest shares of a block in the noise variance, armed and before; equations before which it is armed."""
+
+MARGIN, GROWTH_MAX = 2.0, 9.0
+INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 4.0, 0.9998933, 1e6
+TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
+JUSTIFIED, CREDIT_MAX, CREDIT_PER_BLOCK = 4.0, 4.0, BLOCK_N / 5000.0
+LEAST = 1e-9
+"""Smallest noise variance."""
+
+NEAR = 0.01
+"""Relative distance from a threshold at which rounding may decide."""
+
+
+class ReferenceScale:
+    """Variance expected of the innovations: the followed noise variance times an inflation."""
+
+    def __init__(self, config: EstimatorConfig) -> None:
+        self.noise_variance = config.noise_variance
+        self.inflation, self._credit = 1.0, CREDIT_MAX
+        self._share = 1.0 if config.noise_estimated else 0.0
+        """Share of the next block in the noise variance; 0: it is not followed."""
+        self._trial_n, self._balance, self._energy = 0, 0.0, 0.0
+        self._old: Vector = []
+        self.is_doubtful = False
+        """True if rounding may have decided whether a block counts, or whether an alarm was justified."""
+        self._restart()
+        self._apply()
+
+    @property
+    def is_on_trial(self) -> bool:
+        """True while the last alarm is on trial."""
+        return self._trial_n > 0
+
+    @property
+    def old(self) -> Vector:
+        """Estimate before the alarm on trial."""
+        return self._old
+
+    def _apply(self) -> None:
+        self.expected = self.noise_variance * self.inflation * (1.0 + MARGIN * self._share)
+        """Variance that the trigger expects."""
+
+    def _restart(self) -> None:
+        self._squares, self._left_n, self._is_followed = 0.0, BLOCK_N, False
+
+    def begin_trial(self, old: Vector) -> None:
+        """Compare the estimate ``old`` with those that follow. An earlier trial ends."""
+        self.end_trial()
+        self._trial_n, self._left_n, self._balance, self._energy = 1, 0, 0.0, 0.0
+        self._old = list(old)
+
+    def end_trial(self) -> None:
+        """Judge the alarm on trial, if one is."""
+        if not self._trial_n:
+            return
+        self.is_doubtful |= abs(self._balance) < NEAR * self._energy
+        if self._trial_n > TRIAL_LEAST_N and self._balance > 0.0 and self._credit >= 1.0:
+            self._credit -= 1.0
+        elif self.inflation < INFLATION_MAX:
+            self.inflation *= INFLATION_STEP
+        self._trial_n = 0
+        self._restart()
+        self._apply()
+
+    def forgive(self) -> None:
+        """Begin anew with another model of the edges."""
+        self.inflation = 1.0
+        self._share = SHARE_WARM if self._share else 0.0
+        self._restart()
+        self._apply()
+
+    def enter(self, square: float, old_square: float, since_n: int, *, waits: bool, warm: bool, excess: float) -> None:
+        """Enter one equation.
+
+        :param square: of its innovation, over the predicted variance in noise variances.
+        :param old_square: of its innovation with the estimate on trial.
+        :param since_n: samples since an edge.
+        :param waits: the step has other work.
+        :param warm: the trigger will not be armed soon.
+        :param excess: statistic over half the ceiling.
+        """
+        if self._left_n:
+            self._left_n -= 1
+            self._squares += square
+        elif self._trial_n:
+            self._try(square, old_square, since_n)
+        elif not waits and self._is_followed:
+            self._relax()
+        elif not waits:
+            self._follow(warm=warm, excess=excess)
+
+    def _try(self, square: float, old_square: float, since_n: int) -> None:
+        self._trial_n += 1
+        if self._trial_n > TRIAL_BEGIN_N:
+            self._balance += old_square - JUSTIFIED * square
+            self._energy += old_square + JUSTIFIED * square
+        if self._trial_n >= TRIAL_MAX_N or (self._trial_n >= TRIAL_N and since_n < self._trial_n):
+            self.end_trial()
+
+    def _follow(self, *, warm: bool, excess: float) -> None:
+        """Let the noise variance follow the complete block, unless its sum is half way to an alarm."""
+        self._is_followed = True
+        if not self._share:
+            return
+        self.is_doubtful |= abs(excess - 1.0) < NEAR
+        if excess < 1.0:
+            mean = min(self._squares / BLOCK_N, GROWTH_MAX * self.noise_variance)
+            self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), LEAST)
+            least = SHARE_WARM if warm or self._share > SHARE_WARM else SHARE_MIN
+            self._share = max(self._share / (1.0 + self._share), least)
+
+    def _relax(self) -> None:
+        """Let the inflation decrease, and the number of alarms that may be justified increase."""
+        self.inflation = max(self.inflation * INFLATION_DECAY, 1.0)
+        self._credit = min(self._credit + CREDIT_PER_BLOCK, CREDIT_MAX)
+        self._restart()
+        self._apply()
