@@ -768,14 +768,14 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
     const float weight = precision * weight_of(self);
     const float term   = est_trigger_term(equation.innovation, weight);
-    if (!held) {
-        est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, self->noise_variance, precision, term);
-    }
+    const float share  = held ? 0.0F : 1.0F;  // a theta that overflows raises an alarm all the same
+    est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, self->noise_variance / precision,
+                      share * term, held);
     step->innovation      = equation.innovation;
     step->statistic       = self->trigger.statistic;
     est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        finding = judge_readings(self, shape, &equation, held ? 0.0F : weight);
+        finding = judge_readings(self, shape, &equation, share * weight);
     }
     if (finding == EST_ALARM) {
         raise_alarm(self, step);

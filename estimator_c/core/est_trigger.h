@@ -164,16 +164,16 @@ EST_INLINE bool est_trigger_holds(est_trigger_t* const self, const est_trigger_k
     return kind == EST_TRIGGER_NONE;
 }
 
-/// Enter one innovation [codes] as recorded, with its term in the cumulative sum. Its variance is noise_variance over
-/// precision.
+/// Enter one innovation [codes] as recorded, with its variance [codes^2] and its term in the cumulative sum. The term is
+/// zero while the statistic is held.
 EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
                                   const est_trigger_config_t* const config,
                                   const float                       innovation,
-                                  const float                       noise_variance,
-                                  const float                       precision,
-                                  const float                       term) {
-    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM)) {
-        self->statistic = est_trigger_other_statistic(self, config, innovation, noise_variance / precision);
+                                  const float                       variance,
+                                  const float                       term,
+                                  const bool                        held) {
+    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && !held) {
+        self->statistic = est_trigger_other_statistic(self, config, innovation, variance);
     } else {
         self->statistic = est_trigger_sum(self->statistic, term);
     }

@@ -23,6 +23,7 @@ from analogrig.run import Channel, Run
 from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import Excitation
 from analogrig_thesis.models import (
+    DEFAULT,
     ERROR,
     ERROR_CEILING,
     FRONT,
@@ -190,9 +191,9 @@ def play_circuit() -> CircuitRuns:
 
 
 def circuit_schemes(m_per_unit: float) -> dict[str, EstimatorConfig]:
-    """Settings by key: the thesis's five with its ceilings in codes, and ours as shipped."""
+    """Settings by key: the thesis's five with its ceilings in codes, and ours."""
     error, mean = (ceiling / UNITS_PER_M / m_per_unit for ceiling in (ERROR_CEILING, MEAN_CEILING))
-    return {**schemes(LIVE, error, mean), OURS: EstimatorConfig()}
+    return {**schemes(LIVE, error, mean), OURS: DEFAULT}
 
 
 def _shipped_rig(name: str) -> Rig:

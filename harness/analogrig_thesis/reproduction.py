@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
 from analogrig.storage import replace_file
 from analogrig_thesis import chapter3, chapter4, chapter5
@@ -28,7 +27,7 @@ from analogrig_thesis.chapter5 import (
     play_alone,
     play_circuit,
 )
-from analogrig_thesis.models import OURS, PROFILE, SignalPair, TrackQuality, assess
+from analogrig_thesis.models import DEFAULT, OURS, PROFILE, SignalPair, TrackQuality, assess
 from analogrig_thesis.rendering import render
 from analogrig_thesis.texts import Chapter, Signal, Table
 
@@ -113,7 +112,7 @@ def compare(simulation: Simulation, circuit: CircuitRuns) -> Table:
     tests/thesis/cost.py.
     """
     noisy = circuit.noisy
-    ours = SignalPair(simulation.u, simulation.y * CODES_PER_M, 1.0 / CODES_PER_M).track(EstimatorConfig())
+    ours = SignalPair(simulation.u, simulation.y * CODES_PER_M, 1.0 / CODES_PER_M).track(DEFAULT)
     filtered = {key: assess(each, noisy.segments) for key, each in filtered_schemes(noisy.run).items()}
     del filtered["mean-of-magnitudes"]
     played: dict[str, list[TrackQuality]] = {}

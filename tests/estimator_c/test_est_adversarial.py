@@ -113,15 +113,15 @@ VAGUE = {"p0": 1e3, "forgetting": 0.5, "ceiling": 1e6, "warm_up_n": 150, "edge_i
         {"kind": 0, "warm_up_n": 0},
         {"warm_up_n": 2000},
         {"warm_up_n": 2000, "edge_instants": 1},
-        {"nc": 2, "nb": 2, "offset": 0},
+        {"nc": 2, "nb": 2},
     ],
     ids=["sum", "none", "held", "in doubt", "residuals"],
 )
 def test_theta_that_overflows_begins_anew(estimator: Estimator, settings: dict[str, float]) -> None:
     anew = 0
     for seed in range(60):
-        assert estimator.init(**VAGUE | settings)
-        result = estimator.run(*barely_excited(seed, 2000, rest=1e-3, busy=0.02))
+        assert estimator.init(**VAGUE | {"p0": 1e6, "offset": 0} | settings)
+        result = estimator.run(*barely_excited(seed, 2000, rest=1e-4, busy=0.2))
         assert np.isfinite(result.theta).all()
         overflowed = result.alarms[~(result.statistic[result.alarms] < np.finfo(np.float32).max)]
         assert (result.theta[overflowed] == 0.0).all()
