@@ -665,7 +665,9 @@ static void renew_scale(est_t* const self) {
     if (!scale->followed) {
         const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
         if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
-            self->noise_variance = est_scale_follow(scale, self->noise_variance, warm ? EST_SHARE_MIN : EST_SHARE_WARM);
+            self->noise_variance =
+                est_scale_follow(scale, self->noise_variance, EST_NOISE_LEAST * self->config->noise_variance,
+                                 warm ? EST_SHARE_MIN : EST_SHARE_WARM);
         }
         scale->followed = true;
     } else {
@@ -937,5 +939,5 @@ bool est_invariants_hold(const est_t* const self) {
         }
     }
     return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) &&
-           within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);
+           within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, FLT_MIN, FLT_MAX);
 }

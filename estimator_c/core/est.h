@@ -228,9 +228,10 @@ typedef struct {
     float random_walk;
     float p0;         ///< initial variance of each a, b and c; 1e-9 .. 1e9, usually 1 .. 100 [1 / codes^2]
     float p0_offset;  ///< initial variance of d; 1e-9 .. 1e9, usually 1e6 [noise variances]
-    /// Variance of e; 1e-9 .. 1e9 [codes^2], usually 0.1 .. 100; only the first value if the noise is estimated. Else
-    /// it is to be measured at rest: too small a value causes false alarms, too large a value hides changes. The
-    /// standard deviation is at most 1/32 of code_high - code_low.
+    /// Variance of e; 1e-9 .. 1e9 [codes^2], usually 0.1 .. 100. If the noise is estimated, the first value, and 14 times
+    /// the smallest one that is followed: usually 1.2, for noise from 0.3 codes on. Else it is to be measured at rest: too
+    /// small a value causes false alarms, too large a value hides changes. The standard deviation is at most 1/32 of
+    /// code_high - code_low.
     float noise_variance;
     float c[EST_NA_MAX];  ///< prefilter C = 1 + c[0] z^-1 + ...; zeros inside the unit circle; 0: none
     /// Smallest step of u that is an edge; > 0, at most code_high - code_low [codes]. Usually a tenth to a half of the

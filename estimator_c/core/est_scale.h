@@ -21,6 +21,10 @@
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
 #define EST_MARGIN 2.0F
 
+/// Smallest noise variance that is followed, in configured ones: quantisation alone, with the default. The innovations of
+/// a plant without noise come in bursts.
+#define EST_NOISE_LEAST 0.07F
+
 /// Largest mean square of a block that counts, in noise variances. Before the trigger is armed, an outlier might pass
 /// all bounds; later it raises an alarm.
 #define EST_GROWTH_MAX 9.0F
@@ -86,15 +90,18 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
     return true;
 }
 
-/// Noise variance after a complete block. `least`: smallest share of the next block.
-static inline float est_scale_follow(est_scale_t* const self, const float noise_variance, const float least) {
+/// Noise variance after a complete block, at least `least`. `share_least`: smallest share of the next block.
+static inline float est_scale_follow(est_scale_t* const self,
+                                     const float        noise_variance,
+                                     const float        least,
+                                     const float        share_least) {
     const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
     const float most    = EST_GROWTH_MAX * noise_variance;
     const float limited = (mean < most) ? mean : most;
     const float noise   = noise_variance + (self->share * (limited - noise_variance));
     const float share   = self->share / (1.0F + self->share);
-    self->share         = (share > least) ? share : least;
-    return (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
+    self->share         = (share > share_least) ? share : share_least;
+    return (noise > least) ? noise : least;
 }
 
 /// Let the inflation decrease, and the number of alarms that may be justified increase, by one block.

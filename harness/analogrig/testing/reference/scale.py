@@ -15,8 +15,8 @@ MARGIN, GROWTH_MAX = 2.0, 9.0
 INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 4.0, 0.9998933, 1e6
 TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
 JUSTIFIED, CREDIT_MAX, CREDIT_PER_BLOCK = 4.0, 4.0, BLOCK_N / 5000.0
-LEAST = 1e-9
-"""Smallest noise variance."""
+NOISE_LEAST = 0.07
+"""Smallest noise variance that is followed, in configured ones."""
 
 NEAR = 0.01
 """Relative distance from a threshold at which rounding may decide."""
@@ -32,6 +32,7 @@ class ReferenceScale:
         """Share of the next block in the noise variance; 0: it is not followed."""
         self._trial_n, self._balance, self._energy = 0, 0.0, 0.0
         self._old: Vector = []
+        self._least = NOISE_LEAST * config.noise_variance
         self.is_doubtful = False
         """True if rounding may have decided whether a block counts, or whether an alarm was justified."""
         self._restart()
@@ -116,7 +117,7 @@ class ReferenceScale:
         self.is_doubtful |= abs(excess - 1.0) < NEAR
         if excess < 1.0:
             mean = min(self._squares / BLOCK_N, GROWTH_MAX * self.noise_variance)
-            self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), LEAST)
+            self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), self._least)
             least = SHARE_WARM if warm or self._share > SHARE_WARM else SHARE_MIN
             self._share = max(self._share / (1.0 + self._share), least)
 
