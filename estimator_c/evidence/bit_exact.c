@@ -214,6 +214,7 @@ static bool run_isolation(record_t* const self, uint32_t number) {
     plant_t                 plant     = plant_at_rest(PLANT_FRONT, number, 5U * PLANT_TICKS_PER_SAMPLE);
     const uint32_t          change    = digit(&number, 4U);
     config.edge_instants              = (est_edge_instants_t)digit(&number, 2U);
+    config.trigger.warm_up_n          = 150U;
     if (config.edge_instants == EST_EDGES_LOCKED) {
         config.nb     = 2U;
         config.nk     = 1U;

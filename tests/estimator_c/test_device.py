@@ -113,6 +113,10 @@ class Device:
         return {Counter(answer.counter): answer.value for answer in of(Status, answers)}
 
 
+WARM_UP_N = 550.0
+"""By default."""
+
+
 def of(kind: type[M], messages: Iterable[Message]) -> list[M]:
     return [message for message in messages if isinstance(message, kind)]
 
@@ -186,10 +190,10 @@ def test_answers_are_numbered_one_by_one(device: Device) -> None:
 
 
 def test_estimates_are_those_of_the_core(device: Device, estimator: Estimator) -> None:
-    u, y = codes(600, change_at=400)
-    valid = [index % 97 != 50 for index in range(600)]
-    answers = [device.sample(k, u[k], y[k], missing=not valid[k]) for k in range(600)]
-    assert estimator.init()
+    u, y = codes(800, change_at=650)
+    valid = [index % 97 != 50 for index in range(800)]
+    answers = [device.sample(k, u[k], y[k], missing=not valid[k]) for k in range(800)]
+    assert estimator.init(warm_up_n=WARM_UP_N)
     core = estimator.run(u, y, valid)
     assert len(core.alarms) > 0
     everything = [message for answer in answers for message in answer]
@@ -203,8 +207,8 @@ def test_estimates_are_those_of_the_core(device: Device, estimator: Estimator) -
 
 
 def test_alarm_comes_before_the_rest_of_its_sample(device: Device) -> None:
-    u, y = codes(500, change_at=400)
-    answers = [device.sample(k, u[k], y[k]) for k in range(500)]
+    u, y = codes(700, change_at=650)
+    answers = [device.sample(k, u[k], y[k]) for k in range(700)]
     with_alarm = [answer for answer in answers if of(Alarm, answer)]
     assert with_alarm
     for answer in with_alarm:
@@ -463,7 +467,7 @@ def test_skipped_samples_are_missing_to_the_estimator(device: Device, estimator:
     u, y = codes(300)
     sent = [k for k in range(300) if k % 50 not in (20, 21, 22)]
     answers = [m for k in sent for m in device.sample(k, u[k], y[k])]
-    assert estimator.init()
+    assert estimator.init(warm_up_n=WARM_UP_N)
     core = estimator.run(u, y, [k in set(sent) for k in range(300)])
     assert np.array_equal(theta_of(answers), core.theta[sent])
     counters = device.counters()
@@ -525,7 +529,7 @@ VALUES = {
     Key.P0_OFFSET: 64.0,
     Key.NOISE_VARIANCE: 2.5,
     Key.NC: 1.0,
-    Key.NOISE_ESTIMATED: 1.0,
+    Key.NOISE_ESTIMATED: 0.0,
     Key.REFRESH_N: 128.0,
     Key.STUCK_N: 200.0,
     Key.IDLE_N: 77.0,
@@ -579,7 +583,7 @@ def test_configuration_is_what_the_run_uses(idle: Device, estimator: Estimator) 
         assert idle.configure(Key[name.upper()], value).result == Result.APPLIED
     idle.control(Command.START)
     answers = [m for k in range(300) for m in idle.sample(k, u[k], y[k])]
-    assert estimator.init(**settings)
+    assert estimator.init(**settings, warm_up_n=WARM_UP_N)
     values = [m.value for m in of(Estimate, answers) if m.element != Element.INNOVATION]
     assert np.array_equal(np.array(values, np.float32).reshape(300, 5), estimator.run(u, y).theta)
 

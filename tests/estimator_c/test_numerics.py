@@ -38,7 +38,7 @@ def test_millions_of_samples_without_excitation_do_no_harm(
 ) -> None:
     """The driver asks est_invariants_hold() after every sample: theta finite, every d positive and finite."""
     rng = np.random.default_rng(1)
-    assert estimator.init(forgetting=0.97)
+    assert estimator.init(forgetting=0.97, noise_estimated=0, ceiling=20.0)
     estimator.run(*excited(6, 400, seed=4))
     for _ in range(quiet_n // BLOCK_N):
         y = REST_CODES + np.round(rng.normal(0.0, 1.0, BLOCK_N) * noise_lsb)

@@ -1,7 +1,7 @@
-"""Thesis profile over 100 seeds: no missed change, at most one false alarm, latencies near the information bound.
+"""Thesis profile over 100 seeds: no missed change, at most two false alarms, latencies near the information bound.
 
-The seeds are fixed, so the code alone decides these tests. 600 other seeds gave 1 false alarm in 1,080,000 samples
-(ARL0 = 1e5 promises at most 10.8), no missed change, and no ratio above 1.3.
+The seeds are fixed, so the code alone decides these tests. 600 seeds, these among them, gave 4 false alarms in 750,000
+samples after the warm-up (ARL0 = 1e5 promises at most 7.5), no missed change, and no ratio above 1.3.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ def on_wide_range(request: pytest.FixtureRequest) -> Detection:
 
 
 @pytest.mark.xdist_group("detection")
-def test_no_change_is_missed_and_at_most_one_alarm_is_false(on_wide_range: Detection) -> None:
+def test_no_change_is_missed_and_at_most_two_alarms_are_false(on_wide_range: Detection) -> None:
     assert on_wide_range.inconclusive == 0
     assert on_wide_range.missed == 0
-    assert on_wide_range.false_alarms <= 1
+    assert on_wide_range.false_alarms <= 2
 
 
 @pytest.mark.xdist_group("detection")
