@@ -138,7 +138,7 @@ static void follow_slip(est_t* const self, const bool late) {
     const uint_fast8_t last = (uint_fast8_t)(self->config->nb - 1U);
     float* const       b    = &self->theta[self->config->na];
     (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
-    est_delta_to_plain(&b[1], b[0], last);
+    (void)est_delta_to_plain(&b[1], b[0], last, &b[1]);
     if (late) {
         for (uint_fast8_t j = last; j > 0U; j--) {
             b[j] = b[j - 1U];
@@ -160,8 +160,8 @@ EST_SHARED void copy_theta(const est_t* const self, const est_shape_t shape, flo
         b[shape.nb + shape.nc] += (theta[shape.na - 1U] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
     }
     if (est_delta_applies(self->config)) {
-        est_delta_to_plain(theta, 1.0F, shape.na);
-        est_delta_to_plain(&b[1], b[0], (uint_fast8_t)(shape.nb - 1U));
+        (void)est_delta_to_plain(theta, 1.0F, shape.na, theta);
+        (void)est_delta_to_plain(&b[1], b[0], (uint_fast8_t)(shape.nb - 1U), &b[1]);
     }
 #else
     (void)append(theta, self->theta, est_shape_count(shape));
@@ -172,11 +172,9 @@ EST_SHARED void copy_theta(const est_t* const self, const est_shape_t shape, flo
 /// (thesis section 3.5).
 EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const c) {
     float factor = 1.0F;
-    float a[EST_NA_MAX];
-    (void)append(a, self->theta, na);
-    if (est_delta_applies(self->config)) {
-        est_delta_to_plain(a, 1.0F, na);
-    }
+    float              plain[EST_NA_MAX];
+    const float* const a =
+        est_delta_applies(self->config) ? est_delta_to_plain(self->theta, 1.0F, na, plain) : self->theta;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         factor *= CONTRACTION;
@@ -872,9 +870,13 @@ uint8_t est_theta_count(const est_t* const self) {
 
 float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
+#if EST_WITH_ROBUSTNESS
     float theta[EST_THETA_MAX];
     copy_theta(self, est_shape_of(self->config), theta);
     return theta[index];
+#else
+    return self->theta[index];
+#endif
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {

@@ -47,17 +47,27 @@ EST_ROBUST_SHARED void est_delta_difference(float* const x, const uint_fast8_t o
     }
 }
 
-/// Replace the coefficients of these differences by those of the values: the transpose of the above. `x` holds all but
-/// the first, which is the same in both forms: `lead`.
-EST_ROBUST_SHARED void est_delta_to_plain(float* const x, const float lead, const uint_fast8_t order) {
+/// Coefficients of the values from those of these differences: the transpose of the above. `x` holds all but the first,
+/// which is the same in both forms: `lead`. The result is `out`, which may be `x`; without conversions it is `x`.
+EST_ROBUST_SHARED const float*
+est_delta_to_plain(const float* const x, const float lead, const uint_fast8_t order, float* const out) {
+#if EST_WITH_ROBUSTNESS
+    (void)append(out, x, order);
     EST_UNROLL
-    for (uint_fast8_t n = EST_WITH_ROBUSTNESS ? 1U : (uint_fast8_t)(order + 1U); n <= order; n++) {
+    for (uint_fast8_t n = 1U; n <= order; n++) {
         EST_UNROLL
         for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
-            x[i] -= x[i - 1U];
+            out[i] -= out[i - 1U];
         }
-        x[0] -= lead;
+        out[0] -= lead;
     }
+    return out;
+#else
+    (void)lead;
+    (void)order;
+    (void)out;
+    return x;
+#endif
 }
 
 /// The inverse of est_delta_to_plain().

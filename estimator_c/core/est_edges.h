@@ -83,15 +83,16 @@ EST_ROBUST_SHARED void est_edges_shares(est_edges_t* const          self,
     float early_raw = 0.0F;
     float late_raw  = 0.0F;
     if (edge_age_n < ((uint32_t)shape.nb + shape.nk)) {
-        float b[EST_NB_MAX] = { 0.0F };  // MISRA D2
-        (void)append(b, &self->theta[shape.na], shape.nb);
-        est_delta_to_plain(&b[1], b[0], (uint_fast8_t)(shape.nb - 1U));
+        const float* const delta = &self->theta[shape.na];
+        float              rest[EST_NB_MAX];
+        const float* const others = est_delta_to_plain(&delta[1], delta[0], (uint_fast8_t)(shape.nb - 1U), rest);
         EST_UNROLL
         for (uint_fast8_t j = 0U; j < shape.nb; j++) {
             const uint_fast8_t lag = (uint_fast8_t)(shape.nk + j);
-            late_raw -= b[j] * ((lag < doubt_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
+            const float        b   = (j == 0U) ? delta[0] : others[j - 1U];
+            late_raw -= b * ((lag < doubt_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
             if (lag > 0U) {
-                early_raw += b[j] * ((lag <= doubt_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
+                early_raw += b * ((lag <= doubt_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
             }
         }
     }
