@@ -424,6 +424,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     increment_long(&self->counters.updated);
     if (self->pending_n > 0U) {
         gather(self);
+        shift_y(self, relative_y(self, sample.y));
         return EST_GATHERING;  // MISRA D4
     }
     return EST_UPDATED;
@@ -725,9 +726,9 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     }
 }
 
-/// Predict a missing y: replace the `y` of an equation by the one whose innovation is zero. With C close to A the next
+/// Predict a missing y: replace the one of an equation by that whose innovation is zero. With C close to A the next
 /// equations then lose nothing but the information of the missing sample.
-EST_SHARED void bridge(est_t* const self, const est_shape_t shape, const float y, const float innovation) {
+EST_SHARED void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
     est_past_t* const past = &self->whitener.past[est_shape_count(shape)];
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         float early;
@@ -738,7 +739,7 @@ EST_SHARED void bridge(est_t* const self, const est_shape_t shape, const float y
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         past->x[i] -= innovation;  // the differences contain y(k) with the factor 1
     }
-    shift_y(self, y - innovation);
+    self->y[0] -= innovation;
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
@@ -756,9 +757,10 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         limit_factors(self, shape);
     }
     est_equation_fill(self, shape, y, equation.phi);
+    shift_y(self, y);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
     if (EST_WITH_ROBUSTNESS && (step->status != EST_UPDATED)) {
-        bridge(self, shape, y, equation.innovation);
+        bridge(self, shape, equation.innovation);
         return;  // MISRA D4
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
@@ -850,14 +852,9 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
     est_step_t step   = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
     step.statistic    = self->trigger.statistic;
-    const bool  good  = (step.status == EST_UPDATED) || (step.status == EST_GATHERING);
-    const float y     = good ? relative_y(self, sample.y) : self->y[0];
-    const bool  known = good ? (step.status == EST_UPDATED) : enter_gap(self, step.status);
-    if (known) {
-        dispatch_equation(self, y, &step);
-    }
-    if (good) {
-        shift_y(self, y);
+    const bool updated = step.status == EST_UPDATED;
+    if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status))) {
+        dispatch_equation(self, updated ? relative_y(self, sample.y) : self->y[0], &step);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);
     return step;
