@@ -42,7 +42,8 @@
 #define BRIDGE_PRECISION 0.6F
 
 EST_SHARED void increment(uint16_t* const counter) {
-    *counter = (uint16_t)(*counter + ((*counter < UINT16_MAX) ? 1U : 0U));
+    const uint32_t next = *counter + (uint32_t)1U;
+    *counter            = (uint16_t)(next - (next >> 16U));
 }
 
 EST_SHARED void increment_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
@@ -363,7 +364,7 @@ EST_INLINE bool is_on_trial(const est_t* const self) {
 /// True iff the previous sample was predicted.
 static bool on_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return (self->bridged_n > 0U) && (self->bridge_at == (uint16_t)self->counters.updated);
+    return self->bridged_n > 0U;
 #else
     (void)self;
     return false;
@@ -396,7 +397,7 @@ static void enter_edge(est_t* const self) {
 static bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
     return self->known && (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) && (self->same_n == 0U) &&
-           (!on_bridge(self) || (self->bridged_n < BRIDGED_MAX)) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
+           (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
            (est_shape_of(self->config).nc == 0U);
 #else
     (void)self;
@@ -421,6 +422,9 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     if (edge) {
         enter_edge(self);
     }
+#if EST_WITH_ROBUSTNESS
+    self->bridged_n = 0U;
+#endif
     increment_long(&self->counters.updated);
     if (self->pending_n > 0U) {
         gather(self);
@@ -625,8 +629,7 @@ static bool enter_gap(est_t* const self, const est_status_t status) {
     }
 #if EST_WITH_ROBUSTNESS
     if (bridged && self->known) {
-        self->bridged_n = (uint8_t)(on_bridge(self) ? (self->bridged_n + 1U) : 1U);
-        self->bridge_at = (uint16_t)self->counters.updated;
+        self->bridged_n++;
         shift_u(self, self->u[0]);
         increment(&self->edge_age_n);
         return true;  // MISRA D4

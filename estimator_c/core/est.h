@@ -437,8 +437,7 @@ typedef struct {
     float               noise_variance;  ///< [codes^2]
 #if EST_WITH_ROBUSTNESS
     bool        edges_vary;   ///< edges come anywhere, against the configuration
-    uint8_t     bridged_n;    ///< predicted samples of the last bridge
-    uint16_t    bridge_at;    ///< low bits of the number of good samples before it
+    uint8_t     bridged_n;    ///< samples before the next one that were predicted
     float       reference_u;  ///< codes of the first sample, subtracted from all if the offset is estimated
     float       reference_y;
     est_scale_t scale;
