@@ -28,7 +28,7 @@ from analogrig.reporting.summary import summary
 from analogrig.run import UNARMED
 
 THESIS = Scenario.load("thesis")
-STATED = Datasheet(warm_up_n=150, arl0=1e5, edge_codes=64.0, idle_n=1000)
+STATED = Datasheet(warm_up_n=550, arl0=1e5, edge_codes=64.0, idle_n=1000)
 
 
 @dataclass(frozen=True, kw_only=True)

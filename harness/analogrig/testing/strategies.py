@@ -38,10 +38,10 @@ WIDE_RANGES_V = {
 }
 """Ranges of the card of the rig ``emulator``: they hold every signal."""
 
-WARM_UP_N, SETTLING_N = 400, 300
+WARM_UP_N, SETTLING_N = 700, 300
 """Samples before the first change, and between two: enough edges for the device to have learned the plant."""
 
-QUIET_N = 1000
+QUIET_N = 1300
 """Samples of a scenario in which nothing changes."""
 
 MOST_DISPLACEMENT_V = 8.0

@@ -24,7 +24,7 @@ from analogrig.testing.statement import Play, with_some_seed
 from analogrig.testing.strategies import link_faults, profile, seeds
 from analogrig_emulator import Excitation
 
-SHORT = Scenario(samples=300, excitation=Excitation(low_v=0.1, high_v=9.9), name="short")
+SHORT = Scenario(samples=700, excitation=Excitation(low_v=0.1, high_v=9.9), name="short")
 FAULTS_EACH, LEAST_VALID_KINDS = 4, 4
 CERTIFIED = Design(rate=1e-5, confidence=0.999, allowed=10)
 CERTIFIED_RUN_N = 100_000
