@@ -528,9 +528,9 @@ static bool remembers_edge(const est_t* const self) {
 
 /// Decide whether C follows A. If C moves far, or the gains have not settled, the whitening begins anew: C is then
 /// taken at the next sample, which has no equation.
-EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
+static void compare_prefilter(est_t* const self) {
     float c[EST_NA_MAX];
-    contract_a(self, shape.na, c);
+    contract_a(self, est_shape_of(self->config).na, c);
     const float moved = distance(&self->whitener, c);
     if (moved < REFRESH_STEP) {
         self->renewal    = EST_RENEWAL_NONE;
@@ -545,11 +545,11 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
 
 /// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while edges
 /// are in doubt, because theta may have followed an edge that was misread.
-EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
+static void consider_refresh(est_t* const self) {
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
-        compare_prefilter(self, shape);
+        compare_prefilter(self);
     } else if (self->renewal == EST_RENEWAL_PREFILTER) {
         self->renewal = EST_RENEWAL_NONE;
         refresh_prefilter(self);
@@ -731,8 +731,9 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
 
 /// Predict a missing y: replace the one of an equation by that whose innovation is zero. With C close to A the next
 /// equations then lose nothing but the information of the missing sample.
-EST_SHARED void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
-    est_past_t* const past = &self->whitener.past[est_shape_count(shape)];
+static void bridge(est_t* const self, const float innovation) {
+    const est_shape_t shape = est_shape_of(self->config);
+    est_past_t* const past  = &self->whitener.past[est_shape_count(shape)];
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         float early;
         float late;
@@ -763,7 +764,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     shift_y(self, y);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
     if (EST_WITH_ROBUSTNESS && (step->status != EST_UPDATED)) {
-        bridge(self, shape, equation.innovation);
+        bridge(self, equation.innovation);
         return;  // MISRA D4
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
@@ -794,7 +795,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
         self->refresh_in--;
     } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
-        consider_refresh(self, shape);
+        consider_refresh(self);
     } else {
         // C is constant
     }

@@ -101,7 +101,7 @@ def test_what_is_not_reported_is_not_judged_and_named(run: Run) -> None:
 
 
 def test_stated_figures_stand_for_the_settings_of_our_estimator(run: Run, ours: Run) -> None:
-    assert abs(exposure(run).armed - exposure(ours).armed) <= 14  # equations that its regressors await
+    assert abs(exposure(run).armed - exposure(ours).armed) <= 16  # equations that its regressors await
     assert judge(run).arl0 == pytest.approx(1e5)
     assert judge(played(Datasheet(arl0=1e3))).arl0 == pytest.approx(1e3)
 
