@@ -380,17 +380,17 @@ def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None
 
 
 def test_samples_of_the_warm_up_do_not_end_a_cell(tmp_path: Path) -> None:
-    """At most 0.01 a sample at 90 % takes some 1800 without an alarm; of 160 samples at most 10 are armed."""
+    """At most 0.01 a sample at 90 % takes some 1800 without an alarm; of 560 samples at most 10 are armed."""
     stop = '[stop]\nquantity = "false_alarms"\nrate = 0.01\nconfidence = 0.9\n'
-    plan = planned(tmp_path, f"trials = 20\nchunk = 1\nsamples = 160\n{stop}")
+    plan = planned(tmp_path, f"trials = 20\nchunk = 1\nsamples = 560\n{stop}")
     summary = conduct(plan, ThisProcess(), tmp_path / "out.json").total()
-    assert (summary.trials, summary.samples) == (20, 3200)
+    assert (summary.trials, summary.samples) == (20, 11_200)
     assert summary.armed <= 200
 
 
 @pytest.mark.parametrize(
     ("spec", "why"),
-    [("samples = 140", "its warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "in 900 it was not excited")],
+    [("samples = 540", "its warm-up takes 550"), ("samples = 900\nscenario = '{still}'", "in 900 it was not excited")],
 )
 def test_trial_in_which_the_trigger_was_never_armed_is_inconclusive(tmp_path: Path, spec: str, why: str) -> None:
     still = tmp_path / "still.toml"
@@ -534,7 +534,7 @@ def test_device_that_does_not_answer_leaves_the_others_their_results(
 ) -> None:
     master, slave = os.openpty()
     (tmp_path / "mute.toml").write_text(f"kind = 'serial'\nurl = '{os.ttyname(slave)}'\ntimeout_s = 0.05\n")
-    spec = f"trials = 3\nsamples = 400\ndevices = ['{tmp_path / 'mute.toml'}', 'inproc']\n"
+    spec = f"trials = 3\nsamples = 700\ndevices = ['{tmp_path / 'mute.toml'}', 'inproc']\n"
     planned(tmp_path, spec, [os.ttyname(slave)])
     out = tmp_path / "out.json"
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--allow", os.ttyname(slave)]) == 3
@@ -545,7 +545,7 @@ def test_device_that_does_not_answer_leaves_the_others_their_results(
     assert "3 trials inconclusive, such as seed 0: device mute: no Hello" in said.out
     mute, others = Results.load(out).rows
     assert [(each["outcome"], each["samples"]) for each in mute] == [("inconclusive", 0)] * 3
-    assert [(each["outcome"], each["samples"]) for each in others] == [("passed", 400)] * 3
+    assert [(each["outcome"], each["samples"]) for each in others] == [("passed", 700)] * 3
 
 
 @pytest.mark.parametrize("failing", [{1, 2}, set(range(4))])
@@ -560,7 +560,7 @@ def test_trial_whose_device_fails_is_inconclusive_and_the_next_is_played(
         return real(bench, scenario, seed)
 
     monkeypatch.setattr(Bench, "play", play)
-    planned(tmp_path, "trials = 4\nsamples = 300\ndevices = ['host?exchange=block']\n")
+    planned(tmp_path, "trials = 4\nsamples = 700\ndevices = ['host?exchange=block']\n")
     out = tmp_path / "out.json"
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 3
     (rows,) = Results.load(out).rows

@@ -36,8 +36,8 @@ DBC = Path(__file__).parents[2] / "estimator_c" / "catalogue" / "analogrig.dbc"
 
 SCENARIO = dataclasses.replace(
     Scenario.load("thesis"),
-    samples=600,
-    tweaks=tuple(dataclasses.replace(tweak, sample=400) for tweak in Scenario.load("thesis").tweaks[:1]),
+    samples=800,
+    tweaks=tuple(dataclasses.replace(tweak, sample=650) for tweak in Scenario.load("thesis").tweaks[:1]),
 )
 SEED = 7
 
@@ -416,7 +416,7 @@ def test_capture_that_ended_early_is_inconclusive(tmp_path: Path, traffic: tuple
     frames = traffic[1]
     verdict = judge(captured(written(tmp_path / "can.log", frames[: nth(frames, "Stepped", 299) + 1])))
     assert verdict.outcome == "inconclusive"
-    assert "the run ended after 300 of 600 samples" in verdict.reasons
+    assert "the run ended after 300 of 800 samples" in verdict.reasons
 
 
 def test_capture_without_the_counters_of_the_device_is_inconclusive(
@@ -576,10 +576,10 @@ def test_unsuitable_dbc_is_refused_in_one_line(
 
 
 def test_scenario_with_fewer_samples_is_refused(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
-    shorter = dataclasses.replace(SCENARIO, samples=599)
-    with open_rig("emulator") as rig, pytest.raises(ConfigurationError, match="has 600 samples, scenario thesis 599"):
+    shorter = dataclasses.replace(SCENARIO, samples=799)
+    with open_rig("emulator") as rig, pytest.raises(ConfigurationError, match="has 800 samples, scenario thesis 799"):
         import_run(written(tmp_path / "can.log", traffic[1]), shorter, rig)
-    with pytest.raises(ConfigurationError, match="the recording has 600 samples"):
+    with pytest.raises(ConfigurationError, match="the recording has 800 samples"):
         replace_scenario(traffic[0], shorter)
 
 

@@ -37,10 +37,10 @@ def asked(dut: str = "inproc", **settings: Any) -> Question:
     return Question(rig_table("emulator"), describe(dut).as_table(), Scenario.load("healthy"), **settings)
 
 
-def noisy_device(tmp_path: Path, arl0: float) -> str:
-    """One whose trigger is far too sensitive: with a noise variance so small, everything is a surprise."""
+def noisy_device(tmp_path: Path) -> str:
+    """One whose trigger is far too sensitive: its ceiling is three standard deviations of the noise."""
     path = tmp_path / "noisy.toml"
-    path.write_text(f'kind = "inproc"\n[estimator]\nnoise_variance = 0.8\narl0 = {arl0}\n')
+    path.write_text('kind = "inproc"\n[estimator]\ntrigger = "prediction-error"\nceiling = 3.0\n')
     return str(path)
 
 
@@ -57,7 +57,7 @@ def test_quiet_device_is_certified_by_the_number_of_samples_that_this_takes() ->
 @pytest.mark.parametrize("sequential", [False, True])
 def test_noisy_device_is_refuted(tmp_path: Path, sequential: bool) -> None:  # noqa: FBT001 - a parameter
     answer = certify(
-        asked(noisy_device(tmp_path, 20.0), far=1e-4, confidence=0.999, allowed=0, sequential=sequential), ThisProcess()
+        asked(noisy_device(tmp_path), far=1e-4, confidence=0.999, allowed=0, sequential=sequential), ThisProcess()
     )
     assert answer.outcome == "refuted"
     assert answer.alarms / answer.samples > 1e-4
@@ -235,7 +235,7 @@ def test_command_tells_outcome_by_its_status(tmp_path: Path, capsys: pytest.Capt
     said = json.loads(capsys.readouterr().out)
     assert (said["outcome"], said["far"], said["alarms"], said["burst"]) == ("certified", 1e-3, 0, BURST)
     assert "assumed" in said["basis"]
-    assert main(["certify", "--dut", noisy_device(tmp_path, 20.0), "--sequential", *options]) == 1
+    assert main(["certify", "--dut", noisy_device(tmp_path), "--sequential", *options]) == 1
     assert main(["certify", "--dut", "serial:/dev/absent", *options]) == 3
     assert main(["certify", "--dut", "inproc", "--far", "2"]) == 2
 
