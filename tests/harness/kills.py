@@ -38,7 +38,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
 LONG_S = 300.0
 """For what takes seconds unless something is broken."""
 
-CAMPAIGN = 'trials = 12\nchunk = 2\nsamples = 300\ndevices = ["host"]\n'
+CAMPAIGN = 'trials = 12\nchunk = 2\nsamples = 700\ndevices = ["host"]\n'
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,8 @@ from analogrig.run import LOST
 from tests.harness.fed import Fed, fed
 from tests.harness.processes import children
 
-N = 400
-CHANGE_AT = 300
+N = 912
+CHANGE_AT = 700
 
 
 def signals(n: int = N) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:

@@ -170,14 +170,13 @@ def test_recording_is_a_rig_with_its_own_scenario_and_seed(thesis: tuple[Path, d
     assert "would overwrite" in refusal("replay", out["run"], "--out", Path(out["run"]).parent, cwd=tmp_path)
 
 
-def test_generator_of_any_period_wants_its_own_setting(tmp_path: Path) -> None:
+def test_generator_may_have_any_period(tmp_path: Path) -> None:
     text = (
         locate("scenarios", "thesis-free-running").read_text().replace("frequency_hz = 200.0", "frequency_hz = 180.0")
     )
     (tmp_path / "180.toml").write_text(text)
     assert run_json("run", "--scenario", "180.toml", "--dut", "any-edges", cwd=tmp_path)["outcome"] == "passed"
-    alarmed = run_json("run", "--scenario", "180.toml", cwd=tmp_path, status=1)
-    assert "any-edges" in alarmed["advice"][0]
+    assert run_json("run", "--scenario", "180.toml", cwd=tmp_path)["outcome"] == "passed"
 
 
 # ---- what goes wrong
@@ -213,7 +212,7 @@ def refusal_here(arguments: Sequence[str], capsys: pytest.CaptureFixture[str]) -
         ("scenarios", "frequency_hz = 200.0", "frequency_hz = 1e-12", "mine.toml"),
         pytest.param("scenarios", "samples = 1800", f"samples = {10**400}", "mine.toml", id="samples"),
         ("devices", "forgetting", "forgeting", "mine.toml: estimator: unknown key 'forgeting'"),
-        ("devices", "forgetting = 0.99\n", "forgetting = 0.2\n", "forgetting.* 0.2"),
+        ("devices", "forgetting = 0.995\n", "forgetting = 0.2\n", "forgetting.* 0.2"),
         ("devices", "arl0 = 1.0e5", "ceiling = 1.0e12", "mine.toml"),
         ("devices", 'kind = "host"', f'kind = "serial"\nurl = "loop://"\nbaud = 1{20 * "0"}', "mine.toml"),
     ],

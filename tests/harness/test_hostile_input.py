@@ -30,7 +30,7 @@ from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, counter_text, number_of, one_line
 
 SCENARIO = """
-samples = 300
+samples = 600
 seed = 7
 [excitation]
 low_v = 0.1
@@ -50,7 +50,7 @@ net_force = [-12.5, 12.5]
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 300 samples."""
+    """A run of 600 samples."""
     folder = tmp_path_factory.mktemp("sound")
     (folder / "short.toml").write_text(SCENARIO)
     assert main(["run", "--scenario", str(folder / "short.toml"), "--dut", "inproc", "--out", str(folder)]) == 0
@@ -158,7 +158,7 @@ def extended(samples: int) -> Rewrite:
     def change(conditions: dict[str, Any], arrays: dict[str, Any]) -> None:
         conditions["samples_asked"] = samples
         for name, array in arrays.items():
-            if len(array) == 300:
+            if len(array) == 600:
                 arrays[name] = np.resize(array, (samples, *array.shape[1:]))
 
     return change

@@ -186,7 +186,7 @@ def test_installed_package_says_the_commit_of_its_wheel(checkout: Path, monkeypa
 def test_campaign_is_the_same_whoever_played_it_and_says_who(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "spec.toml").write_text("trials = 4\nchunk = 2\nsamples = 300\n")
+    (tmp_path / "spec.toml").write_text("trials = 4\nchunk = 2\nsamples = 700\n")
     monkeypatch.chdir(tmp_path)
     words = ["campaign", "spec.toml", "--workers", "1", "--json", "--out"]
 

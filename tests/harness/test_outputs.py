@@ -512,7 +512,7 @@ def test_thesis_that_is_interrupted_leaves_no_older_page(tmp_path: Path, monkeyp
 def test_page_of_an_older_campaign_is_not_taken_for_that_of_the_new_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "spec.toml").write_text("trials = 1\nsamples = 300\n")
+    (tmp_path / "spec.toml").write_text("trials = 1\nsamples = 700\n")
     words = ["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / "out.json"), "--workers", "1"]
     assert main(words) in (0, 1, 3)
     (tmp_path / "out.json").unlink()

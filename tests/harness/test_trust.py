@@ -342,7 +342,7 @@ def recorded_scenario(bait: Bait, recorded: Path) -> str:
 
 
 def campaign_of(bait: Bait, name: str) -> list[str]:
-    spec = f'scenario = "healthy"\nsamples = 400\ntrials = 1\ndevices = ["{name}"]\n'
+    spec = f'scenario = "healthy"\nsamples = 700\ntrials = 1\ndevices = ["{name}"]\n'
     device_file(bait)
     return ["campaign", written("campaign.toml", spec), "--workers", "1", "--out", "build/campaign.json"]
 
@@ -384,7 +384,7 @@ def scenario_on(bait: Bait) -> str:
 
 def campaign_on(bait: Bait) -> list[str]:
     rig_file(bait)
-    spec = 'scenario = "healthy"\nsamples = 400\ntrials = 1\nrigs = ["rig.toml"]\ndevices = ["host"]\n'
+    spec = 'scenario = "healthy"\nsamples = 700\ntrials = 1\nrigs = ["rig.toml"]\ndevices = ["host"]\n'
     return ["campaign", written("campaign.toml", spec), "--workers", "1", "--out", "build/campaign.json"]
 
 
