@@ -60,16 +60,15 @@ SIZES = [f"M4F, code of the core at -Os, {what}" for what in ("everything", "tri
 LIMITED = [*STEPS, *(f"{name}, worst" for name in STEPS), *SIZES]
 
 BEYOND = {
-    "M4F, n = 4, edges locked, worst": 532,
-    "M4F, n = 4, edges locked, fixed": 344,
-    "M4F, n = 4, edges locked, fixed, worst": 433,
-    "M4F, n = 6, edges locked, worst": 697,
-    "M4F, n = 6, edges may slip, worst": 797,
-    "M4F, n = 6, edges may slip, fixed": 527,
-    "M4F, n = 6, edges may slip, fixed, worst": 740,
-    "M3, n = 4, edges locked, worst": 8320,
-    "M4F, code of the core at -Os, everything": 6388,
-    "M4F, code of the core at -Os, trigger alone": 1610,
+    "M4F, n = 4, edges locked, worst": 526,
+    "M4F, n = 4, edges locked, fixed, worst": 428,
+    "M4F, n = 6, edges locked, worst": 695,
+    "M4F, n = 6, edges may slip, worst": 796,
+    "M4F, n = 6, edges may slip, fixed": 522.5,
+    "M4F, n = 6, edges may slip, fixed, worst": 735,
+    "M3, n = 4, edges locked, worst": 8414,
+    "M4F, code of the core at -Os, everything": 6284,
+    "M4F, code of the core at -Os, trigger alone": 1570,
 }
 """What the core still misses, and may not exceed; a limit that it comes to keep must be taken off this list.
 
