@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.estimator_c.est_driver import CUSTOM, GATHERING, LOCKED, MISSING, NONE, REFUSED, UPDATED, Estimator
+from tests.estimator_c.est_driver import CUSTOM, LOCKED, MISSING, NONE, REFUSED, UPDATED, Estimator
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 800

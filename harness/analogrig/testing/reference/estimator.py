@@ -156,7 +156,7 @@ class ReferenceEstimator:
 
     @property
     def _zero(self) -> Vector:
-        """theta = 0."""
+        """Parameters of theta = 0."""
         a = [1.0, *([0.0] * self.config.na)]
         return [*(to_delta(a) if self._is_delta else a)[1:], *([0.0] * (self.config.parameters - self.config.na))]
 
