@@ -44,8 +44,8 @@ extern "C" {
 #define DEVICE_LATE_MAX 32U
 
 /// Slices of work on a diagnosis per sample. A sample needs EST_ISOLATION_SLICES_N, and up to 20 shorter samples wait
-/// at the alarm. The diagnosis is 0.6 samples later than with unlimited work.
-#define DEVICE_ISOLATION_SLICES 18U
+/// at the alarm. The diagnosis is 0.4 samples later than with unlimited work.
+#define DEVICE_ISOLATION_SLICES 24U
 
 /// Properties of a port.
 typedef struct {

@@ -71,7 +71,14 @@ class Result:
     """After the last sample; codes^2."""
 
 
-CHANGES = ("undecided", "M", "B", "K", "several")
+CHANGES = (
+    *("undecided", "M", "B", "K", "several"),
+    *(
+        f"{channel} {fault}"
+        for channel in ("force", "displacement")
+        for fault in ("offset", "gain", "delay", "stuck", "noise")
+    ),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +101,7 @@ class Isolated:
     most_n: NDArray[np.float64]
 
 
-SLICES_N = 13
+SLICES_N = 18
 """As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes."""
 
 
