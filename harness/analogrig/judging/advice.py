@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
+from analogrig.catalogue import Change
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, MisfitPeriod, Verdict
+from analogrig.judging.verdict import CHANNEL_FAULTS, DIAGNOSABLE, DIAGNOSES, ESTIMATES, MisfitPeriod, Verdict
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -26,6 +27,8 @@ MOST_EDGE_SHIFT = 1.5e-3
 
 _EXAMINED_SAMPLES = 4000
 
+_SHOWN_FAULTS = 5
+
 
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences of advice, the most severe first; empty if there is nothing to advise."""
@@ -38,6 +41,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_theta_without_a_model(run),
         *_assumed_settings(run),
         *_overloads(verdict),
+        *_channel_faults(run),
         *_noise_setting(run),
         *_edge_spacing(run),
         *_warm_up(run),
@@ -102,6 +106,21 @@ def _overloads(verdict: Verdict) -> Iterator[str]:
         yield (
             f"{names} overloaded from sample {min(verdict.overloads.values())} on: the computer no longer matched the"
             " plant of the scenario, so estimates and alarms may be correct for the overloaded computer"
+        )
+
+
+def _channel_faults(run: Run) -> Iterator[str]:
+    """The scenario has none: the device is wrong, or the rig is."""
+    named = [
+        f"{DIAGNOSABLE[Change(change)]} (sample {index})"
+        for index, change in zip(run.diagnosis_index.tolist(), run.diagnosis_change.tolist(), strict=True)
+        if change in CHANNEL_FAULTS
+    ]
+    if named:
+        more = ", ..." if len(named) > _SHOWN_FAULTS else ""
+        yield (
+            f"the device diagnosed a fault of a channel, which the scenario does not contain:"
+            f" {', '.join(named[:_SHOWN_FAULTS])}{more}; check cables, inputs and the clock of the rig"
         )
 
 

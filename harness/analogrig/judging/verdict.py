@@ -45,8 +45,13 @@ instant, which is known only as an interval. ``not judged``: the change was not 
 ESTIMATES, STATISTIC, DIAGNOSES = "estimates of M, B, K", "the trigger's statistic", "diagnoses"
 """Quantities in ``Verdict.not_judged`` that reports show elsewhere."""
 
-DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
-"""Changes that a device can diagnose, with their names in verdicts."""
+CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERAL)
+"""Changes that are faults of a channel. Diagnosed where a parameter has changed, they are wrong."""
+
+DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"} | {
+    fault: fault.name.lower().replace("_", " ") for fault in CHANNEL_FAULTS
+}
+"""Changes that a device can diagnose, with their names in verdicts, such as ``force offset``."""
 
 CURES: Mapping[str, str] = {
     "drift": "remove the mean of the displacement by a high-pass filter, or make the run shorter",
@@ -90,7 +95,7 @@ class DiagnosisVerdict:
     """Verdict on the first diagnosis after the detection of a change."""
 
     named: str
-    """``M``, ``B``, ``K`` or ``several``."""
+    """Name in ``DIAGNOSABLE``: ``M``, ``B``, ``K``, ``several`` or a fault of a channel, such as ``force offset``."""
     right: bool
     delay_n: int
     """Samples from the change to the diagnosis."""
@@ -99,7 +104,7 @@ class DiagnosisVerdict:
     onset_error_n: int
     """Diagnosed minus true sample of the change."""
     extent: float | None
-    """Diagnosed ratio of the new to the old value; None if several parameters were named, or non-finite."""
+    """Diagnosed ratio of the new to the old value; None unless a parameter was named, or non-finite."""
     extent_error: float | None
     """Relative error of ``extent``; None unless exactly one parameter changed and was named."""
 

@@ -33,12 +33,13 @@ def summary(run: Run, verdict: Verdict) -> str:
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
         lines += [line for tweak in verdict.tweaks for line in _change_lines(tweak)]
-    diagnoses = [_diagnosis_line(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
+    diagnoses = [(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
     if diagnoses:
+        width = max(len("several"), *(len(diagnosis.named) for _, diagnosis in diagnoses))
         lines += [
             "",
-            "  sample  named    right  extent   error       delay  bound   onset error  (samples)",
-            *diagnoses,
+            f"  sample  {'named':{width}}  right  extent   error       delay  bound   onset error  (samples)",
+            *(_diagnosis_line(*each, width) for each in diagnoses),
         ]
     load = load_of(run)
     facts = {
@@ -107,13 +108,13 @@ def change_text(tweak: ChangeVerdict) -> str:
     return ", ".join(f"{name} {old:g} -> {tweak.after[name]:g} {UNITS[name]}" for name, old in tweak.before.items())
 
 
-def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:
+def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict, width: int) -> str:
     extent = "-" if diagnosis.extent is None else f"{diagnosis.extent:.3f}"
     error = "-" if diagnosis.extent_error is None else f"{diagnosis.extent_error:+.1%}"
     bound = "none" if diagnosis.bound_n is None else str(diagnosis.bound_n)
     right = "yes" if diagnosis.right else "NO"
     return (
-        f"  {sample:6}  {diagnosis.named:7}  {right:>5}  {extent:>6}  {error:>6}"
+        f"  {sample:6}  {diagnosis.named:{width}}  {right:>5}  {extent:>6}  {error:>6}"
         f"  {diagnosis.delay_n:10}  {bound:>5}  {diagnosis.onset_error_n:+12}"
     )
 
