@@ -2,6 +2,7 @@
 
 #include "est_isolation.h"
 #include "est_assert.h"
+#include "est_shape.h"
 
 #include <stddef.h>
 
@@ -29,8 +30,10 @@
 #define LINEAR_N 3U
 #define KINDS_N 5U
 
-/// Samples that an equation reaches back to. An effect is driven alike by all onsets before.
-#define LAGS_N 2U
+/// Onsets that a slice of work enters a sample into. Last slices in which a sample is entered, and weighed.
+#define AT_ONCE 2U
+#define ENTERED (EST_ISOLATION_ONSETS_N / AT_ONCE)
+#define WEIGHED (ENTERED + (2U * EST_ISOLATION_ONSETS_N))
 
 /// Samples after an alarm at which theta counts as the plant again, and the refinement of the extent ends.
 #define SETTLED_N 100U
@@ -138,6 +141,9 @@ static bool derive_plant(est_plant_t* const self, const est_config_t* const conf
     const float a1  = self->theta[0];
     const float a2  = self->theta[1];
     const float sum = 1.0F + a1 + a2;
+    self->a[0]      = 1.0F;
+    self->a[1]      = a1;
+    self->a[2]      = a2;
     if ((a2 < 1.0e-6F) || (a2 >= 1.0F) || (sum < 1.0e-6F)) {
         return false;  // MISRA D4
     }
@@ -159,9 +165,12 @@ static bool derive_plant(est_plant_t* const self, const est_config_t* const conf
     from_moments(self->spring, sum, drag_n + first, second + (2.0F * ((lag_n * (first + drag_n)) - (sum / q))));
     from_moments(self->damper, 0.0F, -drag_n, -2.0F * lag_n * (first + drag_n));
     self->gain = 0.0F;
-    for (uint8_t i = 0U; i < config->nb; i++) {
-        self->gain += self->theta[2U + i] / sum;
+    for (uint8_t i = 0U; i < EST_ISOLATION_LAGS_N; i++) {
+        const bool acts = (i >= config->nk) && (i < (config->nb + config->nk));  // nb + nk: est_isolation_init()
+        self->b[i]      = acts ? self->theta[(2U + i) - config->nk] : 0.0F;
+        self->gain += self->b[i] / sum;
     }
+    self->direct = (config->nk == 0U) ? self->b[0] : 0.0F;
     const float offset = config->offset ? (self->theta[2U + config->nb + config->nc] / sum) : 0.0F;
     self->rest         = offset + (self->gain * force_zero);
     return true;
@@ -183,20 +192,12 @@ static void keep(est_isolation_t* const self, const est_sample_t sample, const f
     self->known_n            = (uint8_t)((self->known_n < EST_ISOLATION_KEPT_N) ? (self->known_n + 1U) : self->known_n);
 }
 
-/// True iff a channel has the same code as in the sample before.
-static bool is_same(const est_isolation_t* const self, const uint8_t channel, const uint32_t ago) {
-    const est_kept_t* const now  = sample_before(self, ago);
-    const est_kept_t* const last = sample_before(self, ago + 1U);
-    return (channel == FORCE) ? equal(now->u, last->u) : equal(now->y, last->y);
-}
-
-/// Square of the smaller one of the last two steps of u. An edge is a step beside a small one.
-static float squared_step(const est_isolation_t* const self, const uint32_t ago) {
-    const float middle = sample_before(self, ago + 1U)->u;
-    const float last   = sample_before(self, ago)->u - middle;
-    const float first  = sample_before(self, ago + 2U)->u - middle;
-    const float newer  = last * last;
-    const float older  = first * first;
+/// Square of the smaller one of two steps of u, between three samples. An edge is a step beside a small one.
+static float squared_step(const float newest, const float middle, const float oldest) {
+    const float last  = newest - middle;
+    const float first = oldest - middle;
+    const float newer = last * last;
+    const float older = first * first;
     return (newer < older) ? newer : older;
 }
 
@@ -207,144 +208,127 @@ static float least_unrest(const est_isolation_t* const self) {
 
 /// Follow the habits of the channels. A noise that has just begun hardly counts.
 static void follow_habits(est_isolation_t* const self) {
-    est_habits_t* const habits  = &self->habits;
-    const bool          learns  = habits->known_n < HABITS_N;
-    const float         present = squared_step(self, 0U);
-    const float         most    = UNUSUAL * (habits->unrest + least_unrest(self));
-    habits->known_n             = learns ? (uint8_t)(habits->known_n + 1U) : habits->known_n;
-    const float rate            = 1.0F / (float)habits->known_n;
-    for (uint8_t i = 0U; i < CHANNELS; i++) {
-        habits->same[i] += rate * ((is_same(self, i, 0U) ? 1.0F : 0.0F) - habits->same[i]);
-    }
+    est_habits_t* const     habits  = &self->habits;
+    const est_kept_t* const now     = sample_before(self, 0U);
+    const est_kept_t* const last    = sample_before(self, 1U);
+    const bool              learns  = habits->known_n < HABITS_N;
+    const float             present = squared_step(now->u, last->u, sample_before(self, 2U)->u);
+    const float             most    = UNUSUAL * (habits->unrest + least_unrest(self));
+    habits->known_n                 = learns ? (uint8_t)(habits->known_n + 1U) : habits->known_n;
+    const float rate                = 1.0F / (float)habits->known_n;
+    habits->same[FORCE] += rate * ((equal(now->u, last->u) ? 1.0F : 0.0F) - habits->same[FORCE]);
+    habits->same[DISPLACEMENT] += rate * ((equal(now->y, last->y) ? 1.0F : 0.0F) - habits->same[DISPLACEMENT]);
     habits->unrest += rate * (((learns || (present < most)) ? present : most) - habits->unrest);
 }
 
-/// Measured force: u counted from F = 0.
-static float force(const est_isolation_t* const self, const uint32_t ago) {
-    return sample_before(self, ago)->u - self->force_zero;
+/// Move on to the sample `ago` samples before the newest one.
+static void advance(est_isolation_t* const self, const uint32_t ago) {
+    const est_kept_t* const now = sample_before(self, ago);
+    for (uint8_t i = EST_ISOLATION_LAGS_N; i > 0U; i--) {
+        self->force[i]        = self->force[i - 1U];
+        self->displacement[i] = self->displacement[i - 1U];
+    }
+    self->force[0]        = now->u - self->force_zero;
+    self->displacement[0] = now->y - self->plant.rest;
 }
 
-/// Effect on y of the force during the past sample, for an onset `age_n` samples ago. An edge of u may come anywhere
-/// within the interval; b_0 is then the share of the new level, if nk is 0.
-static float force_effect(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n) {
-    const est_config_t* const config = self->config;
-    const float* const        b      = &self->plant.theta[2];
-    if (age_n == 1U) {
-        const float direct = (config->nk == 0U) ? b[0] : 0.0F;
-        const float whole  = self->plant.gain * self->plant.hold;
-        return (direct * force(self, ago)) + ((whole - direct) * force(self, ago + 1U));  // MISRA D4
-    }
-    float out = 0.0F;
-    for (uint8_t i = 0U; i < config->nb; i++) {
-        out += b[i] * force(self, ago + i + config->nk);  // at most two samples back: checked by est_isolation_init()
-    }
-    return out;
+/// Sum of products over the lags.
+static float filter(const float* const factors, const float* const x) {
+    return (factors[0] * x[0]) + (factors[1] * x[1]) + (factors[2] * x[2]);
 }
 
 /// Compute the inputs of the effects of M, B and K for an onset `age_n` samples ago. With x the measured displacement
 /// and all else unchanged,
 ///     M0 d'' + B0 d' + K0 d = -nu (F - B0 x' - K0 x) - dB x' - dK x,    nu = 1 - M0/M,
-/// gives the deviation d of the plant from its course. It is linear in a change of M, of B, and of K.
-static void drive_plant(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n, float* const out) {
+/// gives the deviation d of the plant from its course. It is linear in a change of M, of B, and of K. In the first
+/// sample, the force acts from the onset on, and the second sample has half the weight. An edge of u may come anywhere
+/// within the interval; b_0 is then the share of the new level.
+static void drive_plant(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
     const est_plant_t* const plant = &self->plant;
-    float                    spring;
-    float                    damper;
-    if (age_n == 1U) {  // the force acts from the first sample on: the second has half the weight
-        const float rise = sample_before(self, ago)->y - sample_before(self, ago + 1U)->y;
-        spring           = plant->hold * (sample_before(self, ago + 1U)->y + (0.33333333F * rise) - plant->rest);
-        damper           = plant->hold * plant->lag_n * rise;
-    } else {
-        spring = 0.0F;
-        damper = 0.0F;
-        for (uint32_t i = 0U; i < 3U; i++) {
-            const float x = sample_before(self, ago + i)->y - plant->rest;
-            spring += plant->spring[i] * x;
-            damper += plant->damper[i] * x;
-        }
-    }
-    out[0] = spring + damper - force_effect(self, ago, age_n);
-    out[1] = -damper;
-    out[2] = -spring;
+    const float* const       f     = self->force;
+    const float* const       x     = self->displacement;
+    const bool               first = age_n == 1U;
+    const float              rise  = x[0] - x[1];
+    const float spring = first ? (plant->hold * (x[1] + (0.33333333F * rise))) : filter(plant->spring, x);
+    const float damper = first ? ((plant->hold * plant->lag_n) * rise) : filter(plant->damper, x);
+    const float later  = (plant->gain * plant->hold) - plant->direct;
+    const float force  = first ? ((plant->direct * f[0]) + (later * f[1])) : filter(plant->b, f);
+    out[0]             = spring + damper - force;
+    out[1]             = -damper;
+    out[2]             = -spring;
 }
 
 /// Compute the inputs of the effects of an offset, a gain and a delay of the force for an onset `age_n` samples ago. A
 /// force that is measured f too high leaves the equation a residual of -B f. An offset is f = 1. A gain is f = u less
 /// its zero, as its size is 1 - old/new. A delay is f(k) = u(k) - u(k + 1); the one of the present sample is not known.
-static void drive_force(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n, float* const out) {
-    const est_config_t* const config = self->config;
-    for (uint8_t i = 0U; i < LINEAR_N; i++) {
-        out[i] = 0.0F;
-    }
-    for (uint32_t i = config->nk; i < ((uint32_t)config->nb + config->nk); i++) {
-        const float b = self->plant.theta[(2U + i) - config->nk];
-        const float u = force(self, ago + i);
-        if (age_n > i) {
-            out[OFFSET] -= b;
-            out[GAIN] -= b * u;
-            out[DELAY] -= (i > 0U) ? (b * (u - force(self, (ago + i) - 1U))) : 0.0F;
-        }
+static void drive_force(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
+    const float* const b = self->plant.b;
+    const float* const f = self->force;
+    const uint16_t     n = (age_n < EST_ISOLATION_LAGS_N) ? age_n : EST_ISOLATION_LAGS_N;
+    out[OFFSET]          = -b[0];
+    out[GAIN]            = -b[0] * f[0];
+    out[DELAY]           = 0.0F;
+    for (uint16_t i = 1U; i < n; i++) {
+        out[OFFSET] -= b[i];
+        out[GAIN] -= b[i] * f[i];
+        out[DELAY] -= b[i] * (f[i] - f[i - 1U]);
     }
 }
 
 /// The same of the displacement. If it is measured f too high the residual is A f. A late displacement obeys the
 /// equation of the sample before: the residual is the step of -B u, and at first A times the steps of y before the
 /// onset, because one code comes twice.
-static void
-drive_displacement(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n, float* const out) {
-    const est_config_t* const config = self->config;
-    const float               a[3]   = { 1.0F, self->plant.theta[0], self->plant.theta[1] };
-    for (uint8_t i = 0U; i < LINEAR_N; i++) {
-        out[i] = 0.0F;
-    }
-    for (uint32_t i = 0U; i < 3U; i++) {
-        const float y = sample_before(self, ago + i)->y;
+static void drive_displacement(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
+    const float* const a = self->plant.a;
+    const float* const f = self->force;
+    const float* const x = self->displacement;
+    out[OFFSET]          = 0.0F;
+    out[GAIN]            = 0.0F;
+    out[DELAY]           = filter(self->plant.b, &f[1]) - filter(self->plant.b, f);
+    for (uint16_t i = 0U; i < EST_ISOLATION_LAGS_N; i++) {
         if (age_n > i) {
             out[OFFSET] += a[i];
-            out[GAIN] += a[i] * (y - self->plant.rest);
+            out[GAIN] += a[i] * x[i];
         } else {
-            out[DELAY] += a[i] * (y - sample_before(self, ago + i + 1U)->y);
+            out[DELAY] += a[i] * (x[i] - x[i + 1U]);
         }
-    }
-    for (uint32_t i = config->nk; i < ((uint32_t)config->nb + config->nk); i++) {
-        const float b = self->plant.theta[(2U + i) - config->nk];
-        out[DELAY] -= b * (force(self, ago + i) - force(self, ago + i + 1U));
     }
 }
 
 /// Compute the inputs of all effects for an onset `age_n` samples ago. The second impulse is a past value of its effect.
-static void drive(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n, float* const out) {
-    drive_plant(self, ago, age_n, out);
+static void drive(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
+    drive_plant(self, age_n, out);
     out[PARAMETERS]      = (age_n == 1U) ? 1.0F : 0.0F;
     out[PARAMETERS + 1U] = 0.0F;
-    drive_force(self, ago, age_n, &out[JOINT]);
-    drive_displacement(self, ago, age_n, &out[JOINT + LINEAR_N]);
+    drive_force(self, age_n, &out[JOINT]);
+    drive_displacement(self, age_n, &out[JOINT + LINEAR_N]);
 }
 
-/// Enter a sample into the residual: y less the response of the plant before the change, whitened by C as in
+/// Enter the sample into the residual: y less the response of the plant before the change, whitened by C as in
 /// est_whitener.h.
-static void enter_residual(est_isolation_t* const self, const uint32_t ago) {
-    const est_config_t* const config = self->config;
-    const float* const        theta  = self->plant.theta;
-    float                     out    = sample_before(self, ago)->y + (theta[0] * sample_before(self, ago + 1U)->y) +
-                (theta[1] * sample_before(self, ago + 2U)->y);
-    for (uint8_t i = 0U; i < config->nb; i++) {
-        out -= theta[2U + i] * sample_before(self, ago + i + config->nk)->u;
-    }
-    out -= config->offset ? theta[2U + config->nb + config->nc] : 0.0F;
-    out -= (self->plant.c[0] * self->residual[0]) + (self->plant.c[1] * self->residual[1]);
-    self->residual[1] = self->residual[0];
-    self->residual[0] = out;
+static void enter_residual(est_isolation_t* const self) {
+    const est_plant_t* const plant = &self->plant;
+    const float              out   = filter(plant->a, self->displacement) - filter(plant->b, self->force);
+    const float              white = out - (plant->c[0] * self->residual[0]) - (plant->c[1] * self->residual[1]);
+    self->residual[1]              = self->residual[0];
+    self->residual[0]              = white;
 }
 
-/// Enter a sample into the runs of equal codes, and into the unrest of the force: "the variance of its steps is four
-/// times an unusual one", as in est_trigger.h.
-static void enter_habits(est_isolation_t* const self, const uint32_t ago) {
-    const float ratio   = squared_step(self, ago) / (UNUSUAL * (self->habits.unrest + least_unrest(self)));
-    const float counted = (ratio < CLIP) ? ratio : CLIP;
-    self->unrest        = (self->habits.known_n < HABITS_N) ? 0.0F : ((0.375F * counted) - LN_2);
-    for (uint8_t i = 0U; i < CHANNELS; i++) {
-        self->same_n[i] = is_same(self, i, ago) ? count_up(self->same_n[i]) : 0U;
-    }
+/// Enter the sample into the runs of equal codes, and into the unrest of the force: "the variance of its steps is four
+/// times an unusual one", a likelihood ratio.
+static void enter_habits(est_isolation_t* const self) {
+    const float* const f       = self->force;
+    const float* const x       = self->displacement;
+    const float        ratio   = squared_step(f[0], f[1], f[2]) / (UNUSUAL * (self->habits.unrest + least_unrest(self)));
+    const float        counted = (ratio < CLIP) ? ratio : CLIP;
+    self->unrest               = (self->habits.known_n < HABITS_N) ? 0.0F : ((0.375F * counted) - LN_2);
+    self->same_n[FORCE]        = equal(f[0], f[1]) ? count_up(self->same_n[FORCE]) : 0U;
+    self->same_n[DISPLACEMENT] = equal(x[0], x[1]) ? count_up(self->same_n[DISPLACEMENT]) : 0U;
+}
+
+/// Samples from an onset to the present sample.
+static uint16_t age_of(const est_isolation_t* const self, const est_onset_t* const onset) {
+    return (uint16_t)((self->worked_n + onset->before_n) - self->onsets[0].before_n);
 }
 
 /// Prepare an onset for its first sample. The second impulse came one sample before.
@@ -367,32 +351,45 @@ static void clear_onset(est_onset_t* const onset) {
     onset->unrest = 0.0F;
 }
 
-/// Enter a sample into the effects of one onset and their normal equations.
-static void
-enter_onset(est_isolation_t* const self, est_onset_t* const onset, const uint32_t ago, const uint16_t age_n) {
-    float        first[EFFECTS];
-    const float* driving = self->driving;
-    float*       matrix  = onset->matrix;
-    if (age_n <= LAGS_N) {
-        drive(self, ago, age_n, first);
+/// Enter the sample into the effects of one onset and their normal equations. All onsets that the equation does not
+/// reach back to are driven alike.
+static void enter_onset(est_isolation_t* const self, est_onset_t* const onset) {
+    float          first[EFFECTS];
+    const float*   driving = self->driving;
+    float*         matrix  = onset->matrix;
+    const uint16_t age_n   = age_of(self, onset);
+    if (age_n == 1U) {
+        clear_onset(onset);
+    }
+    if (age_n < EST_ISOLATION_LAGS_N) {
+        drive(self, age_n, first);
         driving = first;
     }
-    for (uint8_t i = 0U; i < EFFECTS; i++) {
-        float* const past   = onset->past[i];
-        const float  now    = driving[i] - (self->plant.c[0] * past[0]) - (self->plant.c[1] * past[1]);
-        const float  weight = now * self->nats;
-        past[1]             = past[0];
-        past[0]             = now;
-        onset->vector[i] += weight * self->residual[0];
-        if (i < JOINT) {
-            for (uint8_t j = 0U; j <= i; j++) {
-                *matrix++ += weight * onset->past[j][0];
-            }
-        } else {
-            onset->known[i - JOINT] += weight * now;
-            for (uint8_t j = 0U; j < PUSHES; j++) {
-                onset->shared[i - JOINT][j] += weight * onset->past[PARAMETERS + j][0];
-            }
+    const float c0       = self->plant.c[0];
+    const float c1       = self->plant.c[1];
+    const float residual = self->residual[0];
+    const float nats     = self->nats;
+    float       now[EFFECTS];
+    for (uint_fast8_t i = 0U; i < EFFECTS; i++) {
+        float* const past = onset->past[i];
+        now[i]            = driving[i] - (c0 * past[0]) - (c1 * past[1]);
+        past[1]           = past[0];
+        past[0]           = now[i];
+        onset->vector[i] += (now[i] * nats) * residual;
+    }
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < JOINT; i++) {
+        EST_UNROLL
+        for (uint_fast8_t j = 0U; j <= i; j++) {
+            *matrix++ += (now[i] * nats) * now[j];
+        }
+    }
+    for (uint_fast8_t i = 0U; i < EST_ISOLATION_FAULTS_N; i++) {
+        const float weight = now[JOINT + i] * nats;
+        onset->known[i] += weight * now[JOINT + i];
+        EST_UNROLL
+        for (uint_fast8_t j = 0U; j < PUSHES; j++) {
+            onset->shared[i][j] += weight * now[PARAMETERS + j];
         }
     }
     onset->energy += (self->residual[0] * self->nats) * self->residual[0];
@@ -451,21 +448,28 @@ weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const
 }
 
 /// Enter the evidence of one onset for a single change.
-static void
-enter_single(est_fit_t* const fit, const uint8_t one, const est_single_t* const found, const uint8_t number) {
-    est_single_t* const kept = &fit->single[one];
-    const float         any  = log_add(kept->any, found->best);
-    if (found->best > kept->best) {
-        *kept = *found;
+EST_INLINE void enter_single(est_isolation_t* const self,
+                             const uint_fast8_t     one,
+                             const uint_fast8_t     number,
+                             const float            gain,
+                             const float            change,
+                             const float            known) {
+    est_single_t* const single = &self->fit.single[one];
+    float* const        most   = &self->fit.onset[number];
+    single->any                = log_add(single->any, gain);
+    *most                      = greater(*most, gain);
+    if (gain > single->best) {
+        single->best     = gain;
+        single->change   = change;
+        single->known    = known;
+        single->before_n = self->onsets[number].before_n;
     }
-    kept->any          = any;
-    fit->onset[number] = greater(fit->onset[number], found->best);
 }
 
 /// The impulses of one onset, the second less its share of the first. Private.
 typedef struct {
     float share;
-    float known[PUSHES];  ///< as in est_single_t, and change likewise
+    float variance[PUSHES];  ///< doubled
     float change[PUSHES];
     float gain;
 } pushes_t;
@@ -474,12 +478,12 @@ static pushes_t free_pushes(const est_isolation_t* const self, const est_onset_t
     const float* const first  = &onset->matrix[(PARAMETERS * (PARAMETERS + 1U)) / 2U];
     const float* const second = &first[PARAMETERS + 1U];
     pushes_t           out;
-    out.known[0]     = first[PARAMETERS] + self->nats;
-    out.share        = second[PARAMETERS] / out.known[0];
-    out.known[1]     = greater(second[PARAMETERS + 1U] - (out.share * second[PARAMETERS]), 0.0F) + self->nats;
+    out.variance[0]  = 1.0F / (first[PARAMETERS] + self->nats);
+    out.share        = second[PARAMETERS] * out.variance[0];
+    out.variance[1]  = 1.0F / (greater(second[PARAMETERS + 1U] - (out.share * second[PARAMETERS]), 0.0F) + self->nats);
     const float rest = onset->vector[PARAMETERS + 1U] - (out.share * onset->vector[PARAMETERS]);
-    out.change[0]    = onset->vector[PARAMETERS] / out.known[0];
-    out.change[1]    = rest / out.known[1];
+    out.change[0]    = onset->vector[PARAMETERS] * out.variance[0];
+    out.change[1]    = rest * out.variance[1];
     out.gain         = (out.change[0] * onset->vector[PARAMETERS]) + (out.change[1] * rest);
     return out;
 }
@@ -496,18 +500,17 @@ static void weigh_plant(est_isolation_t* const self, const uint8_t number) {
     one_t                    ones[PARAMETERS];
     for (uint8_t i = 0U; i < PARAMETERS; i++) {
         float       left[PARAMETERS];
-        const float share = first[i] / pushes.known[0];
+        const float share = first[i] * pushes.variance[0];
         rest[i]           = second[i] - (pushes.share * first[i]);
         for (uint8_t j = 0U; j <= i; j++) {
-            left[j] = row[j] - (share * first[j]) - ((rest[i] / pushes.known[1]) * rest[j]);
+            left[j] = row[j] - (share * first[j]) - ((rest[i] * pushes.variance[1]) * rest[j]);
         }
         const float vector       = onset->vector[i] - (first[i] * pushes.change[0]) - (rest[i] * pushes.change[1]);
         const float known        = left[i] + PRIOR;
         const float change       = vector / known;
         const float gain         = pushes.gain + (vector * change);
         ones[i]                  = (one_t){ .vector = vector, .known = known, .change = change, .gain = gain };
-        const est_single_t found = { .best = gain, .change = change, .known = known, .before_n = onset->before_n };
-        enter_single(fit, i, &found, number);
+        enter_single(self, i, number, gain, change, known);
         for (uint8_t j = 0U; j < i; j++) {
             weigh_pair(fit, ones, i, j, left[j]);
         }
@@ -515,32 +518,35 @@ static void weigh_plant(est_isolation_t* const self, const uint8_t number) {
     }
 }
 
-/// Evidence of one onset for a fault whose effect is linear in its size. A delay has the size 1. Undoing a gain of the
-/// displacement scales the noise as well; that is no evidence.
-static est_single_t weigh_linear(const est_onset_t* const onset,
-                                 const pushes_t* const    pushes,
-                                 const uint8_t            channel,
-                                 const uint8_t            kind,
-                                 const float              samples_n) {
-    const uint8_t      i      = (uint8_t)((channel * LINEAR_N) + kind);
+/// A hypothesis of one fault whose effect is linear in its size. Private.
+typedef struct {
+    float known;
+    float change;
+    float gain;
+} fault_t;
+
+/// Evidence of one onset for a fault whose effect is linear in its size. A delay has the size 1.
+EST_INLINE fault_t weigh_linear(const est_onset_t* const onset,
+                                const pushes_t* const    pushes,
+                                const uint_fast8_t       i,
+                                const bool               delays) {
     const float* const shared = onset->shared[i];
     const float        rest   = shared[1] - (pushes->share * shared[0]);
-    const float        vector = onset->vector[JOINT + i] - (shared[0] * pushes->change[0]) - (rest * pushes->change[1]);
-    const float        known =
-        onset->known[i] - ((shared[0] / pushes->known[0]) * shared[0]) - ((rest / pushes->known[1]) * rest);
+    const float vector = onset->vector[JOINT + i] - (shared[0] * pushes->change[0]) - (rest * pushes->change[1]);
+    const float known  = onset->known[i] - ((shared[0] * pushes->variance[0]) * shared[0]) - ((rest * pushes->variance[1]) * rest);
     const float left   = greater(known, 1.0e-9F);  // smaller only by rounding
-    const float change = (kind == DELAY) ? 1.0F : (vector / left);
-    float       gain   = pushes->gain + (((2.0F * vector) - (left * change)) * change);
-    if ((channel == DISPLACEMENT) && (kind == GAIN)) {
-        const float counted = greater((change < 1.0F) ? change : 1.0F, -0.5F);
-        gain -= samples_n * counted * (1.0F - (0.5F * counted));
-    }
-    return (est_single_t){
-        .best = gain, .change = change, .known = (kind == DELAY) ? 0.0F : left, .before_n = onset->before_n
-    };
+    const float change = delays ? 1.0F : (vector / left);
+    const float gain   = pushes->gain + (((2.0F * vector) - (left * change)) * change);
+    return (fault_t){ .known = delays ? 0.0F : left, .change = change, .gain = gain };
 }
 
-static uint8_t fault_of(const uint8_t channel, const uint8_t kind) {
+/// Part of the gain by undoing a gain of the displacement that is no evidence: the noise is scaled as well.
+static float gain_of_scaling(const float change, const float samples_n) {
+    const float counted = greater((change < 1.0F) ? change : 1.0F, -0.5F);
+    return samples_n * counted * (1.0F - (0.5F * counted));
+}
+
+static uint8_t fault_of(const uint_fast8_t channel, const uint_fast8_t kind) {
     return (uint8_t)(PARAMETERS + (channel * KINDS_N) + kind);
 }
 
@@ -548,28 +554,30 @@ static uint8_t fault_of(const uint8_t channel, const uint8_t kind) {
 /// whose codes are all equal. A displacement that is stuck explains every residual. Noise has an unknown variance; in
 /// the force it shows in the force too.
 static void weigh_faults(est_isolation_t* const self, const uint8_t number) {
-    est_fit_t* const         fit    = &self->fit;
-    const est_onset_t* const onset  = &self->onsets[number];
-    const pushes_t           pushes = free_pushes(self, onset);
-    const uint32_t           age_n  = ((uint32_t)self->worked_n + onset->before_n) - self->onsets[0].before_n;
-    const float              n      = (float)age_n;
-    const float              noise  = gain_of_variance(onset->energy, n);
-    for (uint8_t channel = 0U; channel < CHANNELS; channel++) {
-        est_single_t noisy = {
-            .best = noise, .change = 1.0F, .known = VARIANCE_KNOWN * n, .before_n = onset->before_n
-        };
-        est_single_t stuck = { .best = onset->energy, .before_n = onset->before_n };
-        for (uint8_t kind = 0U; kind < LINEAR_N; kind++) {
-            const est_single_t found = weigh_linear(onset, &pushes, channel, kind, n);
-            enter_single(fit, fault_of(channel, kind), &found, number);
-            stuck = ((channel == FORCE) && (kind == OFFSET)) ? found : stuck;
+    const est_onset_t* const onset    = &self->onsets[number];
+    const pushes_t           pushes   = free_pushes(self, onset);
+    const uint16_t           age_n    = age_of(self, onset);
+    const float              n        = (float)age_n;
+    const float              noise    = gain_of_variance(onset->energy, n);
+    const float              unrest   = 0.5F * onset->unrest;  // steps of neighbours are correlated
+    const float              noisy[CHANNELS] = { noise + unrest, noise };
+    for (uint_fast8_t channel = 0U; channel < CHANNELS; channel++) {
+        fault_t stuck = { .gain = onset->energy };
+        for (uint_fast8_t kind = 0U; kind < LINEAR_N; kind++) {
+            fault_t found = weigh_linear(onset, &pushes, (channel * LINEAR_N) + kind, kind == DELAY);
+            if ((channel == FORCE) && (kind == OFFSET)) {
+                stuck = found;
+            }
+            if ((channel == DISPLACEMENT) && (kind == GAIN)) {
+                found.gain -= gain_of_scaling(found.change, n);
+            }
+            enter_single(self, fault_of(channel, kind), number, found.gain, found.change, found.known);
         }
         if (self->same_n[channel] >= age_n) {
-            stuck.best += n * self->surprise[channel];
-            enter_single(fit, fault_of(channel, STUCK), &stuck, number);
+            const float gain = stuck.gain + (n * self->surprise[channel]);
+            enter_single(self, fault_of(channel, STUCK), number, gain, stuck.change, stuck.known);
         }
-        noisy.best += (channel == FORCE) ? (0.5F * onset->unrest) : 0.0F;  // steps of neighbours are correlated
-        enter_single(fit, fault_of(channel, NOISE), &noisy, number);
+        enter_single(self, fault_of(channel, NOISE), number, noisy[channel], 1.0F, VARIANCE_KNOWN * n);
     }
 }
 
@@ -749,6 +757,9 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     self->nats        = 0.5F / est_noise_variance(estimator);
     self->residual[0] = sample_before(self, self->waiting_n)->innovation;
     self->residual[1] = sample_before(self, self->waiting_n + 1U)->innovation;
+    for (uint32_t i = EST_ISOLATION_LAGS_N; i > 0U; i--) {
+        advance(self, (self->waiting_n + i) - 1U);
+    }
 }
 
 bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
@@ -777,7 +788,7 @@ static void enter_quiet(est_isolation_t* const self, const est_t* const estimato
         self->quiet   = false;
     } else if ((step.statistic <= 0.0F) && (self->since_n >= SETTLED_N)) {
         take_theta(self, estimator);
-        if (self->known_n > LAGS_N) {
+        if (self->known_n >= EST_ISOLATION_LAGS_N) {
             follow_habits(self);
         }
     } else {
@@ -811,38 +822,34 @@ void est_isolation_enter(est_isolation_t* const self,
     }
 }
 
-/// True iff the present sample comes after this onset.
-static bool has_begun(const est_isolation_t* const self, const est_onset_t* const onset) {
-    return (self->worked_n + onset->before_n) > self->onsets[0].before_n;
-}
-
-/// Number of slices of the present sample. Hypotheses are weighed only after the alarm.
-static uint8_t count_slices(const est_isolation_t* const self) {
-    uint8_t out = 1U;
-    for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
-        out = has_begun(self, &self->onsets[i]) ? (uint8_t)(out + 1U) : out;
+/// Number of onsets before the present sample.
+static uint8_t count_begun(const est_isolation_t* const self) {
+    uint8_t out = 0U;
+    while ((out < EST_ISOLATION_ONSETS_N) &&
+           ((self->worked_n + self->onsets[out].before_n) > self->onsets[0].before_n)) {
+        out++;
     }
-    return is_after_alarm(self) ? EST_ISOLATION_SLICES_N : out;
+    return out;
 }
 
-static void begin_sample(est_isolation_t* const self, const uint32_t ago) {
-    clear_fit(&self->fit);
-    enter_residual(self, ago);
-    enter_habits(self, ago);
-    drive(self, ago, LAGS_N + 1U, self->driving);
+/// Begin a sample. Hypotheses are weighed after the alarm, with the newest sample: a delay of the work does not grow.
+static void begin_sample(est_isolation_t* const self) {
+    advance(self, self->waiting_n - 1U);
+    enter_residual(self);
+    enter_habits(self);
+    drive(self, EST_ISOLATION_LAGS_N, self->driving);
     self->worked_n++;
-    self->slices_n = count_slices(self);
+    self->begun_n  = count_begun(self);
+    self->slices_n = (uint8_t)(1U + ((self->begun_n + 1U) / AT_ONCE));
+    if (is_after_alarm(self) && (self->waiting_n == 1U)) {
+        clear_fit(&self->fit);
+        self->slices_n = EST_ISOLATION_SLICES_N;
+    }
 }
 
-static void enter_and_weigh(est_isolation_t* const self, const uint8_t number) {
-    est_onset_t* const onset = &self->onsets[number];
-    const uint32_t     age_n = (uint32_t)self->worked_n + onset->before_n - self->onsets[0].before_n;
-    if (age_n == 1U) {
-        clear_onset(onset);
-    }
-    enter_onset(self, onset, self->waiting_n - 1U, (uint16_t)age_n);
-    if (is_after_alarm(self)) {
-        weigh_plant(self, number);
+static void enter_onsets(est_isolation_t* const self, const uint8_t first) {
+    for (uint8_t i = first; (i < (first + AT_ONCE)) && (i < self->begun_n); i++) {
+        enter_onset(self, &self->onsets[i]);
     }
 }
 
@@ -852,11 +859,16 @@ bool est_isolation_work(est_isolation_t* const self) {
         return false;  // MISRA D4
     }
     if (self->turn == 0U) {
-        begin_sample(self, self->waiting_n - 1U);
-    } else if (self->turn <= EST_ISOLATION_ONSETS_N) {
-        enter_and_weigh(self, (uint8_t)(self->turn - 1U));
-    } else if (self->turn <= (2U * EST_ISOLATION_ONSETS_N)) {
-        weigh_faults(self, (uint8_t)(self->turn - (EST_ISOLATION_ONSETS_N + 1U)));
+        begin_sample(self);
+    } else if (self->turn <= ENTERED) {
+        enter_onsets(self, (uint8_t)(AT_ONCE * (self->turn - 1U)));
+    } else if (self->turn <= WEIGHED) {
+        const uint8_t number = (uint8_t)((self->turn - (ENTERED + 1U)) / 2U);
+        if (((self->turn - ENTERED) % 2U) == 1U) {
+            weigh_plant(self, number);
+        } else {
+            weigh_faults(self, number);
+        }
     } else {
         diagnose(self);
     }

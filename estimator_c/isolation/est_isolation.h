@@ -33,9 +33,12 @@ extern "C" {
 /// Number of onsets that are tried.
 #define EST_ISOLATION_ONSETS_N 8U
 
-/// Slices of work per sample after the alarm: one to prepare it, two for each onset, for the plant and for the
-/// channels, and one to decide. A sample before the alarm takes at most half as many.
-#define EST_ISOLATION_SLICES_N (2U + (2U * EST_ISOLATION_ONSETS_N))
+/// Slices of work on a sample that is weighed: one to prepare it, one for every two onsets to enter it, two for each
+/// onset to weigh it, for the plant and for the channels, and one to decide. Another one takes at most the first five.
+#define EST_ISOLATION_SLICES_N (2U + (EST_ISOLATION_ONSETS_N / 2U) + (2U * EST_ISOLATION_ONSETS_N))
+
+/// Number of samples in an equation.
+#define EST_ISOLATION_LAGS_N 3U
 
 /// Number of impulses at the onset. They stand for the deviation of the filter's two states if the onset was earlier.
 #define EST_ISOLATION_PUSHES_N 2U
@@ -132,10 +135,13 @@ typedef struct {
 typedef struct {
     float theta[EST_THETA_MAX];
     float c[2];
+    float a[EST_ISOLATION_LAGS_N];  ///< factors of y(k), y(k-1), y(k-2)
+    float b[EST_ISOLATION_LAGS_N];  ///< factors of u(k), u(k-1), u(k-2)
+    float direct;                   ///< share of b[0] that an edge within the interval may have
     float hold;       ///< share of the final deflection reached one sample after a force step
     float lag_n;      ///< B / K
-    float spring[3];  ///< effect of K y, as a force, on the equation of y: factors of y(k), y(k-1), y(k-2)
-    float damper[3];  ///< the same for B y'
+    float spring[EST_ISOLATION_LAGS_N];  ///< effect of K y, as a force, on the equation of y: factors as those of a
+    float damper[EST_ISOLATION_LAGS_N];  ///< the same for B y'
     float rest;       ///< y at F = 0 [codes]
     float gain;       ///< static gain: y per u
 } est_plant_t;
@@ -153,12 +159,15 @@ typedef struct {
     uint8_t             waiting_n;   ///< samples waiting for work
     uint8_t             turn;        ///< next slice of the present sample
     uint8_t             slices_n;    ///< number of slices of the present sample
+    uint8_t             begun_n;     ///< onsets before the present sample
     uint16_t            worked_n;    ///< samples from the first onset to the present one
     bool                active;      ///< an alarm is being diagnosed
     est_plant_t         plant;
     est_habits_t        habits;
     uint8_t             same_n[EST_ISOLATION_CHANNELS_N];    ///< codes that equal the last one, up to this sample
     float               surprise[EST_ISOLATION_CHANNELS_N];  ///< of each of them, unless the channel is stuck [nats]
+    float               force[EST_ISOLATION_LAGS_N + 1U];         ///< u less its zero, up to the present sample
+    float               displacement[EST_ISOLATION_LAGS_N + 1U];  ///< y less its rest, likewise
     float               unrest;                              ///< of this sample, as in est_onset_t
     float               driving[EST_ISOLATION_EFFECTS_N];    ///< input of the effects, if the onset was long ago
     float               residual[2];  ///< whitened y less the response of the plant before the change, newest first
@@ -179,9 +188,9 @@ EST_RESULT_USED bool est_isolation_init(est_isolation_t* self, const est_config_
 /// alarm 770 (make cost). May be called from an interrupt.
 void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 
-/// Do one slice of the work after an alarm: one sample with one onset. Return true iff more work is waiting. A sample
-/// needs up to EST_ISOLATION_SLICES_N calls. If more than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis
-/// remains undecided. Cost: some 1,070 instructions on a Cortex-M4F, at most 1,700; none before an alarm. May be
+/// Do one slice of the work after an alarm. Return true iff more work is waiting. A sample needs five calls, and
+/// EST_ISOLATION_SLICES_N if none comes after it: the more slices per sample, the more samples are weighed. If more
+/// than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided. Cost: some 1,070 instructions on a Cortex-M4F, at most 1,700; none before an alarm. May be
 /// called from an interrupt.
 bool est_isolation_work(est_isolation_t* self);
 
