@@ -564,7 +564,7 @@ static void weigh_faults(est_isolation_t* const self, const uint8_t number) {
     for (uint_fast8_t channel = 0U; channel < CHANNELS; channel++) {
         fault_t stuck = { .gain = onset->energy };
         for (uint_fast8_t kind = 0U; kind < LINEAR_N; kind++) {
-            fault_t found = weigh_linear(onset, &pushes, (channel * LINEAR_N) + kind, kind == DELAY);
+            fault_t found = weigh_linear(onset, &pushes, (uint_fast8_t)((channel * LINEAR_N) + kind), kind == DELAY);
             if ((channel == FORCE) && (kind == OFFSET)) {
                 stuck = found;
             }

@@ -101,7 +101,7 @@ class Isolated:
     most_n: NDArray[np.float64]
 
 
-SLICES_N = 18
+SLICES_N = 22
 """As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes."""
 
 
