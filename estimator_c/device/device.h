@@ -45,7 +45,7 @@ extern "C" {
 
 /// Slices of work on a diagnosis per sample. A sample needs EST_ISOLATION_SLICES_N, and up to 20 shorter samples wait
 /// at the alarm. The diagnosis is 0.4 samples later than with unlimited work.
-#define DEVICE_ISOLATION_SLICES 24U
+#define DEVICE_ISOLATION_SLICES 14U
 
 /// Properties of a port.
 typedef struct {
