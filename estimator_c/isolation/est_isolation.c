@@ -47,6 +47,10 @@
 #define WORTH_TELLING 0.15F
 #define FAULTY 2.0F
 
+/// What rounding may add to the evidence of one hypothesis over another, relative to that over no change: the sums of a
+/// hundred samples have lost their last five bits.
+#define ROUNDING 1.0e-6F
+
 /// Evidence for a second changed parameter [nats].
 #define NOT_BY_CHANCE 11.0F
 
@@ -639,7 +643,7 @@ static uint8_t find_likeliest(const float* const gains) {
 /// True iff a parameter alone is more likely than beside another one, and its extent is known.
 static bool stands_alone(const est_fit_t* const fit, const uint8_t one, const float penalty) {
     const est_single_t* const found  = &fit->single[one];
-    const float               likely = found->any - penalty;
+    const float               likely = found->any - (penalty + (ROUNDING * found->any));
     return (found->known > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
            ((likely - fit->any_pair[2U - one]) >= MORE_LIKELY);
 }
@@ -663,9 +667,10 @@ static est_change_t decide(const est_fit_t* const fit, const uint16_t samples_n)
     const uint8_t             one   = find_likeliest(gains);
     const est_single_t* const found = &fit->single[one];
     const float               pair  = gain_of_pairs(fit, one);
-    float                     lead  = SURE;
+    const float               lost  = ROUNDING * found->any;
+    float                     lead  = SURE + lost;
     bool                      sure;
-    if ((pair - found->any) > NOT_BY_CHANCE) {
+    if ((pair - found->any) > (NOT_BY_CHANCE + lost)) {
         return EST_CHANGE_SEVERAL;  // MISRA D4
     }
     if (one < PARAMETERS) {
@@ -674,7 +679,7 @@ static est_change_t decide(const est_fit_t* const fit, const uint16_t samples_n)
         sure = stands_alone(fit, one, penalty);
     } else {
         lead += FAULTY;
-        sure = (((uint32_t)samples_n + found->before_n) >= FAULT_N) && ((found->any - pair) >= MORE_LIKELY);
+        sure = (((uint32_t)samples_n + found->before_n) >= FAULT_N) && ((found->any - pair) >= (MORE_LIKELY + lost));
     }
     for (uint8_t other = 0U; other < SINGLES; other++) {
         sure = sure && ((other == one) || ((gains[one] - gains[other]) >= lead));

@@ -50,6 +50,7 @@ _SINGLE = {
     "M and K rise": {"mass_kg": 60.0, "stiffness_n_per_m": 28_500.0},
 }
 HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
+FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
 RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
@@ -150,6 +151,37 @@ def hold(codes: Codes, missing: NDArray[np.bool_]) -> None:
     missing[edges[6] + 20] = True
 
 
+FAULT_AT = 420
+"""First sample of a faulty channel."""
+
+
+def _fails(channel: int, wrong: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Spoil:
+    """Codes of a channel from FAULT_AT on, made of the true ones, which begin one sample earlier."""
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+        codes[FAULT_AT:, channel] = np.round(wrong(codes[FAULT_AT - 1 :, channel].astype(np.float64)))
+
+    return spoil
+
+
+def _noise(deviation: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    return lambda codes: codes[1:] + np.random.default_rng(1995).normal(0.0, deviation, len(codes) - 1)
+
+
+FAULTS: Mapping[str, Spoil] = {
+    "offset of the force": _fails(U, lambda codes: codes[1:] + 150.0),
+    "gain of the force": _fails(U, lambda codes: 1.3 * codes[1:]),
+    "late force": _fails(U, lambda codes: codes[:-1]),
+    "stuck force": _fails(U, lambda codes: np.repeat(codes[:1], len(codes) - 1)),
+    "noisy force": _fails(U, _noise(40.0)),
+    "offset of the displacement": _fails(Y, lambda codes: codes[1:] + 25.0),
+    "gain of the displacement": _fails(Y, lambda codes: 0.8 * codes[1:]),
+    "late displacement": _fails(Y, lambda codes: codes[:-1]),
+    "stuck displacement": _fails(Y, lambda codes: np.repeat(codes[:1], len(codes) - 1)),
+    "noisy displacement": _fails(Y, _noise(8.0)),
+}
+"""Faults of a channel, one at a time."""
+
 _FIXED = {"refresh_n": 0, "c": (-1.45, 0.51)}
 """C near the plant's A. A refresh depends on whether A has moved by REFRESH_STEP, which rounding may decide."""
 
@@ -218,6 +250,7 @@ CASES: Mapping[str, ReferenceCase] = {
         leave_out_after_alarm,
     ),
     "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
+    **{name: ReferenceCase(FAULTY, {}, spoil) for name, spoil in FAULTS.items()},
     "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}

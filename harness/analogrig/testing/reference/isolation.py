@@ -36,6 +36,9 @@ SURE, MORE_LIKELY, ALONE, FAULTY, NOT_BY_CHANCE = 3.0, 0.2, 2.0, 2.0, 11.0
 """Evidence, in nats: over another single change, over two parameters at once, over itself beside a second one, for a
 fault on top, and for a second parameter."""
 
+ROUNDING = 1e-6
+"""Evidence that a device may lose by rounding, relative to that over no change."""
+
 FAULT_N = 12
 """Samples from the onset of a fault to its diagnosis, at least."""
 
@@ -442,26 +445,31 @@ class Fit:
     @property
     def is_doubtful(self) -> bool:
         """True if rounding may decide what is named, or its onset."""
-        low, high = self.named(-NEAR), self.named(NEAR)
+        low, high = self.named(-1.0), self.named(1.0)
         return low != high or (high in SINGLE and len(self._likely_onsets(SINGLE.index(high))) > 1)
 
     def _likely_onsets(self, one: int) -> NDArray[np.int64]:
         """Onsets of a change any of which may be the best one."""
         gains = self._gains[one]
-        return np.unique(self._onsets_n[gains >= gains.max() - NEAR])
+        return np.unique(self._onsets_n[gains >= gains.max() - self._near(one)])
 
-    def named(self, more: float = 0.0) -> Change | None:
-        """The change that is sure with ``more`` evidence, if one is."""
+    def _near(self, one: int) -> float:
+        return NEAR + 0.5 * ROUNDING * max(float(self.any_alone[one]), 0.0)
+
+    def named(self, nears: float = 0.0) -> Change | None:
+        """The change that is sure, if one is; with so much more evidence as rounding may add, ``nears`` times."""
         one = int(self._alone.argmax())
+        more = nears * self._near(one) - ROUNDING * self.any_alone[one]
         pair = max(likely for pair, likely in self._any_pair.items() if one in pair or one not in range(3))
         if pair - self.any_alone[one] > NOT_BY_CHANCE - more:
             return Change.SEVERAL
         if one in range(3):
             penalty = self._penalty(one)
-            is_sure = self._stands_alone(one, penalty, more)
+            is_known = self._known[one] > EXTENT_KNOWN * (1.0 - 0.1 * NEAR * nears)
+            is_sure = is_known and self._stands_alone(one, penalty, more)
             lead = SURE + penalty
         else:
-            onset_n = self._onset_n[one] if not more else self._likely_onsets(one)[-1 if more > 0.0 else 0]
+            onset_n = self._onset_n[one] if not nears else self._likely_onsets(one)[-1 if nears > 0.0 else 0]
             is_sure = self._samples_n + onset_n >= FAULT_N and self.any_alone[one] - pair >= MORE_LIKELY - more
             lead = SURE + FAULTY
         others = np.delete(self._alone, one)
@@ -472,13 +480,11 @@ class Fit:
         return 0.5 * (extent + 1.0 / extent - 2.0)
 
     def _stands_alone(self, one: int, penalty: float, more: float) -> bool:
-        """True if a parameter alone is more likely than beside another one, and its extent is known."""
+        """True if a parameter alone is more likely than beside another one."""
         likely = self.any_alone[one] - penalty
         others = frozenset(range(3)) - {one}
         return bool(
-            self._known[one] > EXTENT_KNOWN * (1.0 - 0.1 * more)
-            and likely - self._beside[one] >= ALONE - more
-            and likely - self._any_pair[others] >= MORE_LIKELY - more
+            likely - self._beside[one] >= ALONE - more and likely - self._any_pair[others] >= MORE_LIKELY - more
         )
 
     def diagnosis(self, change: Change, repeated_n: int) -> ReferenceDiagnosis:
