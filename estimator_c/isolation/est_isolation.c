@@ -777,11 +777,8 @@ bool est_isolation_init(est_isolation_t* const self, const est_config_t* const c
 
 /// Store theta and C as the plant before a change.
 static void take_theta(est_isolation_t* const self, const est_t* const estimator) {
-    const uint8_t count = est_theta_count(estimator);
-    self->quiet         = true;
-    for (uint8_t i = 0U; i < count; i++) {
-        self->plant.theta[i] = est_theta(estimator, i);
-    }
+    self->quiet = true;
+    est_copy_theta(estimator, self->plant.theta);
     self->plant.c[0] = est_prefilter(estimator, 0U);
     self->plant.c[1] = est_prefilter(estimator, 1U);
 }
