@@ -180,17 +180,17 @@ typedef struct {
 /// Prepare for the first sample of an estimator with this configuration. The configuration is not copied; it must
 /// stay unchanged. `force_zero` is u at F = 0 [codes], from which the force of the spring is counted. Returns false
 /// iff na is not 2, nb + nk exceeds 3, the trigger is not the cumulative sum, or edges may come anywhere. The method
-/// then does not apply and the state is unusable. Cost: constant. RAM: 3.2 kB. May be called from an interrupt.
+/// then does not apply and the state is unusable. Cost: constant. RAM: 3.3 kB. May be called from an interrupt.
 EST_RESULT_USED bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
 /// Enter the input and result of an est_step(); to be called after every step. A gap before the diagnosis leaves it
-/// undecided. An alarm before the diagnosis does not interrupt it. Cost: 60 to 280 instructions on a Cortex-M4F, at an
-/// alarm 770 (make cost). May be called from an interrupt.
+/// undecided. An alarm before the diagnosis does not interrupt it. Cost: 60 to 330 instructions on a Cortex-M4F, at an
+/// alarm 920 (make cost). May be called from an interrupt.
 void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 
 /// Do one slice of the work after an alarm. Return true iff more work is waiting. A sample needs five calls, and
 /// EST_ISOLATION_SLICES_N if none comes after it: the more slices per sample, the more samples are weighed. If more
-/// than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided. Cost: some 1,070 instructions on a Cortex-M4F, at most 1,700; none before an alarm. May be
+/// than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided. Cost: some 710 instructions on a Cortex-M4F, at most 1,720; none before an alarm. May be
 /// called from an interrupt.
 bool est_isolation_work(est_isolation_t* self);
 

@@ -29,7 +29,7 @@ ONSETS_N = (20, 13, 9, 6, 4, 3, 2, 1)
 LAGS_N = 3
 """Samples in an equation."""
 
-SLICES_N, WEIGHED_N = 14, 22
+SLICES_N, WEIGHED_N = 12, 22
 """Slices of work per sample, and those that a sample takes with which hypotheses are weighed."""
 
 SURE, MORE_LIKELY, ALONE, FAULTY, NOT_BY_CHANCE = 3.0, 0.2, 2.0, 2.0, 11.0
