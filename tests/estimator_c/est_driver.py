@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator_c.evidence.cost import SLICES_N as DEVICE_SLICES_N
+
 CORE = Path(__file__).parents[2] / "estimator_c" / "core"
 ISOLATION = CORE.parent / "isolation"
 FIT = CORE.parent / "fit"
@@ -102,7 +104,7 @@ class Isolated:
 
 
 SLICES_N = 22
-"""As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes."""
+"""As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes which is weighed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,11 +213,12 @@ class Estimator:
         y: NDArray[np.float64],
         start: NDArray[np.int64],
         valid: ArrayLike | None = None,
-        slices: int = 1000,
+        slices: int = DEVICE_SLICES_N,
         force_zero: float = 0.0,
     ) -> Isolated:
         """Whole runs (t, n), each from the start: the diagnosis of the first alarm at or after ``start`` (t,).
 
+        :param slices: of work per sample, as many as in the device.
         :param force_zero: u where the force is zero.
         """
         runs, samples = u.shape
