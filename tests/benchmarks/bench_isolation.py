@@ -1,6 +1,7 @@
 """Isolation of changes of M, B and K, and of faults of the channels: errors, delay beside the bound, and extent.
 
-Full range, 12 bits and 1 LSB; 400 trials a change and 200 a fault, random phase and onset, fixed seed.
+Full range, 12 bits and 1 LSB; the work per sample of the device; 100 trials a change and 200 a fault, random phase and
+onset, fixed seed.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ CHANGES: tuple[Change, ...] = (
 SEED = 31
 
 
-def figures(trials: int = 400, faults: int = 200) -> Iterator[Figure]:
+def figures(trials: int = 100, faults: int = 200) -> Iterator[Figure]:
     """One row a change and a clock, and one a fault and a clock."""
     clocks = {"one clock": (SHARED_CLOCK, FULL), "edges anywhere, 20 ppm": (OWN_CLOCK, FULL_FREE)}
     with tempfile.TemporaryDirectory() as folder:

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.catalogue import Change
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import CHANNEL_FAULTS, DIAGNOSABLE, DIAGNOSES, ESTIMATES, MisfitPeriod, Verdict
+from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChannelFault, MisfitPeriod, Verdict
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -27,8 +26,6 @@ MOST_EDGE_SHIFT = 1.5e-3
 
 _EXAMINED_SAMPLES = 4000
 
-_SHOWN_FAULTS = 5
-
 
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences of advice, the most severe first; empty if there is nothing to advise."""
@@ -41,7 +38,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_theta_without_a_model(run),
         *_assumed_settings(run),
         *_overloads(verdict),
-        *_channel_faults(run),
+        *_channel_faults(verdict),
         *_noise_setting(run),
         *_edge_spacing(run),
         *_warm_up(run),
@@ -109,19 +106,19 @@ def _overloads(verdict: Verdict) -> Iterator[str]:
         )
 
 
-def _channel_faults(run: Run) -> Iterator[str]:
-    """The scenario has none: the device is wrong, or the rig is."""
-    named = [
-        f"{DIAGNOSABLE[Change(change)]} (sample {index})"
-        for index, change in zip(run.diagnosis_index.tolist(), run.diagnosis_change.tolist(), strict=True)
-        if change in CHANNEL_FAULTS
-    ]
-    if named:
-        more = ", ..." if len(named) > _SHOWN_FAULTS else ""
+def _channel_faults(verdict: Verdict) -> Iterator[str]:
+    """One sentence for each fault. The scenario has none: the rig has it, or the device is wrong."""
+    for name, faults in itertools.groupby(sorted(verdict.channel_faults, key=_name), _name):
+        first, *others = faults
+        more = f" and {number_of(len(others), 'later sample')}" if others else ""
         yield (
-            f"the device diagnosed a fault of a channel, which the scenario does not contain:"
-            f" {', '.join(named[:_SHOWN_FAULTS])}{more}; check cables, inputs and the clock of the rig"
+            f"the device diagnosed a fault of a channel ({name}) at sample {first.sample}{more}, not a change of the"
+            f" plant; {first.cure}"
         )
+
+
+def _name(fault: ChannelFault) -> str:
+    return fault.name
 
 
 def _noise_setting(run: Run) -> Iterator[str]:

@@ -8,6 +8,7 @@ from analogrig.judging.advice import advice
 from analogrig.judging.verdict import (
     ESTIMATES,
     ChangeVerdict,
+    ChannelFault,
     DiagnosisVerdict,
     MisfitPeriod,
     SegmentEstimate,
@@ -46,6 +47,7 @@ def summary(run: Run, verdict: Verdict) -> str:
         "false alarms": f"{_alarms(verdict.false_alarms)} in {number_of(run.samples, 'sample')}",
         "false or not, depending on the instants of the changes": verdict.doubtful_alarms
         and f"alarms at {', '.join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))}",
+        "faults of channels": verdict.channel_faults and channel_faults_text(verdict.channel_faults),
         "misfit": verdict.fit and misfit_text(verdict.fit),
         missing_text(run): verdict.missing_n and number_of(verdict.missing_n, "sample"),
         "overload lamps": verdict.overloads and lamps_text(verdict.overloads),
@@ -59,6 +61,12 @@ def summary(run: Run, verdict: Verdict) -> str:
     digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  {digest}"]
     return "\n".join(lines)
+
+
+def channel_faults_text(faults: Sequence[ChannelFault]) -> str:
+    """Faults of the channels: ``displacement stuck at 433 (since 419)``."""
+    shown = [f"{fault.name} at {fault.sample} (since {fault.onset})" for fault in faults[:SHOWN_ALARMS]]
+    return ", ".join([*shown, *(["..."] if len(faults) > SHOWN_ALARMS else [])])
 
 
 def misfit_text(fit: Sequence[MisfitPeriod]) -> str:
