@@ -174,7 +174,7 @@ static bool derive_plant(est_plant_t* const self, const est_config_t* const conf
         self->b[i]      = acts ? self->theta[(2U + i) - config->nk] : 0.0F;
         self->gain += self->b[i] / sum;
     }
-    self->direct = (config->nk == 0U) ? self->b[0] : 0.0F;
+    self->direct       = (config->nk == 0U) ? self->b[0] : 0.0F;
     const float offset = config->offset ? (self->theta[2U + config->nb + config->nc] / sum) : 0.0F;
     self->rest         = offset + (self->gain * force_zero);
     return true;
@@ -248,18 +248,18 @@ static float filter(const float* const factors, const float* const x) {
 /// sample, the force acts from the onset on, and the second sample has half the weight. An edge of u may come anywhere
 /// within the interval; b_0 is then the share of the new level.
 static void drive_plant(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
-    const est_plant_t* const plant = &self->plant;
-    const float* const       f     = self->force;
-    const float* const       x     = self->displacement;
-    const bool               first = age_n == 1U;
-    const float              rise  = x[0] - x[1];
-    const float spring = first ? (plant->hold * (x[1] + (0.33333333F * rise))) : filter(plant->spring, x);
-    const float damper = first ? ((plant->hold * plant->lag_n) * rise) : filter(plant->damper, x);
-    const float later  = (plant->gain * plant->hold) - plant->direct;
-    const float force  = first ? ((plant->direct * f[0]) + (later * f[1])) : filter(plant->b, f);
-    out[0]             = spring + damper - force;
-    out[1]             = -damper;
-    out[2]             = -spring;
+    const est_plant_t* const plant  = &self->plant;
+    const float* const       f      = self->force;
+    const float* const       x      = self->displacement;
+    const bool               first  = age_n == 1U;
+    const float              rise   = x[0] - x[1];
+    const float              spring = first ? (plant->hold * (x[1] + (0.33333333F * rise))) : filter(plant->spring, x);
+    const float              damper = first ? ((plant->hold * plant->lag_n) * rise) : filter(plant->damper, x);
+    const float              later  = (plant->gain * plant->hold) - plant->direct;
+    const float              force  = first ? ((plant->direct * f[0]) + (later * f[1])) : filter(plant->b, f);
+    out[0]                          = spring + damper - force;
+    out[1]                          = -damper;
+    out[2]                          = -spring;
 }
 
 /// Compute the inputs of the effects of an offset, a gain and a delay of the force for an onset `age_n` samples ago. A
@@ -321,9 +321,9 @@ static void enter_residual(est_isolation_t* const self) {
 /// Enter the sample into the runs of equal codes, and into the unrest of the force: "the variance of its steps is four
 /// times an unusual one", a likelihood ratio.
 static void enter_habits(est_isolation_t* const self) {
-    const float* const f       = self->force;
-    const float* const x       = self->displacement;
-    const float        ratio   = squared_step(f[0], f[1], f[2]) / (UNUSUAL * (self->habits.unrest + least_unrest(self)));
+    const float* const f     = self->force;
+    const float* const x     = self->displacement;
+    const float        ratio = squared_step(f[0], f[1], f[2]) / (UNUSUAL * (self->habits.unrest + least_unrest(self)));
     const float        counted = (ratio < CLIP) ? ratio : CLIP;
     self->unrest               = (self->habits.known_n < HABITS_N) ? 0.0F : ((0.375F * counted) - LN_2);
     self->same_n[FORCE]        = equal(f[0], f[1]) ? count_up(self->same_n[FORCE]) : 0U;
@@ -509,11 +509,11 @@ static void weigh_plant(est_isolation_t* const self, const uint8_t number) {
         for (uint8_t j = 0U; j <= i; j++) {
             left[j] = row[j] - (share * first[j]) - ((rest[i] * pushes.variance[1]) * rest[j]);
         }
-        const float vector       = onset->vector[i] - (first[i] * pushes.change[0]) - (rest[i] * pushes.change[1]);
-        const float known        = left[i] + PRIOR;
-        const float change       = vector / known;
-        const float gain         = pushes.gain + (vector * change);
-        ones[i]                  = (one_t){ .vector = vector, .known = known, .change = change, .gain = gain };
+        const float vector = onset->vector[i] - (first[i] * pushes.change[0]) - (rest[i] * pushes.change[1]);
+        const float known  = left[i] + PRIOR;
+        const float change = vector / known;
+        const float gain   = pushes.gain + (vector * change);
+        ones[i]            = (one_t){ .vector = vector, .known = known, .change = change, .gain = gain };
         enter_single(self, i, number, gain, change, known);
         for (uint8_t j = 0U; j < i; j++) {
             weigh_pair(fit, ones, i, j, left[j]);
@@ -536,8 +536,9 @@ EST_INLINE fault_t weigh_linear(const est_onset_t* const onset,
                                 const bool               delays) {
     const float* const shared = onset->shared[i];
     const float        rest   = shared[1] - (pushes->share * shared[0]);
-    const float vector = onset->vector[JOINT + i] - (shared[0] * pushes->change[0]) - (rest * pushes->change[1]);
-    const float known  = onset->known[i] - ((shared[0] * pushes->variance[0]) * shared[0]) - ((rest * pushes->variance[1]) * rest);
+    const float        vector = onset->vector[JOINT + i] - (shared[0] * pushes->change[0]) - (rest * pushes->change[1]);
+    const float        known =
+        onset->known[i] - ((shared[0] * pushes->variance[0]) * shared[0]) - ((rest * pushes->variance[1]) * rest);
     const float left   = greater(known, 1.0e-9F);  // smaller only by rounding
     const float change = delays ? 1.0F : (vector / left);
     const float gain   = pushes->gain + (((2.0F * vector) - (left * change)) * change);
@@ -558,12 +559,12 @@ static uint8_t fault_of(const uint_fast8_t channel, const uint_fast8_t kind) {
 /// whose codes are all equal. A displacement that is stuck explains every residual. Noise has an unknown variance; in
 /// the force it shows in the force too.
 static void weigh_faults(est_isolation_t* const self, const uint8_t number) {
-    const est_onset_t* const onset    = &self->onsets[number];
-    const pushes_t           pushes   = free_pushes(self, onset);
-    const uint16_t           age_n    = age_of(self, onset);
-    const float              n        = (float)age_n;
-    const float              noise    = gain_of_variance(onset->energy, n);
-    const float              unrest   = 0.5F * onset->unrest;  // steps of neighbours are correlated
+    const est_onset_t* const onset           = &self->onsets[number];
+    const pushes_t           pushes          = free_pushes(self, onset);
+    const uint16_t           age_n           = age_of(self, onset);
+    const float              n               = (float)age_n;
+    const float              noise           = gain_of_variance(onset->energy, n);
+    const float              unrest          = 0.5F * onset->unrest;  // steps of neighbours are correlated
     const float              noisy[CHANNELS] = { noise + unrest, noise };
     for (uint_fast8_t channel = 0U; channel < CHANNELS; channel++) {
         fault_t stuck = { .gain = onset->energy };

@@ -135,15 +135,15 @@ typedef struct {
 typedef struct {
     float theta[EST_THETA_MAX];
     float c[2];
-    float a[EST_ISOLATION_LAGS_N];  ///< factors of y(k), y(k-1), y(k-2)
-    float b[EST_ISOLATION_LAGS_N];  ///< factors of u(k), u(k-1), u(k-2)
-    float direct;                   ///< share of b[0] that an edge within the interval may have
-    float hold;       ///< share of the final deflection reached one sample after a force step
-    float lag_n;      ///< B / K
+    float a[EST_ISOLATION_LAGS_N];       ///< factors of y(k), y(k-1), y(k-2)
+    float b[EST_ISOLATION_LAGS_N];       ///< factors of u(k), u(k-1), u(k-2)
+    float direct;                        ///< share of b[0] that an edge within the interval may have
+    float hold;                          ///< share of the final deflection reached one sample after a force step
+    float lag_n;                         ///< B / K
     float spring[EST_ISOLATION_LAGS_N];  ///< effect of K y, as a force, on the equation of y: factors as those of a
     float damper[EST_ISOLATION_LAGS_N];  ///< the same for B y'
-    float rest;       ///< y at F = 0 [codes]
-    float gain;       ///< static gain: y per u
+    float rest;                          ///< y at F = 0 [codes]
+    float gain;                          ///< static gain: y per u
 } est_plant_t;
 
 /// State of an isolation. The fields are private; read est_isolation_diagnosis().
@@ -166,10 +166,10 @@ typedef struct {
     est_habits_t        habits;
     uint8_t             same_n[EST_ISOLATION_CHANNELS_N];    ///< codes that equal the last one, up to this sample
     float               surprise[EST_ISOLATION_CHANNELS_N];  ///< of each of them, unless the channel is stuck [nats]
-    float               force[EST_ISOLATION_LAGS_N + 1U];         ///< u less its zero, up to the present sample
+    float               force[EST_ISOLATION_LAGS_N + 1U];    ///< u less its zero, up to the present sample
     float               displacement[EST_ISOLATION_LAGS_N + 1U];  ///< y less its rest, likewise
-    float               unrest;                              ///< of this sample, as in est_onset_t
-    float               driving[EST_ISOLATION_EFFECTS_N];    ///< input of the effects, if the onset was long ago
+    float               unrest;                                   ///< of this sample, as in est_onset_t
+    float               driving[EST_ISOLATION_EFFECTS_N];         ///< input of the effects, if the onset was long ago
     float               residual[2];  ///< whitened y less the response of the plant before the change, newest first
     est_fit_t           fit;
     est_diagnosis_t     diagnosis;

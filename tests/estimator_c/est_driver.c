@@ -17,14 +17,14 @@ typedef struct {
 static est_t        self;
 static est_config_t config;
 
-/* The estimate of the caller, whose orders are na = 2 and nb = 3. */
+/* The estimate of the caller; na = 2. */
 static void set_theta(const double* theta) {
     for (unsigned i = 0; i < est_theta_count(&self); i++) {
         self.theta[i] = (float)theta[i];
     }
     if (est_delta_applies(&config)) {
         est_delta_from_plain(self.theta, 1.0F, 2U);
-        est_delta_from_plain(&self.theta[3], self.theta[2], 2U);
+        est_delta_from_plain(&self.theta[3], self.theta[2], (uint_fast8_t)(config.nb - 1U));
     }
 }
 

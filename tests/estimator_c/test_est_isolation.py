@@ -239,6 +239,11 @@ def test_fast_poles_are_a_suspension_too(by_hand: Estimator, a1: float, a2: floa
     assert by_hand.diagnose((a1, a2, *SUSPENSION[2:]), steps()).left.any()
 
 
+def test_model_may_have_fewer_lags_than_the_longest(by_hand: Estimator) -> None:
+    assert by_hand.init(nb=2, nk=0)
+    assert by_hand.diagnose((-1.7, 0.74, 0.02, 0.02, 0.0), steps()).left.any()
+
+
 def test_alarm_before_the_plant_was_ever_well_leaves_it_undecided(by_hand: Estimator) -> None:
     assert not by_hand.diagnose(SUSPENSION, steps(quiet_n=SETTLED_N - 20)).left.any()
 
