@@ -760,7 +760,7 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     self->turn        = 0U;
     self->worked_n    = 0U;
     self->waiting_n   = self->onsets[0].before_n;
-    self->nats        = 0.5F / est_noise_variance(estimator);
+    self->nats        = 0.5F / est_scale(estimator);  // the misfit of the model is noise to isolation
     self->residual[0] = sample_before(self, self->waiting_n)->innovation;
     self->residual[1] = sample_before(self, self->waiting_n + 1U)->innovation;
     for (uint32_t i = EST_ISOLATION_LAGS_N; i > 0U; i--) {
