@@ -880,6 +880,11 @@ float est_theta(const est_t* const self, const uint8_t index) {
 #endif
 }
 
+void est_copy_theta(const est_t* const self, float* const out) {
+    EST_ASSERT((self != NULL) && (out != NULL));
+    copy_theta(self, est_shape_of(self->config), out);
+}
+
 float est_variance(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
     const est_shape_t shape                      = est_shape_of(self->config);

@@ -490,6 +490,10 @@ uint8_t est_theta_count(const est_t* self);
 /// still contains the effect of the slipped edge. Cost: constant. May be called from an interrupt.
 float est_theta(const est_t* self, uint8_t index);
 
+/// All elements of theta, as est_theta() of each. out has EST_THETA_MAX elements, those beyond est_theta_count() without
+/// meaning. Cost: as one est_theta(). May be called from an interrupt.
+void est_copy_theta(const est_t* self, float* out);
+
 /// One diagonal element of P [noise variances]. index is in [0, est_theta_count()), asserted. After an alarm and
 /// until the next sample, P is still that before the alarm. Cost: O(n). May be called from an interrupt.
 float est_variance(const est_t* self, uint8_t index);

@@ -43,9 +43,9 @@ extern "C" {
 /// Number of recent sequence numbers that mark a message as repeated. A repeated message must not be executed twice.
 #define DEVICE_LATE_MAX 32U
 
-/// Slices of work on a diagnosis per sample. A sample needs EST_ISOLATION_SLICES_N, and up to 20 shorter samples wait
-/// at the alarm. The diagnosis is 0.6 samples later than with unlimited work.
-#define DEVICE_ISOLATION_SLICES 18U
+/// Slices of work on a diagnosis per sample. Up to 20 samples wait at the alarm, which take 55; then every second or
+/// third sample is weighed. The diagnosis is 3 samples later than with unlimited work.
+#define DEVICE_ISOLATION_SLICES 12U
 
 /// Properties of a port.
 typedef struct {

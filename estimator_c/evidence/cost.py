@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import shutil
 import statistics
 import subprocess
@@ -41,6 +42,9 @@ FLAGS = (
     *("-Wall", "-Wextra", "-Wdouble-promotion", "-Werror"),
     *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}", f"-I{ISOLATION}", f"-I{FIT}"),
 )
+
+SLICES_N = int(re.findall(r"define DEVICE_ISOLATION_SLICES (\d+)U", (DEVICE / "device.h").read_text("utf-8"))[0])
+"""Slices of work on a diagnosis that the device does for each sample."""
 
 CLOCK_MHZ, CYCLES = 168.0, 1.5
 """For estimates of time: the clock of a usual M4F, and cycles per instruction (1.2 to 2, as its memory has it)."""
@@ -292,7 +296,10 @@ class ImageRunner:
         flags = ("-O2", *processor.flags, *orders.flags(fixed=False), "-DSUBJECT_ISOLATES")
         image = link(self._folder / "image.elf", sources, flags)
         work = count_steps(image, processor.machine, *calls)
-        yield Steps(f"{processor.name}, isolation, a slice of work", [count for count in work if count > min(work)])
+        slices = [count for count in work if count > min(work)]
+        yield Steps(f"{processor.name}, isolation, a slice of work", slices)
+        together = [sum(slices[first : first + SLICES_N]) for first in range(len(slices) - SLICES_N)]
+        yield Steps(f"{processor.name}, isolation, the {SLICES_N} slices of a sample", together)
         entered = count_steps(image, processor.machine, *calls[1:], calls[0])
         yield Steps(f"{processor.name}, isolation, a sample entered", entered)
 

@@ -107,7 +107,7 @@ static void isolate(est_isolation_t* const isolation,
         (void)est_isolation_work(isolation);
     }
     const est_diagnosis_t diagnosis = est_isolation_diagnosis(isolation);
-    expect(number_is_finite(diagnosis.extent) && (diagnosis.change <= EST_CHANGE_SEVERAL));
+    expect(number_is_finite(diagnosis.extent) && (diagnosis.change <= EST_CHANGE_DISPLACEMENT_NOISE));
     expect((diagnosis.onset_low_n <= diagnosis.onset_n) && (diagnosis.onset_n <= diagnosis.onset_high_n));
     expect(diagnosis.onset_high_n < EST_ISOLATION_KEPT_N);
 }

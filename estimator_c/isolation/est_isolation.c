@@ -2,54 +2,103 @@
 
 #include "est_isolation.h"
 #include "est_assert.h"
+#include "est_shape.h"
 
 #include <stddef.h>
 
 #define EFFECTS EST_ISOLATION_EFFECTS_N
-#define PUSH 3U  ///< index of the impulse, which stands for an onset between two samples; M, B and K come before it
+#define JOINT EST_ISOLATION_JOINT_N
+#define PUSHES EST_ISOLATION_PUSHES_N
+#define TRIANGLE_N ((JOINT * (JOINT + 1U)) / 2U)
+#define SINGLES EST_ISOLATION_SINGLES_N
+#define CHANNELS EST_ISOLATION_CHANNELS_N
+
+/// Index of the first impulse among the effects, and of the first fault among the single changes. M, B and K come
+/// before it.
+#define PARAMETERS 3U
+
+/// Channels.
+#define FORCE 0U
+#define DISPLACEMENT 1U
+
+/// Faults of a channel. The first three have effects that are linear in their size.
+#define OFFSET 0U
+#define GAIN 1U
+#define DELAY 2U
+#define STUCK 3U
+#define NOISE 4U
+#define LINEAR_N 3U
+#define KINDS_N 5U
+
+/// Onsets that a slice of work enters a sample into. Last slices in which a sample is entered, and weighed.
+#define AT_ONCE 2U
+#define ENTERED (EST_ISOLATION_ONSETS_N / AT_ONCE)
+#define WEIGHED (ENTERED + (2U * EST_ISOLATION_ONSETS_N))
 
 /// Samples after an alarm at which theta counts as the plant again, and the refinement of the extent ends.
 #define SETTLED_N 100U
 
-/// Evidence for a single changed parameter [nats]. SURE: over any other single parameter, a factor of 20.
-/// MORE_LIKELY: over the two others together, 1.5; without a force they explain the same, and soon after far less.
-/// ALONE: over itself and a second parameter that changed by WORTH_TELLING or more, 7.
+/// Evidence for a single change [nats]. SURE: over any other single change, a factor of 20. MORE_LIKELY: over two
+/// changed parameters together, 1.2; without a force they explain the same, and soon after far less. ALONE: over itself
+/// and a second parameter that changed by WORTH_TELLING or more, 7. FAULTY: for a fault of a channel, on top of SURE.
 #define SURE 3.0F
-#define MORE_LIKELY 0.4F
+#define MORE_LIKELY 0.2F
 #define ALONE 2.0F
 #define WORTH_TELLING 0.15F
+#define FAULTY 2.0F
 
-/// Evidence for a second changed parameter [nats], and for an onset between two samples, which has one more free
-/// parameter than an onset at a sample.
+/// What rounding may add to the evidence of one hypothesis over another, relative to that over no change: the sums of a
+/// hundred samples have lost their last five bits.
+#define ROUNDING 1.0e-6F
+
+/// Evidence for a second changed parameter [nats].
 #define NOT_BY_CHANCE 11.0F
-#define BETWEEN 2.0F
+
+/// Samples from the onset of a fault on which its diagnosis is based, at least. Fewer are explained by any fault.
+#define FAULT_N 12U
 
 /// Accuracy of the extent at which it is stated: a standard deviation of 1.1 %. Reciprocal variances are halved here
 /// and in the normal equations: a deviation then costs its square times that [nats].
 #define EXTENT_KNOWN 4000.0F
 
-/// Prior of a change: a standard deviation of 1. Prior of an impulse: almost none.
+/// Prior of a change: a standard deviation of 1. The impulses have that of the noise.
 #define PRIOR 0.5F
-#define UNKNOWN 1.0e-3F
+
+/// Prior of the size of a change: its logarithm may lie anywhere in an interval of 4. A size x then costs
+/// ln(1 + SIZES x^2 known) / 2.
+#define SIZES 20.0F
+
+/// Half the reciprocal variance, per sample, of the logarithm of a variance.
+#define VARIANCE_KNOWN 0.25F
+
+/// Samples on which the habits of the channels are based.
+#define HABITS_N 128U
+
+/// Variance that a noisy force exceeds, in usual variances, and the largest square that counts, in such variances.
+#define UNUSUAL 4.0F
+#define CLIP 25.0F
 
 /// Halvings that suffice for the largest arcosh of a plant, 7.6 with a2 = 1e-6.
 #define HALVINGS_N 8U
 
-/// Doublings that suffice for the logarithm of the smallest a2, 1e-6.
-#define DOUBLINGS_N 20U
+/// Scalings that suffice for the logarithm of the smallest number, 2^-31.
+#define SCALINGS_N 5U
 
 #define LN_2 0.69314718F
 
 // ---------------------------------------------         PLANT          ---------------------------------------------
 
-/// Natural logarithm of 1e-6 < a < 1. Near 1 it is 2 artanh((x - 1) / (x + 1)).
+/// Natural logarithm of 2^-31 <= a < 1. Near 1 it is 2 artanh((x - 1) / (x + 1)).
 static float logarithm(const float a) {
-    float x   = a;
-    float out = 0.0F;
-    for (uint8_t i = 0U; i < DOUBLINGS_N; i++) {
-        if (x < 0.70710678F) {
-            x += x;
-            out -= LN_2;
+    static const float scales[SCALINGS_N] = { 65536.0F, 256.0F, 16.0F, 4.0F, 2.0F };
+    static const float logs[SCALINGS_N]   = { 16.0F * LN_2, 8.0F * LN_2, 4.0F * LN_2, 2.0F * LN_2, LN_2 };
+    float              x                  = a;
+    float              out                = 0.0F;
+    for (uint8_t i = 0U; i < SCALINGS_N; i++) {
+        const float scaled = scales[i] * x;
+        if (scaled < 1.41421356F) {
+            x = scaled;
+            out -= logs[i];
         }
     }
     const float t = (x - 1.0F) / (x + 1.0F);
@@ -96,6 +145,9 @@ static bool derive_plant(est_plant_t* const self, const est_config_t* const conf
     const float a1  = self->theta[0];
     const float a2  = self->theta[1];
     const float sum = 1.0F + a1 + a2;
+    self->a[0]      = 1.0F;
+    self->a[1]      = a1;
+    self->a[2]      = a2;
     if ((a2 < 1.0e-6F) || (a2 >= 1.0F) || (sum < 1.0e-6F)) {
         return false;  // MISRA D4
     }
@@ -117,9 +169,12 @@ static bool derive_plant(est_plant_t* const self, const est_config_t* const conf
     from_moments(self->spring, sum, drag_n + first, second + (2.0F * ((lag_n * (first + drag_n)) - (sum / q))));
     from_moments(self->damper, 0.0F, -drag_n, -2.0F * lag_n * (first + drag_n));
     self->gain = 0.0F;
-    for (uint8_t i = 0U; i < config->nb; i++) {
-        self->gain += self->theta[2U + i] / sum;
+    for (uint8_t i = 0U; i < EST_ISOLATION_LAGS_N; i++) {
+        const bool acts = (i >= config->nk) && (i < (config->nb + config->nk));  // nb + nk: est_isolation_init()
+        self->b[i]      = acts ? self->theta[(2U + i) - config->nk] : 0.0F;
+        self->gain += self->b[i] / sum;
     }
+    self->direct       = (config->nk == 0U) ? self->b[0] : 0.0F;
     const float offset = config->offset ? (self->theta[2U + config->nb + config->nc] / sum) : 0.0F;
     self->rest         = offset + (self->gain * force_zero);
     return true;
@@ -131,6 +186,8 @@ static const est_kept_t* sample_before(const est_isolation_t* const self, const 
     return &self->kept[((self->newest + EST_ISOLATION_KEPT_N) - ago) % EST_ISOLATION_KEPT_N];
 }
 
+static bool equal(const float a, const float b) { return !((a < b) || (a > b)); }
+
 static uint8_t count_up(const uint8_t n) { return (n < UINT8_MAX) ? (uint8_t)(n + 1U) : n; }
 
 static void keep(est_isolation_t* const self, const est_sample_t sample, const float innovation) {
@@ -139,92 +196,208 @@ static void keep(est_isolation_t* const self, const est_sample_t sample, const f
     self->known_n            = (uint8_t)((self->known_n < EST_ISOLATION_KEPT_N) ? (self->known_n + 1U) : self->known_n);
 }
 
-/// Measured force: u counted from F = 0.
-static float force(const est_isolation_t* const self, const uint32_t ago) {
-    return sample_before(self, ago)->u - self->force_zero;
+/// Square of the smaller one of two steps of u, between three samples. An edge is a step beside a small one.
+static float squared_step(const float newest, const float middle, const float oldest) {
+    const float last  = newest - middle;
+    const float first = oldest - middle;
+    const float newer = last * last;
+    const float older = first * first;
+    return (newer < older) ? newer : older;
 }
 
-/// Effect on y of the force during the past sample, for an onset `age_n` samples ago. An edge of u may come anywhere
-/// within the interval; b_0 is then the share of the new level, if nk is 0.
-static float force_effect(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n) {
-    const est_config_t* const config = self->config;
-    const float* const        b      = &self->plant.theta[2];
-    if (age_n == 1U) {
-        const float direct = (config->nk == 0U) ? b[0] : 0.0F;
-        const float whole  = self->plant.gain * self->plant.hold;
-        return (direct * force(self, ago)) + ((whole - direct) * force(self, ago + 1U));  // MISRA D4
-    }
-    float out = 0.0F;
-    for (uint8_t i = 0U; i < config->nb; i++) {
-        out += b[i] * force(self, ago + i + config->nk);  // at most two samples back: checked by est_isolation_init()
-    }
-    return out;
+/// Mean square of the steps of u that is never unusual: that of steps of a 64th of an edge.
+static float least_unrest(const est_isolation_t* const self) {
+    return (self->config->edge_codes * self->config->edge_codes) / 4096.0F;
 }
 
-/// Compute the inputs of the effects for an onset `age_n` samples ago. With x the measured displacement and all else
-/// unchanged,
+/// Follow the habits of the channels. A noise that has just begun hardly counts.
+static void follow_habits(est_isolation_t* const self) {
+    est_habits_t* const     habits  = &self->habits;
+    const est_kept_t* const now     = sample_before(self, 0U);
+    const est_kept_t* const last    = sample_before(self, 1U);
+    const bool              learns  = habits->known_n < HABITS_N;
+    const float             present = squared_step(now->u, last->u, sample_before(self, 2U)->u);
+    const float             most    = UNUSUAL * (habits->unrest + least_unrest(self));
+    habits->known_n                 = learns ? (uint8_t)(habits->known_n + 1U) : habits->known_n;
+    const float rate                = 1.0F / (float)habits->known_n;
+    habits->same[FORCE] += rate * ((equal(now->u, last->u) ? 1.0F : 0.0F) - habits->same[FORCE]);
+    habits->same[DISPLACEMENT] += rate * ((equal(now->y, last->y) ? 1.0F : 0.0F) - habits->same[DISPLACEMENT]);
+    habits->unrest += rate * (((learns || (present < most)) ? present : most) - habits->unrest);
+}
+
+/// Move on to the sample `ago` samples before the newest one.
+static void advance(est_isolation_t* const self, const uint32_t ago) {
+    const est_kept_t* const now = sample_before(self, ago);
+    for (uint8_t i = EST_ISOLATION_LAGS_N; i > 0U; i--) {
+        self->force[i]        = self->force[i - 1U];
+        self->displacement[i] = self->displacement[i - 1U];
+    }
+    self->force[0]        = now->u - self->force_zero;
+    self->displacement[0] = now->y - self->plant.rest;
+}
+
+/// Sum of products over the lags.
+static float filter(const float* const factors, const float* const x) {
+    return (factors[0] * x[0]) + (factors[1] * x[1]) + (factors[2] * x[2]);
+}
+
+/// Compute the inputs of the effects of M, B and K for an onset `age_n` samples ago. With x the measured displacement
+/// and all else unchanged,
 ///     M0 d'' + B0 d' + K0 d = -nu (F - B0 x' - K0 x) - dB x' - dK x,    nu = 1 - M0/M,
-/// gives the deviation d of the plant from its course. It is linear in a change of M, of B, and of K.
-static void drive(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n, float* const out) {
-    const est_plant_t* const plant = &self->plant;
-    float                    spring;
-    float                    damper;
-    if (age_n == 1U) {  // the force acts from the first sample on: the second has half the weight
-        const float rise = sample_before(self, ago)->y - sample_before(self, ago + 1U)->y;
-        spring           = plant->hold * (sample_before(self, ago + 1U)->y + (0.33333333F * rise) - plant->rest);
-        damper           = plant->hold * plant->lag_n * rise;
-    } else {
-        spring = 0.0F;
-        damper = 0.0F;
-        for (uint32_t i = 0U; i < 3U; i++) {
-            const float x = sample_before(self, ago + i)->y - plant->rest;
-            spring += plant->spring[i] * x;
-            damper += plant->damper[i] * x;
+/// gives the deviation d of the plant from its course. It is linear in a change of M, of B, and of K. In the first
+/// sample, the force acts from the onset on, and the second sample has half the weight. An edge of u may come anywhere
+/// within the interval; b_0 is then the share of the new level.
+static void drive_plant(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
+    const est_plant_t* const plant  = &self->plant;
+    const float* const       f      = self->force;
+    const float* const       x      = self->displacement;
+    const bool               first  = age_n == 1U;
+    const float              rise   = x[0] - x[1];
+    const float              spring = first ? (plant->hold * (x[1] + (0.33333333F * rise))) : filter(plant->spring, x);
+    const float              damper = first ? ((plant->hold * plant->lag_n) * rise) : filter(plant->damper, x);
+    const float              later  = (plant->gain * plant->hold) - plant->direct;
+    const float              force  = first ? ((plant->direct * f[0]) + (later * f[1])) : filter(plant->b, f);
+    out[0]                          = spring + damper - force;
+    out[1]                          = -damper;
+    out[2]                          = -spring;
+}
+
+/// Compute the inputs of the effects of an offset, a gain and a delay of the force for an onset `age_n` samples ago. A
+/// force that is measured f too high leaves the equation a residual of -B f. An offset is f = 1. A gain is f = u less
+/// its zero, as its size is 1 - old/new. A delay is f(k) = u(k) - u(k + 1); the one of the present sample is not known.
+static void drive_force(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
+    const float* const b = self->plant.b;
+    const float* const f = self->force;
+    const uint16_t     n = (age_n < EST_ISOLATION_LAGS_N) ? age_n : EST_ISOLATION_LAGS_N;
+    out[OFFSET]          = -b[0];
+    out[GAIN]            = -b[0] * f[0];
+    out[DELAY]           = 0.0F;
+    for (uint16_t i = 1U; i < n; i++) {
+        out[OFFSET] -= b[i];
+        out[GAIN] -= b[i] * f[i];
+        out[DELAY] -= b[i] * (f[i] - f[i - 1U]);
+    }
+}
+
+/// The same of the displacement. If it is measured f too high the residual is A f. A late displacement obeys the
+/// equation of the sample before: the residual is the step of -B u, and at first A times the steps of y before the
+/// onset, because one code comes twice.
+static void drive_displacement(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
+    const float* const a = self->plant.a;
+    const float* const f = self->force;
+    const float* const x = self->displacement;
+    out[OFFSET]          = 0.0F;
+    out[GAIN]            = 0.0F;
+    out[DELAY]           = filter(self->plant.b, &f[1]) - filter(self->plant.b, f);
+    for (uint16_t i = 0U; i < EST_ISOLATION_LAGS_N; i++) {
+        if (age_n > i) {
+            out[OFFSET] += a[i];
+            out[GAIN] += a[i] * x[i];
+        } else {
+            out[DELAY] += a[i] * (x[i] - x[i + 1U]);
         }
     }
-    out[0] = spring + damper - force_effect(self, ago, age_n);
-    out[1] = -damper;
-    out[2] = -spring;
 }
 
-/// Enter a sample into the residual: y less the response of the plant before the change, whitened by C as in
+/// Compute the inputs of all effects for an onset `age_n` samples ago. The second impulse is a past value of its effect.
+static void drive(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
+    drive_plant(self, age_n, out);
+    out[PARAMETERS]      = (age_n == 1U) ? 1.0F : 0.0F;
+    out[PARAMETERS + 1U] = 0.0F;
+    drive_force(self, age_n, &out[JOINT]);
+    drive_displacement(self, age_n, &out[JOINT + LINEAR_N]);
+}
+
+/// Enter the sample into the residual: y less the response of the plant before the change, whitened by C as in
 /// est_whitener.h.
-static void enter_residual(est_isolation_t* const self, const uint32_t ago) {
-    const est_config_t* const config = self->config;
-    const float* const        theta  = self->plant.theta;
-    float                     out    = sample_before(self, ago)->y + (theta[0] * sample_before(self, ago + 1U)->y) +
-                (theta[1] * sample_before(self, ago + 2U)->y);
-    for (uint8_t i = 0U; i < config->nb; i++) {
-        out -= theta[2U + i] * sample_before(self, ago + i + config->nk)->u;
-    }
-    out -= config->offset ? theta[2U + config->nb + config->nc] : 0.0F;
-    out -= (self->plant.c[0] * self->residual[0]) + (self->plant.c[1] * self->residual[1]);
-    self->residual[1] = self->residual[0];
-    self->residual[0] = out;
+static void enter_residual(est_isolation_t* const self) {
+    const est_plant_t* const plant = &self->plant;
+    const float              out   = filter(plant->a, self->displacement) - filter(plant->b, self->force);
+    const float              white = out - (plant->c[0] * self->residual[0]) - (plant->c[1] * self->residual[1]);
+    self->residual[1]              = self->residual[0];
+    self->residual[0]              = white;
 }
 
-static void
-enter_onset(est_isolation_t* const self, est_onset_t* const onset, const uint32_t ago, const uint16_t age_n) {
-    float        first[PUSH];
-    const float* driving = self->driving;
-    float*       matrix  = onset->matrix;
+/// Enter the sample into the runs of equal codes, and into the unrest of the force: "the variance of its steps is four
+/// times an unusual one", a likelihood ratio.
+static void enter_habits(est_isolation_t* const self) {
+    const float* const f     = self->force;
+    const float* const x     = self->displacement;
+    const float        ratio = squared_step(f[0], f[1], f[2]) / (UNUSUAL * (self->habits.unrest + least_unrest(self)));
+    const float        counted = (ratio < CLIP) ? ratio : CLIP;
+    self->unrest               = (self->habits.known_n < HABITS_N) ? 0.0F : ((0.375F * counted) - LN_2);
+    self->same_n[FORCE]        = equal(f[0], f[1]) ? count_up(self->same_n[FORCE]) : 0U;
+    self->same_n[DISPLACEMENT] = equal(x[0], x[1]) ? count_up(self->same_n[DISPLACEMENT]) : 0U;
+}
+
+/// Samples from an onset to the present sample.
+static uint16_t age_of(const est_isolation_t* const self, const est_onset_t* const onset) {
+    return (uint16_t)((self->worked_n + onset->before_n) - self->onsets[0].before_n);
+}
+
+/// Prepare an onset for its first sample. The second impulse came one sample before.
+static void clear_onset(est_onset_t* const onset) {
+    for (uint8_t i = 0U; i < EFFECTS; i++) {
+        onset->past[i][0] = (i == (PARAMETERS + 1U)) ? 1.0F : 0.0F;
+        onset->past[i][1] = 0.0F;
+        onset->vector[i]  = 0.0F;
+    }
+    for (uint8_t i = 0U; i < TRIANGLE_N; i++) {
+        onset->matrix[i] = 0.0F;
+    }
+    for (uint8_t i = 0U; i < EST_ISOLATION_FAULTS_N; i++) {
+        onset->known[i] = 0.0F;
+        for (uint8_t j = 0U; j < PUSHES; j++) {
+            onset->shared[i][j] = 0.0F;
+        }
+    }
+    onset->energy = 0.0F;
+    onset->unrest = 0.0F;
+}
+
+/// Enter the sample into the effects of one onset and their normal equations. All onsets that the equation does not
+/// reach back to are driven alike.
+static void enter_onset(est_isolation_t* const self, est_onset_t* const onset) {
+    float          first[EFFECTS];
+    const float*   driving = self->driving;
+    float*         matrix  = onset->matrix;
+    const uint16_t age_n   = age_of(self, onset);
     if (age_n == 1U) {
-        drive(self, ago, age_n, first);
+        clear_onset(onset);
+    }
+    if (age_n < EST_ISOLATION_LAGS_N) {
+        drive(self, age_n, first);
         driving = first;
     }
-    for (uint8_t i = 0U; i < EFFECTS; i++) {
-        float* const past   = onset->past[i];
-        const float  pushes = (age_n == 1U) ? 1.0F : 0.0F;
-        const float  drives = (i == PUSH) ? pushes : driving[i];
-        const float  now    = drives - (self->plant.c[0] * past[0]) - (self->plant.c[1] * past[1]);
-        const float  weight = now * self->nats;
-        past[1]             = past[0];
-        past[0]             = now;
-        onset->vector[i] += weight * self->residual[0];
-        for (uint8_t j = 0U; j <= i; j++) {
-            *matrix++ += weight * onset->past[j][0];
+    const float c0       = self->plant.c[0];
+    const float c1       = self->plant.c[1];
+    const float residual = self->residual[0];
+    const float nats     = self->nats;
+    float       now[EFFECTS];
+    for (uint_fast8_t i = 0U; i < EFFECTS; i++) {
+        float* const past = onset->past[i];
+        now[i]            = driving[i] - (c0 * past[0]) - (c1 * past[1]);
+        past[1]           = past[0];
+        past[0]           = now[i];
+        onset->vector[i] += (now[i] * nats) * residual;
+    }
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < JOINT; i++) {
+        EST_UNROLL
+        for (uint_fast8_t j = 0U; j <= i; j++) {
+            *matrix++ += (now[i] * nats) * now[j];
         }
     }
+    for (uint_fast8_t i = 0U; i < EST_ISOLATION_FAULTS_N; i++) {
+        const float weight = now[JOINT + i] * nats;
+        onset->known[i] += weight * now[JOINT + i];
+        EST_UNROLL
+        for (uint_fast8_t j = 0U; j < PUSHES; j++) {
+            onset->shared[i][j] += weight * now[PARAMETERS + j];
+        }
+    }
+    onset->energy += (self->residual[0] * self->nats) * self->residual[0];
+    onset->unrest += self->unrest;
 }
 
 // ---------------------------------------------        VERDICT         ---------------------------------------------
@@ -237,6 +410,15 @@ static float log_add(const float a, const float b) {
     const float least = (a > b) ? b : a;
     const float near  = greater(2.83F - (most - least), 0.0F);
     return most + ((0.0866F * near) * near);
+}
+
+/// Log-likelihood gain if n samples of this energy have an unknown variance instead of the usual one [nats].
+static float gain_of_variance(const float energy, const float n) {
+    const float usual = 0.5F * n;
+    if (energy <= usual) {
+        return 0.0F;  // MISRA D4
+    }
+    return (energy - usual) + (usual * logarithm(greater(usual / energy, 1.0e-9F)));
 }
 
 /// Discount a gain by what it costs to make the change x, known this well, a relevant one.
@@ -269,75 +451,174 @@ weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const
         greater(fit->beside[i], discount(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
 }
 
-/// Weigh all hypotheses for one onset. The normal equations contain M, B and K only. `gain`: the gain without any of
-/// them.
-static void weigh(est_fit_t* const   fit,
-                  const float* const matrix,
-                  const float* const vector,
-                  const float        gain,
-                  const uint8_t      number,
-                  const uint8_t      before_n) {
-    one_t        ones[PUSH];
-    const float* row = matrix;
-    for (uint8_t i = 0U; i < PUSH; i++) {
-        const float known  = row[i] + PRIOR;
-        const float change = vector[i] / known;
-        const float alone  = gain + (vector[i] * change);
-        ones[i]            = (one_t){ .vector = vector[i], .known = known, .change = change, .gain = alone };
-        fit->any_alone[i]  = log_add(fit->any_alone[i], alone);
-        fit->onset[number] = greater(fit->onset[number], alone);
-        if (alone > fit->alone[i]) {
-            fit->alone[i]    = alone;
-            fit->change[i]   = change;
-            fit->known[i]    = known;
-            fit->before_n[i] = before_n;
+/// Enter the evidence of one onset for a single change.
+EST_INLINE void enter_single(est_isolation_t* const self,
+                             const uint_fast8_t     one,
+                             const uint_fast8_t     number,
+                             const float            gain,
+                             const float            change,
+                             const float            known) {
+    est_single_t* const single = &self->fit.single[one];
+    float* const        most   = &self->fit.onset[number];
+    single->any                = log_add(single->any, gain);
+    *most                      = greater(*most, gain);
+    if (gain > single->best) {
+        single->best     = gain;
+        single->change   = change;
+        single->known    = known;
+        single->before_n = self->onsets[number].before_n;
+    }
+}
+
+/// The impulses of one onset, the second less its share of the first. Private.
+typedef struct {
+    float share;
+    float variance[PUSHES];  ///< doubled
+    float change[PUSHES];
+    float gain;
+} pushes_t;
+
+static pushes_t free_pushes(const est_isolation_t* const self, const est_onset_t* const onset) {
+    const float* const first  = &onset->matrix[(PARAMETERS * (PARAMETERS + 1U)) / 2U];
+    const float* const second = &first[PARAMETERS + 1U];
+    pushes_t           out;
+    out.variance[0]  = 1.0F / (first[PARAMETERS] + self->nats);
+    out.share        = second[PARAMETERS] * out.variance[0];
+    out.variance[1]  = 1.0F / (greater(second[PARAMETERS + 1U] - (out.share * second[PARAMETERS]), 0.0F) + self->nats);
+    const float rest = onset->vector[PARAMETERS + 1U] - (out.share * onset->vector[PARAMETERS]);
+    out.change[0]    = onset->vector[PARAMETERS] * out.variance[0];
+    out.change[1]    = rest * out.variance[1];
+    out.gain         = (out.change[0] * onset->vector[PARAMETERS]) + (out.change[1] * rest);
+    return out;
+}
+
+/// Weigh the parameters for one onset. The impulses are eliminated from the normal equations.
+static void weigh_plant(est_isolation_t* const self, const uint8_t number) {
+    est_fit_t* const         fit    = &self->fit;
+    const est_onset_t* const onset  = &self->onsets[number];
+    const pushes_t           pushes = free_pushes(self, onset);
+    const float* const       first  = &onset->matrix[(PARAMETERS * (PARAMETERS + 1U)) / 2U];
+    const float* const       second = &first[PARAMETERS + 1U];
+    const float*             row    = onset->matrix;
+    float                    rest[PARAMETERS];
+    one_t                    ones[PARAMETERS];
+    for (uint8_t i = 0U; i < PARAMETERS; i++) {
+        float       left[PARAMETERS];
+        const float share = first[i] * pushes.variance[0];
+        rest[i]           = second[i] - (pushes.share * first[i]);
+        for (uint8_t j = 0U; j <= i; j++) {
+            left[j] = row[j] - (share * first[j]) - ((rest[i] * pushes.variance[1]) * rest[j]);
         }
+        const float vector = onset->vector[i] - (first[i] * pushes.change[0]) - (rest[i] * pushes.change[1]);
+        const float known  = left[i] + PRIOR;
+        const float change = vector / known;
+        const float gain   = pushes.gain + (vector * change);
+        ones[i]            = (one_t){ .vector = vector, .known = known, .change = change, .gain = gain };
+        enter_single(self, i, number, gain, change, known);
         for (uint8_t j = 0U; j < i; j++) {
-            weigh_pair(fit, ones, i, j, row[j]);
+            weigh_pair(fit, ones, i, j, left[j]);
         }
         row = &row[i + 1U];
     }
 }
 
-/// Weigh an onset at its sample.
-static void judge(est_fit_t* const fit, const est_onset_t* const onset, const uint8_t number) {
-    fit->onset[number] = 0.0F;
-    weigh(fit, onset->matrix, onset->vector, 0.0F, number, onset->before_n);
+/// A hypothesis of one fault whose effect is linear in its size. Private.
+typedef struct {
+    float known;
+    float change;
+    float gain;
+} fault_t;
+
+/// Evidence of one onset for a fault whose effect is linear in its size. A delay has the size 1.
+EST_INLINE fault_t weigh_linear(const est_onset_t* const onset,
+                                const pushes_t* const    pushes,
+                                const uint_fast8_t       i,
+                                const bool               delays) {
+    const float* const shared = onset->shared[i];
+    const float        rest   = shared[1] - (pushes->share * shared[0]);
+    const float        vector = onset->vector[JOINT + i] - (shared[0] * pushes->change[0]) - (rest * pushes->change[1]);
+    const float        known =
+        onset->known[i] - ((shared[0] * pushes->variance[0]) * shared[0]) - ((rest * pushes->variance[1]) * rest);
+    const float left   = greater(known, 1.0e-9F);  // smaller only by rounding
+    const float change = delays ? 1.0F : (vector / left);
+    const float gain   = pushes->gain + (((2.0F * vector) - (left * change)) * change);
+    return (fault_t){ .known = delays ? 0.0F : left, .change = change, .gain = gain };
 }
 
-/// Weigh an onset between its sample and the next. The impulse that this needs is eliminated.
-static void judge_pushed(est_fit_t* const fit, const est_onset_t* const onset, const uint8_t number) {
-    const float* const push   = &onset->matrix[6];
-    const float        known  = push[PUSH] + UNKNOWN;
-    const float        change = onset->vector[PUSH] / known;
-    float              matrix[6];
-    float              vector[PUSH];
-    uint8_t            at = 0U;
-    for (uint8_t i = 0U; i < PUSH; i++) {
-        const float share = push[i] / known;
-        vector[i]         = onset->vector[i] - (push[i] * change);
-        for (uint8_t j = 0U; j <= i; j++) {
-            matrix[at] = onset->matrix[at] - (share * push[j]);
-            at++;
+/// Part of the gain by undoing a gain of the displacement that is no evidence: the noise is scaled as well.
+static float gain_of_scaling(const float change, const float samples_n) {
+    const float counted = greater((change < 1.0F) ? change : 1.0F, -0.5F);
+    return samples_n * counted * (1.0F - (0.5F * counted));
+}
+
+static uint8_t fault_of(const uint_fast8_t channel, const uint_fast8_t kind) {
+    return (uint8_t)(PARAMETERS + (channel * KINDS_N) + kind);
+}
+
+/// Weigh the faults of the channels for one onset. A force that is stuck while the true one has changed is an offset
+/// whose codes are all equal. A displacement that is stuck explains every residual. Noise has an unknown variance; in
+/// the force it shows in the force too.
+static void weigh_faults(est_isolation_t* const self, const uint8_t number) {
+    const est_onset_t* const onset           = &self->onsets[number];
+    const pushes_t           pushes          = free_pushes(self, onset);
+    const uint16_t           age_n           = age_of(self, onset);
+    const float              n               = (float)age_n;
+    const float              noise           = gain_of_variance(onset->energy, n);
+    const float              unrest          = 0.5F * onset->unrest;  // steps of neighbours are correlated
+    const float              noisy[CHANNELS] = { noise + unrest, noise };
+    for (uint_fast8_t channel = 0U; channel < CHANNELS; channel++) {
+        fault_t stuck = { .gain = onset->energy };
+        for (uint_fast8_t kind = 0U; kind < LINEAR_N; kind++) {
+            fault_t found = weigh_linear(onset, &pushes, (uint_fast8_t)((channel * LINEAR_N) + kind), kind == DELAY);
+            if ((channel == FORCE) && (kind == OFFSET)) {
+                stuck = found;
+            }
+            if ((channel == DISPLACEMENT) && (kind == GAIN)) {
+                found.gain -= gain_of_scaling(found.change, n);
+            }
+            enter_single(self, fault_of(channel, kind), number, found.gain, found.change, found.known);
         }
+        if (self->same_n[channel] >= age_n) {
+            const float gain = stuck.gain + (n * self->surprise[channel]);
+            enter_single(self, fault_of(channel, STUCK), number, gain, stuck.change, stuck.known);
+        }
+        enter_single(self, fault_of(channel, NOISE), number, noisy[channel], 1.0F, VARIANCE_KNOWN * n);
     }
-    weigh(fit, matrix, vector, (change * onset->vector[PUSH]) - BETWEEN, number, onset->before_n);
 }
 
-static void clear_fit(est_fit_t* const fit) { *fit = (est_fit_t){ .alone = { 0.0F } }; }
-
-/// Most likely parameter.
-static uint8_t find_likeliest(const est_fit_t* const fit) {
-    const uint8_t first = (fit->any_alone[1] > fit->any_alone[0]) ? 1U : 0U;
-    return (fit->any_alone[2] > fit->any_alone[first]) ? 2U : first;
+static void clear_fit(est_fit_t* const fit) {
+    for (uint8_t i = 0U; i < SINGLES; i++) {
+        fit->single[i] = (est_single_t){ .any = 0.0F };
+    }
+    for (uint8_t i = 0U; i < PARAMETERS; i++) {
+        fit->any_pair[i] = 0.0F;
+        fit->beside[i]   = 0.0F;
+    }
+    for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
+        fit->onset[i] = 0.0F;
+    }
 }
 
-/// Extent of a change: from 1 - old/new for M, new/old - 1 for B and K. At least 0.01, for M at most 100.
+/// Change with this index among the single ones.
+static est_change_t change_of(const uint8_t one) {
+    const uint32_t number = (uint32_t)one + ((one < PARAMETERS) ? 1U : 2U);
+    return (est_change_t)number;
+}
+
+static uint8_t index_of(const est_change_t change) {
+    return (uint8_t)((uint8_t)change - ((change < EST_CHANGE_SEVERAL) ? 1U : 2U));
+}
+
+static bool is_gain(const est_change_t change) {
+    return (change == EST_CHANGE_FORCE_GAIN) || (change == EST_CHANGE_DISPLACEMENT_GAIN);
+}
+
+/// Extent of a change: from 1 - old/new for M and gains, new/old - 1 for B and K. At least 0.01, or at most 100.
 static float extent_of(const est_change_t change, const float x) {
-    const bool  of_mass = change == EST_CHANGE_MASS;
-    const float parts   = greater(1.0F + (of_mass ? -x : x), 0.01F);
-    const float inverse = 1.0F / parts;
-    return of_mass ? inverse : parts;
+    const bool  inverted = (change == EST_CHANGE_MASS) || is_gain(change);
+    const float parts    = greater(1.0F + (inverted ? -x : x), 0.01F);
+    const float inverse  = 1.0F / parts;
+    return inverted ? inverse : parts;
 }
 
 /// Log-likelihood of an extent a priori, negated [nats]: near 1 it is ln(extent)^2 / 2, as if factors of e were
@@ -345,22 +626,66 @@ static float extent_of(const est_change_t change, const float x) {
 /// effect.
 static float penalty_of(const float extent) { return 0.5F * ((extent + (1.0F / extent)) - 2.0F); }
 
-/// Decide from the evidence so far.
-static est_change_t decide(const est_fit_t* const fit) {
-    static const est_change_t alone[3] = { EST_CHANGE_MASS, EST_CHANGE_DAMPING, EST_CHANGE_STIFFNESS };
-    const uint8_t             one      = find_likeliest(fit);
-    const float               likely   = fit->any_alone[one] - penalty_of(extent_of(alone[one], fit->change[one]));
-    bool                      sure     = (fit->known[one] > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
-                ((likely - fit->any_pair[2U - one]) >= MORE_LIKELY);
-    for (uint8_t other = 0U; other < 3U; other++) {
-        if (other != one) {
-            if ((fit->any_pair[one + other - 1U] - fit->any_alone[one]) > NOT_BY_CHANCE) {
-                return EST_CHANGE_SEVERAL;  // MISRA D4
-            }
-            sure = sure && ((likely - fit->any_alone[other]) >= SURE);
-        }
+/// Cost of a size that is free [nats].
+static float cost_of_size(const est_single_t* const found) {
+    const float explained = found->change * found->change * found->known;
+    return -0.5F * logarithm(greater(1.0F / (1.000001F + (SIZES * explained)), 1.0e-9F));
+}
+
+/// Most likely single change by these gains.
+static uint8_t find_likeliest(const float* const gains) {
+    uint8_t out = 0U;
+    for (uint8_t i = 1U; i < SINGLES; i++) {
+        out = (gains[i] > gains[out]) ? i : out;
     }
-    return sure ? alone[one] : EST_CHANGE_UNDECIDED;
+    return out;
+}
+
+/// True iff a parameter alone is more likely than beside another one, and its extent is known.
+static bool stands_alone(const est_fit_t* const fit, const uint8_t one, const float penalty) {
+    const est_single_t* const found  = &fit->single[one];
+    const float               likely = found->any - (penalty + (ROUNDING * found->any));
+    return (found->known > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
+           ((likely - fit->any_pair[2U - one]) >= MORE_LIKELY);
+}
+
+/// Largest gain of two changed parameters, one of which is this one, unless it is a fault.
+static float gain_of_pairs(const est_fit_t* const fit, const uint8_t one) {
+    float out = 0.0F;
+    for (uint8_t i = 0U; i < PARAMETERS; i++) {
+        const bool without = (i + one) == 2U;
+        out                = without ? out : greater(out, fit->any_pair[i]);
+    }
+    return out;
+}
+
+/// Decide from the evidence so far, `samples_n` samples after the alarm.
+static est_change_t decide(const est_fit_t* const fit, const uint16_t samples_n) {
+    float gains[SINGLES];
+    for (uint8_t i = 0U; i < SINGLES; i++) {
+        gains[i] = fit->single[i].any - cost_of_size(&fit->single[i]);
+    }
+    const uint8_t             one   = find_likeliest(gains);
+    const est_single_t* const found = &fit->single[one];
+    const float               pair  = gain_of_pairs(fit, one);
+    const float               lost  = ROUNDING * found->any;
+    float                     lead  = SURE + lost;
+    bool                      sure;
+    if ((pair - found->any) > (NOT_BY_CHANCE + lost)) {
+        return EST_CHANGE_SEVERAL;  // MISRA D4
+    }
+    if (one < PARAMETERS) {
+        const float penalty = penalty_of(extent_of(change_of(one), found->change));
+        lead += penalty;
+        sure = stands_alone(fit, one, penalty);
+    } else {
+        lead += FAULTY;
+        sure = (((uint32_t)samples_n + found->before_n) >= FAULT_N) && ((found->any - pair) >= (MORE_LIKELY + lost));
+    }
+    for (uint8_t other = 0U; other < SINGLES; other++) {
+        sure = sure && ((other == one) || ((gains[one] - gains[other]) >= lead));
+    }
+    return sure ? change_of(one) : EST_CHANGE_UNDECIDED;
 }
 
 /// True iff the present sample comes after the alarm.
@@ -368,24 +693,22 @@ static bool is_after_alarm(const est_isolation_t* const self) { return self->wor
 
 static void diagnose(est_isolation_t* const self) {
     est_diagnosis_t* const out = &self->diagnosis;
-    if (!is_after_alarm(self)) {
-        return;  // MISRA D4
-    }
-    out->samples_n = (uint16_t)(self->worked_n - self->onsets[0].before_n);
+    out->samples_n             = (uint16_t)(self->worked_n - self->onsets[0].before_n);
     if (out->change == EST_CHANGE_UNDECIDED) {
-        out->change = decide(&self->fit);
+        out->change = decide(&self->fit, out->samples_n);
     }
     if ((out->change == EST_CHANGE_UNDECIDED) || (out->change == EST_CHANGE_SEVERAL)) {
         return;  // MISRA D4
     }
-    const uint8_t one   = (uint8_t)((uint8_t)out->change - 1U);
-    const float   level = self->fit.alone[one] - 2.0F;
-    out->extent         = extent_of(out->change, self->fit.change[one]);
-    out->onset_n        = self->fit.before_n[one];
-    out->onset_low_n    = out->onset_n;
-    out->onset_high_n   = out->onset_n;
+    const uint8_t             one   = index_of(out->change);
+    const est_single_t* const found = &self->fit.single[one];
+    const float               level = found->best - 2.0F;
+    out->extent       = ((one < PARAMETERS) || is_gain(out->change)) ? extent_of(out->change, found->change) : 1.0F;
+    out->onset_n      = (uint16_t)(found->before_n + self->repeated_n);
+    out->onset_low_n  = out->onset_n;
+    out->onset_high_n = out->onset_n;
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
-        const uint8_t n = self->onsets[i].before_n;
+        const uint16_t n = (uint16_t)(self->onsets[i].before_n + self->repeated_n);
         if (self->fit.onset[i] >= level) {
             out->onset_low_n  = (n < out->onset_low_n) ? n : out->onset_low_n;
             out->onset_high_n = (n > out->onset_high_n) ? n : out->onset_high_n;
@@ -402,32 +725,47 @@ static void stop(est_isolation_t* const self) {
 }
 
 /// Samples from onset number i to the alarm, earliest onset first. The longer the delay, the smaller the effect of
-/// the change before the alarm, and the impulse compensates for coarser steps.
+/// the change before the alarm, and the impulses compensate for coarser steps.
 static uint8_t onset_before(const uint8_t i, const uint8_t earliest_n) {
-    static const uint8_t wanted_n[EST_ISOLATION_ONSETS_N] = { 20U, 12U, 7U, 4U, 2U, 1U };
+    static const uint8_t wanted_n[EST_ISOLATION_ONSETS_N] = { 20U, 13U, 9U, 6U, 4U, 3U, 2U, 1U };
     return (wanted_n[i] < earliest_n) ? wanted_n[i] : earliest_n;
 }
 
+/// Start the diagnosis of an alarm. One that is under way continues: such alarms are usual after a fault.
 static void start(est_isolation_t* const self, const est_t* const estimator) {
     const uint8_t past_n     = 4U;
     const uint8_t earliest_n = (self->known_n > past_n) ? (uint8_t)(self->known_n - past_n) : 0U;
     const bool    was_quiet  = self->quiet;
+    if (self->active && (self->diagnosis.change == EST_CHANGE_UNDECIDED)) {
+        self->repeated_n = (uint8_t)(self->repeated_n + self->since_n);
+        self->since_n    = 0U;
+        return;  // MISRA D4
+    }
     stop(self);
-    self->since_n   = 0U;
-    self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
+    self->since_n    = 0U;
+    self->repeated_n = 0U;
+    self->diagnosis  = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
     if (!was_quiet || (earliest_n < 1U) || !derive_plant(&self->plant, self->config, self->force_zero)) {
         return;  // MISRA D4
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
-        self->onsets[i] = (est_onset_t){ .before_n = onset_before(i, earliest_n) };
+        self->onsets[i].before_n = onset_before(i, earliest_n);
+    }
+    for (uint8_t i = 0U; i < CHANNELS; i++) {
+        const float same  = (self->habits.known_n < HABITS_N) ? 0.999F : greater(self->habits.same[i], 0.01F);
+        self->surprise[i] = -logarithm((same < 0.999F) ? same : 0.999F);
+        self->same_n[i]   = 0U;
     }
     self->active      = true;
     self->turn        = 0U;
     self->worked_n    = 0U;
     self->waiting_n   = self->onsets[0].before_n;
-    self->nats        = 0.5F / est_noise_variance(estimator);
+    self->nats        = 0.5F / est_scale(estimator);  // the misfit of the model is noise to isolation
     self->residual[0] = sample_before(self, self->waiting_n)->innovation;
     self->residual[1] = sample_before(self, self->waiting_n + 1U)->innovation;
+    for (uint32_t i = EST_ISOLATION_LAGS_N; i > 0U; i--) {
+        advance(self, (self->waiting_n + i) - 1U);
+    }
 }
 
 bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
@@ -440,21 +778,22 @@ bool est_isolation_init(est_isolation_t* const self, const est_config_t* const c
 
 /// Store theta and C as the plant before a change.
 static void take_theta(est_isolation_t* const self, const est_t* const estimator) {
-    const uint8_t count = est_theta_count(estimator);
-    self->quiet         = true;
-    for (uint8_t i = 0U; i < count; i++) {
-        self->plant.theta[i] = est_theta(estimator, i);
-    }
+    self->quiet = true;
+    est_copy_theta(estimator, self->plant.theta);
     self->plant.c[0] = est_prefilter(estimator, 0U);
     self->plant.c[1] = est_prefilter(estimator, 1U);
 }
 
 static void enter_quiet(est_isolation_t* const self, const est_t* const estimator, const est_step_t step) {
     if (step.status != EST_UPDATED) {
+        self->since_n = (self->known_n > 1U) ? 0U : self->since_n;  // without a gap: theta has jumped
         self->known_n = 0U;
         self->quiet   = false;
     } else if ((step.statistic <= 0.0F) && (self->since_n >= SETTLED_N)) {
         take_theta(self, estimator);
+        if (self->known_n >= EST_ISOLATION_LAGS_N) {
+            follow_habits(self);
+        }
     } else {
         // theta absorbs a change
     }
@@ -474,7 +813,8 @@ void est_isolation_enter(est_isolation_t* const self,
     keep(self, sample, step.innovation);
     if (self->active) {
         self->waiting_n++;
-        if ((self->waiting_n > (EST_ISOLATION_KEPT_N - 4U)) || (self->since_n >= SETTLED_N) || step.alarm) {
+        if ((self->waiting_n > (EST_ISOLATION_KEPT_N - 4U)) ||
+            (((uint32_t)self->since_n + self->repeated_n) >= SETTLED_N)) {
             stop(self);
         }
     } else {
@@ -485,34 +825,34 @@ void est_isolation_enter(est_isolation_t* const self,
     }
 }
 
-/// True iff the present sample comes after this onset.
-static bool has_begun(const est_isolation_t* const self, const est_onset_t* const onset) {
-    return (self->worked_n + onset->before_n) > self->onsets[0].before_n;
-}
-
-/// Number of slices of the present sample. Hypotheses are weighed only after the alarm.
-static uint8_t count_slices(const est_isolation_t* const self) {
-    uint8_t out = 1U;
-    for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
-        out = has_begun(self, &self->onsets[i]) ? (uint8_t)(out + 1U) : out;
+/// Number of onsets before the present sample.
+static uint8_t count_begun(const est_isolation_t* const self) {
+    uint8_t out = 0U;
+    while ((out < EST_ISOLATION_ONSETS_N) &&
+           ((self->worked_n + self->onsets[out].before_n) > self->onsets[0].before_n)) {
+        out++;
     }
-    return is_after_alarm(self) ? EST_ISOLATION_SLICES_N : out;
+    return out;
 }
 
-static void begin_sample(est_isolation_t* const self, const uint32_t ago) {
-    clear_fit(&self->fit);
-    enter_residual(self, ago);
-    drive(self, ago, 2U, self->driving);
+/// Begin a sample. Hypotheses are weighed after the alarm, with the newest sample: a delay of the work does not grow.
+static void begin_sample(est_isolation_t* const self) {
+    advance(self, self->waiting_n - 1U);
+    enter_residual(self);
+    enter_habits(self);
+    drive(self, EST_ISOLATION_LAGS_N, self->driving);
     self->worked_n++;
-    self->slices_n = count_slices(self);
+    self->begun_n  = count_begun(self);
+    self->slices_n = (uint8_t)(1U + ((self->begun_n + 1U) / AT_ONCE));
+    if (is_after_alarm(self) && (self->waiting_n == 1U)) {
+        clear_fit(&self->fit);
+        self->slices_n = EST_ISOLATION_SLICES_N;
+    }
 }
 
-static void enter_and_judge(est_isolation_t* const self, const uint8_t number) {
-    est_onset_t* const onset = &self->onsets[number];
-    const uint32_t     age_n = (uint32_t)self->worked_n + onset->before_n - self->onsets[0].before_n;
-    enter_onset(self, onset, self->waiting_n - 1U, (uint16_t)age_n);
-    if (is_after_alarm(self)) {
-        judge(&self->fit, onset, number);
+static void enter_onsets(est_isolation_t* const self, const uint8_t first) {
+    for (uint8_t i = first; (i < (first + AT_ONCE)) && (i < self->begun_n); i++) {
+        enter_onset(self, &self->onsets[i]);
     }
 }
 
@@ -522,18 +862,23 @@ bool est_isolation_work(est_isolation_t* const self) {
         return false;  // MISRA D4
     }
     if (self->turn == 0U) {
-        begin_sample(self, self->waiting_n - 1U);
-    } else if (self->turn <= EST_ISOLATION_ONSETS_N) {
-        enter_and_judge(self, (uint8_t)(self->turn - 1U));
+        begin_sample(self);
+    } else if (self->turn <= ENTERED) {
+        enter_onsets(self, (uint8_t)(AT_ONCE * (self->turn - 1U)));
+    } else if (self->turn <= WEIGHED) {
+        const uint8_t number = (uint8_t)((self->turn - (ENTERED + 1U)) / 2U);
+        if (((self->turn - ENTERED) % 2U) == 1U) {
+            weigh_plant(self, number);
+        } else {
+            weigh_faults(self, number);
+        }
     } else {
-        const uint8_t number = (uint8_t)(self->turn - (EST_ISOLATION_ONSETS_N + 1U));
-        judge_pushed(&self->fit, &self->onsets[number], number);
+        diagnose(self);
     }
     self->turn++;
     if (self->turn >= self->slices_n) {
         self->turn = 0U;
         self->waiting_n--;
-        diagnose(self);
     }
     return self->waiting_n > 0U;
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 /// est_isolation: after an alarm of est.h, diagnose the parameter that has changed (mass, damping or stiffness), its
-/// extent and its onset. Thesis 6.2.1.2 leaves this open.
+/// extent and its onset, or the fault of a channel. Thesis 6.2.1.2 leaves this open.
 ///
 /// The plant is M x'' + B x' + K x = F. Any estimator with na = 2 and nb + nk <= 3 will do, with or without offset;
 /// T, M, B and K need not be known. harness/docs/background/estimator.md derives the algorithm.
@@ -31,14 +31,32 @@ extern "C" {
 #define EST_ISOLATION_KEPT_N 40U
 
 /// Number of onsets that are tried.
-#define EST_ISOLATION_ONSETS_N 6U
+#define EST_ISOLATION_ONSETS_N 8U
 
-/// Slices of work per sample after the alarm: one to prepare it, two for each onset, at its sample and between
-/// samples. A sample before the alarm takes at most half as many.
-#define EST_ISOLATION_SLICES_N (1U + (2U * EST_ISOLATION_ONSETS_N))
+/// Slices of work on a sample that is weighed: one to prepare it, one for every two onsets to enter it, two for each
+/// onset to weigh it, for the plant and for the channels, and one to decide. Another one takes at most the first five.
+#define EST_ISOLATION_SLICES_N (2U + (EST_ISOLATION_ONSETS_N / 2U) + (2U * EST_ISOLATION_ONSETS_N))
 
-/// Number of effects in every equation: those of M, B, K, and of an impulse at the onset.
-#define EST_ISOLATION_EFFECTS_N 4U
+/// Number of samples in an equation.
+#define EST_ISOLATION_LAGS_N 3U
+
+/// Number of impulses at the onset. They stand for the deviation of the filter's two states if the onset was earlier.
+#define EST_ISOLATION_PUSHES_N 2U
+
+/// Number of effects that are weighed together: those of M, B, K, and of the impulses.
+#define EST_ISOLATION_JOINT_N (3U + EST_ISOLATION_PUSHES_N)
+
+/// Number of channels, the force and the displacement.
+#define EST_ISOLATION_CHANNELS_N 2U
+
+/// Number of effects of faults: an offset, a gain and a delay of each channel.
+#define EST_ISOLATION_FAULTS_N (3U * EST_ISOLATION_CHANNELS_N)
+
+/// Number of effects in every equation.
+#define EST_ISOLATION_EFFECTS_N (EST_ISOLATION_JOINT_N + EST_ISOLATION_FAULTS_N)
+
+/// Number of single changes: M, B, K, and five faults of each channel.
+#define EST_ISOLATION_SINGLES_N (3U + (5U * EST_ISOLATION_CHANNELS_N))
 
 /// Changes that are told apart.
 typedef enum {
@@ -46,14 +64,25 @@ typedef enum {
     EST_CHANGE_MASS      = 1,
     EST_CHANGE_DAMPING   = 2,
     EST_CHANGE_STIFFNESS = 3,
-    EST_CHANGE_SEVERAL   = 4,  ///< no single parameter explains the samples
+    EST_CHANGE_SEVERAL   = 4,  ///< no single parameter and no fault of a channel explains the samples
+    // faults of a channel; the plant has not changed
+    EST_CHANGE_FORCE_OFFSET        = 5,
+    EST_CHANGE_FORCE_GAIN          = 6,
+    EST_CHANGE_FORCE_DELAY         = 7,  ///< codes come one sample late
+    EST_CHANGE_FORCE_STUCK         = 8,
+    EST_CHANGE_FORCE_NOISE         = 9,
+    EST_CHANGE_DISPLACEMENT_OFFSET = 10,
+    EST_CHANGE_DISPLACEMENT_GAIN   = 11,  ///< about the displacement at F = 0
+    EST_CHANGE_DISPLACEMENT_DELAY  = 12,  ///< codes come one sample late
+    EST_CHANGE_DISPLACEMENT_STUCK  = 13,
+    EST_CHANGE_DISPLACEMENT_NOISE  = 14,
 } est_change_t;
 
 typedef struct {
     est_change_t change;
-    float        extent;        ///< new value over old value of that parameter; 1 unless a single parameter has changed
-    uint16_t     samples_n;     ///< samples after the alarm on which this is based
-    uint16_t     onset_n;       ///< samples from the likeliest onset to the alarm
+    float        extent;        ///< new value over old value of that parameter or gain; 1 for every other change
+    uint16_t     samples_n;     ///< samples after the first alarm on which this is based
+    uint16_t     onset_n;       ///< samples from the likeliest onset to the last alarm
     uint16_t     onset_low_n;   ///< from the last onset that is less likely by a factor of e^2 at most
     uint16_t     onset_high_n;  ///< from the first such onset; far from onset_low_n if the change had no effect yet
 } est_diagnosis_t;
@@ -68,34 +97,53 @@ typedef struct {
 /// Deviation of the plant from its course since one onset, by effect. Private.
 typedef struct {
     float past[EST_ISOLATION_EFFECTS_N][2];  ///< last values of each effect, newest first
-    /// Normal equations: lower triangle by rows, and right-hand side.
-    float   matrix[EST_ISOLATION_EFFECTS_N * (EST_ISOLATION_EFFECTS_N + 1U) / 2U];
+    /// Normal equations of the joint effects: lower triangle by rows. Right-hand side of all effects.
+    float   matrix[EST_ISOLATION_JOINT_N * (EST_ISOLATION_JOINT_N + 1U) / 2U];
     float   vector[EST_ISOLATION_EFFECTS_N];
+    float   known[EST_ISOLATION_FAULTS_N];                           ///< normal equations of each fault
+    float   shared[EST_ISOLATION_FAULTS_N][EST_ISOLATION_PUSHES_N];  ///< their elements with the impulses
+    float   energy;    ///< log-likelihood of the residual since the onset, negated [nats]
+    float   unrest;    ///< log-likelihood ratio of a noisy force since the onset [nats]
     uint8_t before_n;  ///< samples from this onset to the alarm
 } est_onset_t;
 
-/// Log-likelihood gain of each hypothesis [nats], for its best onset or summed over all onsets (any_). Private.
+/// Evidence for a single change. Private.
 typedef struct {
-    float   any_alone[3];  ///< M, B, K alone has changed
-    float   any_pair[3];   ///< M and B, M and K, B and K have changed
-    float   alone[3];      ///< M, B, K alone has changed
-    float   beside[3];     ///< M, B, K and another parameter have changed, the other by a relevant amount
-    float   change[3];     ///< estimate for M, B, K alone: 1 - old/new for M, new/old - 1 for B and K
-    float   known[3];      ///< half the reciprocal variance of change
-    uint8_t before_n[3];   ///< samples from the best onset to the alarm
-    float   onset[EST_ISOLATION_ONSETS_N];  ///< best single parameter, for each onset
+    float   any;       ///< log-likelihood gain, summed over all onsets [nats]
+    float   best;      ///< the same for its best onset
+    float   change;    ///< estimate there: 1 - old/new for M and gains, new/old - 1 for B and K
+    float   known;     ///< half the reciprocal variance of change; 0 if the size is given
+    uint8_t before_n;  ///< samples from the best onset to the alarm
+} est_single_t;
+
+/// Evidence for all hypotheses. Private.
+typedef struct {
+    est_single_t single[EST_ISOLATION_SINGLES_N];
+    float        any_pair[3];  ///< log-likelihood gain if M and B, M and K, B and K have changed, over all onsets
+    float        beside[3];    ///< the same if M, B, K and another parameter have, by a relevant amount
+    float        onset[EST_ISOLATION_ONSETS_N];  ///< the same of the best single change, for each onset
 } est_fit_t;
+
+/// Habits of the channels while the plant is unchanged. Private.
+typedef struct {
+    float   same[EST_ISOLATION_CHANNELS_N];  ///< share of codes that equal the last one
+    float   unrest;                          ///< mean square of the steps of u that are not edges [codes^2]
+    uint8_t known_n;                         ///< samples on which this is based, as far as they count
+} est_habits_t;
 
 /// The plant before the change, in units of samples. Private.
 typedef struct {
     float theta[EST_THETA_MAX];
     float c[2];
-    float hold;       ///< share of the final deflection reached one sample after a force step
-    float lag_n;      ///< B / K
-    float spring[3];  ///< effect of K y, as a force, on the equation of y: factors of y(k), y(k-1), y(k-2)
-    float damper[3];  ///< the same for B y'
-    float rest;       ///< y at F = 0 [codes]
-    float gain;       ///< static gain: y per u
+    float a[EST_ISOLATION_LAGS_N];       ///< factors of y(k), y(k-1), y(k-2)
+    float b[EST_ISOLATION_LAGS_N];       ///< factors of u(k), u(k-1), u(k-2)
+    float direct;                        ///< share of b[0] that an edge within the interval may have
+    float hold;                          ///< share of the final deflection reached one sample after a force step
+    float lag_n;                         ///< B / K
+    float spring[EST_ISOLATION_LAGS_N];  ///< effect of K y, as a force, on the equation of y: factors as those of a
+    float damper[EST_ISOLATION_LAGS_N];  ///< the same for B y'
+    float rest;                          ///< y at F = 0 [codes]
+    float gain;                          ///< static gain: y per u
 } est_plant_t;
 
 /// State of an isolation. The fields are private; read est_isolation_diagnosis().
@@ -106,14 +154,22 @@ typedef struct {
     uint8_t             newest;      ///< index in kept
     uint8_t             known_n;     ///< samples in kept without a gap
     bool                quiet;       ///< the plant before a change is known, from the last sample with statistic zero
-    uint8_t             since_n;     ///< samples since the alarm
+    uint8_t             since_n;     ///< samples since the last alarm, or since whitening began anew
+    uint8_t             repeated_n;  ///< samples from the alarm that is being diagnosed to the last alarm
     uint8_t             waiting_n;   ///< samples waiting for work
     uint8_t             turn;        ///< next slice of the present sample
     uint8_t             slices_n;    ///< number of slices of the present sample
+    uint8_t             begun_n;     ///< onsets before the present sample
     uint16_t            worked_n;    ///< samples from the first onset to the present one
     bool                active;      ///< an alarm is being diagnosed
     est_plant_t         plant;
-    float               driving[3];   ///< input of the effects of M, B, K, if the onset was at an earlier sample
+    est_habits_t        habits;
+    uint8_t             same_n[EST_ISOLATION_CHANNELS_N];    ///< codes that equal the last one, up to this sample
+    float               surprise[EST_ISOLATION_CHANNELS_N];  ///< of each of them, unless the channel is stuck [nats]
+    float               force[EST_ISOLATION_LAGS_N + 1U];    ///< u less its zero, up to the present sample
+    float               displacement[EST_ISOLATION_LAGS_N + 1U];  ///< y less its rest, likewise
+    float               unrest;                                   ///< of this sample, as in est_onset_t
+    float               driving[EST_ISOLATION_EFFECTS_N];         ///< input of the effects, if the onset was long ago
     float               residual[2];  ///< whitened y less the response of the plant before the change, newest first
     est_fit_t           fit;
     est_diagnosis_t     diagnosis;
@@ -124,22 +180,23 @@ typedef struct {
 /// Prepare for the first sample of an estimator with this configuration. The configuration is not copied; it must
 /// stay unchanged. `force_zero` is u at F = 0 [codes], from which the force of the spring is counted. Returns false
 /// iff na is not 2, nb + nk exceeds 3, the trigger is not the cumulative sum, or edges may come anywhere. The method
-/// then does not apply and the state is unusable. Cost: constant. RAM: 1.3 kB. May be called from an interrupt.
+/// then does not apply and the state is unusable. Cost: constant. RAM: 3.3 kB. May be called from an interrupt.
 EST_RESULT_USED bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
 /// Enter the input and result of an est_step(); to be called after every step. A gap before the diagnosis leaves it
-/// undecided. Cost: some 150 instructions on a Cortex-M4F, at an alarm 2,400 (make cost). May be called from an
-/// interrupt.
+/// undecided. An alarm before the diagnosis does not interrupt it. Cost: 60 to 330 instructions on a Cortex-M4F, at an
+/// alarm 920 (make cost). May be called from an interrupt.
 void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 
-/// Do one slice of the work after an alarm: one sample with one onset. Return true iff more work is waiting. A sample
-/// needs up to EST_ISOLATION_SLICES_N calls. If more than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis
-/// remains undecided. Cost: some 680 instructions on a Cortex-M4F, at most 830; none before an alarm. May be called
-/// from an interrupt.
+/// Do one slice of the work after an alarm. Return true iff more work is waiting. A sample needs five calls, and
+/// EST_ISOLATION_SLICES_N if none comes after it: the more slices per sample, the more samples are weighed. If more
+/// than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided. Cost: some 710 instructions on a Cortex-M4F, at most 1,720; none before an alarm. May be
+/// called from an interrupt.
 bool est_isolation_work(est_isolation_t* self);
 
 /// Diagnosis of the last alarm. The change is stated once it is 95 % certain, and is then final. The extent is refined
-/// until 100 samples after the alarm. Cost: constant. May be called from an interrupt.
+/// until 100 samples after the alarm. Faults that cannot be told apart remain undecided. Cost: constant. May be called
+/// from an interrupt.
 est_diagnosis_t est_isolation_diagnosis(const est_isolation_t* self);
 
 #ifdef __cplusplus

@@ -53,7 +53,7 @@ class RaisedAlarm:
 
 @dataclass(frozen=True)
 class ReportedDiagnosis:
-    """A diagnosis of the device: the parameter that has changed."""
+    """A diagnosis of the device: the parameter that has changed, or the fault of a channel."""
 
     index: int
     """Sample after which it was sent, counted, like ``onset``, from the start of the record without wrap-around."""
@@ -62,7 +62,7 @@ class ReportedDiagnosis:
     onset: int
     """Most likely sample of the change; that of the alarm if several parameters have changed."""
     extent: float
-    """Parameter after the change over that before; 1 if several have changed."""
+    """Parameter, or gain of a channel, after the change over that before; 1 for all other changes."""
 
 
 @dataclass(frozen=True)

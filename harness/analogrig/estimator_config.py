@@ -112,7 +112,8 @@ class EstimatorConfig:
     """A reading at or below ``code_low``, or at or above ``code_high``, is saturated; codes."""
     code_high: float = 1.0e6
     isolation: bool = True
-    """Diagnose after an alarm whether M, B or K has changed; for na = 2, nb + nk <= 3 and the trigger ``cusum``."""
+    """Diagnose after an alarm whether M, B or K has changed, or a channel is faulty; for na = 2, nb + nk <= 3 and the
+    trigger ``cusum``."""
     misfit: bool = True
     """Watch whether the model fits, and report the cause of a misfit; for na = 2."""
     force_zero: float = 0.0

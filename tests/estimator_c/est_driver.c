@@ -2,6 +2,7 @@
 /* Runs whole blocks of samples through the public header est.h, for the tests. */
 
 #include "est.h"
+#include "est_delta.h"
 #include "est_fit.h"
 #include "est_isolation.h"
 
@@ -15,6 +16,17 @@ typedef struct {
 
 static est_t        self;
 static est_config_t config;
+
+/* The estimate of the caller; na = 2. */
+static void set_theta(const double* theta) {
+    for (unsigned i = 0; i < est_theta_count(&self); i++) {
+        self.theta[i] = (float)theta[i];
+    }
+    if (est_delta_applies(&config)) {
+        est_delta_from_plain(self.theta, 1.0F, 2U);
+        est_delta_from_plain(&self.theta[3], self.theta[2], (uint_fast8_t)(config.nb - 1U));
+    }
+}
 
 /* A trigger of the caller's own: counts the innovations since it began anew, in its context. */
 static float counted;
@@ -269,9 +281,7 @@ void driver_diagnose(size_t               n,
     if (!est_init(&self, &config) || !est_isolation_init(&isolation, &config, 0.0F)) {
         return;
     }
-    for (uint8_t i = 0; i < est_theta_count(&self); i++) {
-        self.theta[i] = (float)theta[i];
-    }
+    set_theta(theta);
     for (size_t k = 0; k < n; k++) {
         const est_step_t step = { .status    = (est_status_t)status[k],
                                   .statistic = (float)statistic[k],
@@ -332,9 +342,7 @@ void driver_judge_fit(size_t               n,
     if (!est_init(&self, &config) || !est_fit_init(&fit, &config)) {
         return;
     }
-    for (unsigned i = 0; i < est_theta_count(&self); i++) {
-        self.theta[i] = (float)theta[i];
-    }
+    set_theta(theta);
     for (size_t k = 0; k < n; k++) {
         const est_sample_t sample = { .u = (float)u[k], .y = (float)y[k], .valid = status[k] != EST_MISSING };
         const est_step_t   step   = { .status     = (est_status_t)status[k],

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator_c.evidence.cost import SLICES_N as DEVICE_SLICES_N
+
 CORE = Path(__file__).parents[2] / "estimator_c" / "core"
 ISOLATION = CORE.parent / "isolation"
 FIT = CORE.parent / "fit"
@@ -71,7 +73,14 @@ class Result:
     """After the last sample; codes^2."""
 
 
-CHANGES = ("undecided", "M", "B", "K", "several")
+CHANGES = (
+    *("undecided", "M", "B", "K", "several"),
+    *(
+        f"{channel} {fault}"
+        for channel in ("force", "displacement")
+        for fault in ("offset", "gain", "delay", "stuck", "noise")
+    ),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +103,8 @@ class Isolated:
     most_n: NDArray[np.float64]
 
 
-SLICES_N = 13
-"""As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes."""
+SLICES_N = 22
+"""As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes which is weighed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,11 +213,12 @@ class Estimator:
         y: NDArray[np.float64],
         start: NDArray[np.int64],
         valid: ArrayLike | None = None,
-        slices: int = 1000,
+        slices: int = DEVICE_SLICES_N,
         force_zero: float = 0.0,
     ) -> Isolated:
         """Whole runs (t, n), each from the start: the diagnosis of the first alarm at or after ``start`` (t,).
 
+        :param slices: of work per sample, as many as in the device.
         :param force_zero: u where the force is zero.
         """
         runs, samples = u.shape

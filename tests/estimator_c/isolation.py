@@ -1,4 +1,7 @@
-"""Measures of the isolation: how often the class is right, how soon against the isolation bound, and the extent."""
+"""Measures of the isolation: how often the class is right, how soon against the isolation bound, and the extent.
+
+Faults of the channels are added to the codes of simulated plants.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.estimator_c.est_driver import Estimator, Isolated
+from tests.estimator_c.est_driver import CHANGES, Estimator, Isolated
 from tests.estimator_c.performance import Settings
 from tests.estimator_c.plants import (
     CODES,
@@ -38,6 +41,20 @@ AT_ONCE = 20
 Change = Mapping[str, float]
 """Factors of "M", "B", "K"; those that do not change are absent."""
 
+FAULTS = CHANGES[CHANGES.index("several") + 1 :]
+"""Faults of a channel, such as "force offset"."""
+
+SIZES = {
+    "force offset": (20.0, 1000.0),
+    "force gain": (0.05, 0.5),
+    "force noise": (20.0, 200.0),
+    "displacement offset": (5.0, 200.0),
+    "displacement gain": (0.05, 0.5),
+    "displacement noise": (3.0, 20.0),
+}
+"""Least and largest size of those that have one: codes, part of the gain, rms codes. Its logarithm is drawn evenly; of
+an offset and a gain also the sign."""
+
 
 @dataclass(frozen=True)
 class Isolation:
@@ -53,6 +70,8 @@ class Isolation:
     """Mean of the isolation bounds of these very trials; NaN if not asked for."""
     bound_of_pairs_n: float
     """The same if two others at once count as a rival too; NaN if several had changed, or if not asked for."""
+    bound_of_all_n: float
+    """The same if offsets and gains of the channels count as well."""
     within_twice: float
     """Share of the trials in which the report came within twice the bound of that trial."""
     error: float
@@ -79,7 +98,9 @@ def truth(change: Change) -> str:
     return next(iter(change)) if len(change) == 1 else "several"
 
 
-def judged(found: Isolated, played: Trials, change: Change, bound_n: Array, bound_of_pairs_n: Array) -> Isolation:
+def judged(
+    found: Isolated, played: Trials, change: Change, bound_n: Array, bound_of_pairs_n: Array, bound_of_all_n: Array
+) -> Isolation:
     """The measures of these diagnoses; the bounds are (t,)."""
     reported, right = found.change != "undecided", found.change == truth(change)
     taken_n = np.where(reported, found.at - played.onset, HORIZON_N)
@@ -93,6 +114,7 @@ def judged(found: Isolated, played: Trials, change: Change, bound_n: Array, boun
         mean_n=float(taken_n.mean()),
         bound_n=float(bound_n.mean()),
         bound_of_pairs_n=float(bound_of_pairs_n.mean()),
+        bound_of_all_n=float(bound_of_all_n.mean()),
         within_twice=float((taken_n <= 2.0 * bound_n).mean()),
         error=errors[0],
         error_refined=errors[1],
@@ -119,12 +141,58 @@ def measure(
     played = play(plant, change, excitation, trials, seed)
     assert estimator.init(**settings)
     found = estimator.isolate(played.u, played.y, played.onset)
-    bound_n = bound_of_pairs_n = np.full(trials, np.nan)
+    bound_n = bound_of_pairs_n = bound_of_all_n = np.full(trials, np.nan)
     if bounded:
         bound_n = bounds(plant, change, excitation, played.onset, seed)
     if bounded and against_two and len(change) == 1:
-        bound_of_pairs_n = bounds_of_pairs(plant, change, excitation, played.onset, seed)
-    return judged(found, played, change, bound_n, bound_of_pairs_n)
+        bound_of_pairs_n = np.maximum(bound_n, bounds_of_pairs(plant, change, excitation, played.onset, seed))
+        of_faults_n = bounds_of_faults(plant, change, excitation, played.onset, seed)
+        bound_of_all_n = np.maximum(bound_of_pairs_n, of_faults_n)
+    return judged(found, played, change, bound_n, bound_of_pairs_n, bound_of_all_n)
+
+
+def faulty(
+    fault: str, u: Array, y: Array, onset: NDArray[np.int64], rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Codes (t, n) of force and displacement with a fault after ``onset``, and the sizes (t,) drawn for it.
+
+    :param fault: one of FAULTS. A stuck channel keeps the code of the onset; a delay is of one sample; a gain is
+        counted from code 0.
+    """
+    channel, kind = fault.split(" ")
+    codes = u if channel == "force" else y
+    trials, samples = codes.shape
+    size = np.ones(trials)
+    if fault in SIZES:
+        least, most = SIZES[fault]
+        size = least * np.exp(rng.uniform(0.0, np.log(most / least), trials))
+        if kind != "noise":
+            size *= rng.choice((-1.0, 1.0), trials)
+    wrong = {
+        "offset": lambda: codes + np.round(size)[:, None],
+        "gain": lambda: np.round(codes * (1.0 + size)[:, None]),
+        "delay": lambda: np.roll(codes, 1, axis=1),
+        "stuck": lambda: np.repeat(codes[np.arange(trials), onset][:, None], samples, axis=1),
+        "noise": lambda: codes + np.round(rng.normal(size=codes.shape) * size[:, None]),
+    }[kind]()
+    codes = np.where(np.arange(samples) > onset[:, None], wrong, codes)
+    return (codes, y, size) if channel == "force" else (u, codes, size)
+
+
+def diagnose_fault(
+    estimator: Estimator,
+    settings: Settings,
+    plant: Mechanics,
+    fault: str,
+    excitation: Excitation,
+    trials: int,
+    seed: int,
+) -> tuple[Isolated, NDArray[np.int64]]:
+    """The diagnoses of so many trials with this fault, and its onsets."""
+    played = play(plant, {}, excitation, trials, seed)
+    u, y, _ = faulty(fault, played.u, played.y, played.onset, np.random.default_rng([seed, 2]))
+    assert estimator.init(**settings)
+    return estimator.isolate(u, y, played.onset), played.onset
 
 
 def bounds(
@@ -169,6 +237,30 @@ def bounds_of_pairs(
         slopes = [(other - others[0]) / step for other in others[1:]]
         out[part] = _separated(_least_nearby(course - others[0], slopes).min(axis=0) / (2.0 * VARIANCE_LSB2))
     return out
+
+
+def bounds_of_faults(
+    plant: Mechanics, change: Change, excitation: Excitation, onset: NDArray[np.int64], seed: int
+) -> NDArray[np.float64]:
+    """As ``bounds`` of a single change; the rivals are an offset and a gain of either channel, of any size.
+
+    An offset of the force is a force that acts from the onset on, its gain a common factor of M, B and K.
+    """
+    first = excitation.first_edges(np.random.default_rng(seed), len(onset))
+    step = 1e-3
+    stiffer = plant
+    for parameter in "MBK":
+        stiffer = stiffer.scaled(parameter, 1.0 + step)
+    course, unchanged, other = _courses(plant, [changed(plant, change), plant, stiffer], excitation, first, onset)
+    pushed = plant.response(np.arange(1.0, HORIZON_N + 1.0))[0][:, None]
+    effects = (np.ones_like(course), unchanged, np.broadcast_to(pushed, course.shape), other - unchanged)
+    rest = course - unchanged
+    least = np.full(course.shape, np.inf)
+    for effect in effects:
+        rr, re, ee = (np.cumsum(a * b, axis=0) for a, b in ((rest, rest), (rest, effect), (effect, effect)))
+        left = rr - np.divide(re**2, ee, out=np.zeros_like(re), where=ee > 0.0)
+        least = np.minimum(least, left / (2.0 * VARIANCE_LSB2))
+    return _separated(least)
 
 
 def _least_nearby(rest: Array, slopes: list[Array]) -> Array:

@@ -100,10 +100,12 @@ def test_watch_of_the_fit_costs_what_its_header_says(costs: Mapping[str, cost.Co
 
 
 def test_isolation_costs_what_its_header_says(costs: Mapping[str, cost.Cost]) -> None:
-    assert costs["M4F, isolation, a sample entered"].value <= 180
-    assert costs["M4F, isolation, a sample entered, worst"].value <= 2500
-    assert costs["M4F, isolation, a slice of work"].value <= 680
-    assert costs["M4F, isolation, a slice of work, worst"].value <= 830
+    assert costs["M4F, isolation, a sample entered"].value <= 330
+    assert costs["M4F, isolation, a sample entered, worst"].value <= 920
+    assert costs["M4F, isolation, a slice of work"].value <= 710
+    assert costs["M4F, isolation, a slice of work, worst"].value <= 1720
+    assert costs["M4F, isolation, the 12 slices of a sample, worst"].value <= 10600
+    assert costs["M4F, state: sizeof(est_isolation_t)"].value <= 3300
 
 
 def test_no_limit_goes_untested(costs: Mapping[str, cost.Cost]) -> None:

@@ -34,21 +34,40 @@ def test_changed_parameter_is_named_in_time_and_its_extent_told(
     assert found.error_refined < 0.01
 
 
-@pytest.mark.parametrize("change", [{"M": 0.8}, {"M": 1.2}, {"B": 1.2}, {"K": 0.8}], ids=str)
+@pytest.mark.parametrize("change", SINGLE, ids=str)
 def test_report_comes_within_twice_the_isolation_bound_on_average(estimator: Estimator, change: Change) -> None:
-    """1.6 to 2.0 times; B - 20 % and K + 20 % are below."""
-    found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 400, seed=31, against_two=False)
-    assert found.bound_n < found.mean_n <= 2.0 * found.bound_n
+    """The rivals of the bound are all that the isolation weighs. As long as no force acts two others at once are the
+    hardest: with single rivals the bound is half as long."""
+    found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 40, seed=31)
+    assert found.bound_n < found.bound_of_pairs_n <= found.bound_of_all_n
+    assert found.bound_n < found.mean_n <= 1.5 * found.bound_of_all_n
 
 
-@pytest.mark.parametrize("change", [{"B": 0.8}, {"K": 1.2}], ids=str)
-def test_change_that_two_others_at_once_look_like_for_long_is_reported_soon_after_they_do_not(
-    estimator: Estimator, change: Change
+@pytest.mark.parametrize(("settings", "excitation"), CLOCKS.values(), ids=CLOCKS)
+@pytest.mark.parametrize("fault", isolation.FAULTS)
+def test_fault_of_a_channel_is_not_taken_for_a_change_of_the_plant(
+    estimator: Estimator, settings: Settings, excitation: Excitation, fault: str
 ) -> None:
-    """As long as no force acts nothing tells them apart: twice the bound against single rivals is not to be had."""
-    found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 60, seed=31)
-    assert found.bound_of_pairs_n > 1.9 * found.bound_n
-    assert found.bound_of_pairs_n < found.mean_n < 1.3 * found.bound_of_pairs_n
+    """At most 5 % are named a parameter: more than 5 of 60 have a probability of 7 % there, of 0.0005 % at 1 %."""
+    found, _ = isolation.diagnose_fault(estimator, settings, FRONT, fault, excitation, 60, seed=31)
+    assert np.isin(found.change, ("M", "B", "K")).sum() <= 5
+
+
+@pytest.mark.parametrize("fault", isolation.FAULTS)
+def test_fault_of_a_channel_is_named(estimator: Estimator, fault: str) -> None:
+    """A gain of the force and one of the displacement are the same as long as the plant is at rest at the onset."""
+    found, _ = isolation.diagnose_fault(estimator, SHARED_CLOCK, FRONT, fault, FULL, 60, seed=31)
+    assert (found.change == fault).mean() >= (0.4 if fault == "force gain" else 0.85)
+
+
+@pytest.mark.parametrize("fault", ["force gain", "displacement gain"])
+def test_extent_of_a_gain_is_told(estimator: Estimator, fault: str) -> None:
+    played = isolation.play(FRONT, {}, FULL, 60, seed=31)
+    u, y, size = isolation.faulty(fault, played.u, played.y, played.onset, np.random.default_rng(2))
+    assert estimator.init(**SHARED_CLOCK)
+    found = estimator.isolate(u, y, played.onset)
+    named = found.change == fault
+    assert np.percentile(np.abs(found.extent / (1.0 + size) - 1.0)[named], 90) < 0.02
 
 
 @pytest.mark.parametrize("change", TWO, ids=str)
@@ -79,14 +98,15 @@ def test_mass_that_hardly_matters_is_not_named_for_what_damping_did(estimator: E
     assert (named == "B").mean() > 0.7
 
 
-def test_verdict_does_not_depend_on_when_the_work_is_done(estimator: Estimator) -> None:
+def test_less_work_per_sample_delays_the_verdict_by_few_samples(estimator: Estimator) -> None:
+    """Fewer samples are weighed, and the first ones wait."""
     played = isolation.play(FRONT, {"B": 1.2}, FULL, 20, seed=2)
     assert estimator.init(**SHARED_CLOCK)
-    at_once = estimator.isolate(played.u, played.y, played.onset)
-    later = estimator.isolate(played.u, played.y, played.onset, slices=2 * SLICES_N - 2)
+    at_once = estimator.isolate(played.u, played.y, played.onset, slices=1000)
+    later = estimator.isolate(played.u, played.y, played.onset)
     assert np.array_equal(at_once.change, later.change)
-    assert np.array_equal(at_once.refined, later.refined)
-    assert (later.at >= at_once.at).all()
+    assert np.allclose(at_once.refined, later.refined, rtol=1e-4)
+    assert 1.0 < (later.at - at_once.at).mean() < 6.0
 
 
 def test_too_little_work_leaves_it_undecided(estimator: Estimator) -> None:
@@ -219,6 +239,11 @@ def test_fast_poles_are_a_suspension_too(by_hand: Estimator, a1: float, a2: floa
     assert by_hand.diagnose((a1, a2, *SUSPENSION[2:]), steps()).left.any()
 
 
+def test_model_may_have_fewer_lags_than_the_longest(by_hand: Estimator) -> None:
+    assert by_hand.init(nb=2, nk=0)
+    assert by_hand.diagnose((-1.7, 0.74, 0.02, 0.02, 0.0), steps()).left.any()
+
+
 def test_alarm_before_the_plant_was_ever_well_leaves_it_undecided(by_hand: Estimator) -> None:
     assert not by_hand.diagnose(SUSPENSION, steps(quiet_n=SETTLED_N - 20)).left.any()
 
@@ -229,8 +254,16 @@ def test_statistic_that_rises_for_hundreds_of_samples_is_no_obstacle(by_hand: Es
 
 def test_alarm_right_after_a_gap_has_too_few_samples_before_it(by_hand: Estimator) -> None:
     played = steps(rising_n=1)
-    played[alarm_at(played) - 2, STATUS] = GATHERING
+    played[alarm_at(played) - 2, STATUS] = REFUSED
     assert not by_hand.diagnose(SUSPENSION, played).left.any()
+
+
+@pytest.mark.parametrize(("before_n", "isolated"), [(SETTLED_N + 20, True), (SETTLED_N - 20, False)])
+def test_theta_has_to_settle_after_a_slip(by_hand: Estimator, before_n: int, *, isolated: bool) -> None:
+    """Whitening begins anew without a gap."""
+    played = steps(quiet_n=2 * SETTLED_N + 40)
+    played[alarm_at(played) - before_n, STATUS] = GATHERING
+    assert by_hand.diagnose(SUSPENSION, played).left.any() == isolated
 
 
 def test_refused_sample_after_the_alarm_leaves_it_undecided(by_hand: Estimator) -> None:
@@ -242,13 +275,31 @@ def test_refused_sample_after_the_alarm_leaves_it_undecided(by_hand: Estimator) 
     assert not left[refused:].any()
 
 
-def test_second_alarm_soon_after_the_first_ends_the_work_on_it(by_hand: Estimator) -> None:
+def test_second_alarm_after_the_diagnosis_ends_the_work_on_it(by_hand: Estimator) -> None:
     played = steps()
     second = alarm_at(played) + 10
     played[second, ALARM] = 1.0
+    assert by_hand.diagnose(SUSPENSION, played[:second]).change != "undecided"
     left = by_hand.diagnose(SUSPENSION, played).left
     assert left[second - 1] > 0
     assert not left[second:].any()
+
+
+def test_second_alarm_before_the_diagnosis_does_not_end_the_work_on_it(by_hand: Estimator) -> None:
+    played = steps()
+    second = alarm_at(played) + 1
+    played[second, ALARM] = 1.0
+    assert by_hand.diagnose(SUSPENSION, played[:second]).change == "undecided"
+    assert (by_hand.diagnose(SUSPENSION, played).left[second : second + 5] > 0).all()
+
+
+def test_onset_counts_from_the_last_alarm(estimator: Estimator) -> None:
+    """Noise of the displacement raises one alarm after another."""
+    found, onset = isolation.diagnose_fault(estimator, SHARED_CLOCK, FRONT, "displacement noise", FULL, 60, seed=31)
+    named = found.change == "displacement noise"
+    assert named.any()
+    assert (found.onset_n[named] <= (found.at - onset)[named] + 2).all()
+    assert (found.onset_n[named] > (found.alarm - onset)[named]).any()
 
 
 def test_extent_is_refined_until_a_hundred_samples_after_the_alarm(by_hand: Estimator) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analogrig.catalogue import Change
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import judge
 from analogrig.plant import Plant
@@ -40,6 +41,13 @@ def test_statement_that_only_pytest_judges_is_named() -> None:
     scenario = {**run.conditions.scenario, "statement": {"name": "detects", "limits": {"within": 1.5}}}
     stated = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, scenario=scenario))
     assert "[statement] detects is not judged here" in advised(stated)
+
+
+def test_fault_of_a_channel_that_the_device_diagnosed_is_named() -> None:
+    named = [(10 * k, Change.DISPLACEMENT_STUCK, 5, 1.0) for k in range(1, 8)]
+    said = advised(made_run(LOADED, [(0, FRONT)], theta=GOOD_THETA, diagnoses=[*named, (90, Change.MASS, 80, 1.2)]))
+    assert "(displacement stuck) at sample 10 and 6 later samples, not a change of the plant" in said
+    assert "displacement: check its cable and its input" in said
 
 
 def test_more_noise_than_the_device_is_set_for_is_named() -> None:

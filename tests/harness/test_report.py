@@ -137,7 +137,7 @@ def test_wrong_diagnosis_is_marked(run: Run) -> None:
 def test_page_states_that_there_is_no_diagnosis(run: Run) -> None:
     silent = tuple(replace(tweak, diagnosis=None) for tweak in reported_verdict(run).tweaks)
     read = Page(render(run, replace(reported_verdict(run), tweaks=silent)))
-    assert "The device reported no diagnosis." in read.text
+    assert "The device reported no diagnosis of a change." in read.text
 
 
 def test_long_list_of_false_alarms_is_cut_with_a_note(run: Run) -> None:

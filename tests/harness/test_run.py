@@ -141,7 +141,7 @@ def test_recording_from_before_these_reports_has_none(run: Run, tmp_path: Path, 
     ("name", "values"),
     [
         ("diagnosis_index", np.array([30, 500])),
-        ("diagnosis_change", np.array([3, 9], np.uint8)),
+        ("diagnosis_change", np.array([3, len(Change)], np.uint8)),
         ("diagnosis_change", np.array([3, Change.UNDECIDED], np.uint8)),
     ],
 )

@@ -181,6 +181,12 @@ def test_several_is_right_if_more_than_one_has_changed() -> None:
     assert (said.named, said.right) == ("several", False)
 
 
+def test_fault_of_a_channel_is_wrong_where_a_parameter_has_changed() -> None:
+    said = told((420, Change.FORCE_GAIN, 398, 1.2))
+    assert said is not None
+    assert (said.named, said.right, said.extent, said.extent_error) == ("force gain", False, None, None)
+
+
 def test_diagnosis_without_a_detection_is_not_attributed() -> None:
     assert told((403, Change.STIFFNESS, 395, 0.75)) is None
     assert told((420, Change.STIFFNESS, 395, 0.75), alarms=()) is None

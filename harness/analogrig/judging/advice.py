@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, MisfitPeriod, Verdict
+from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChannelFault, MisfitPeriod, Verdict
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -38,6 +38,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_theta_without_a_model(run),
         *_assumed_settings(run),
         *_overloads(verdict),
+        *_channel_faults(verdict),
         *_noise_setting(run),
         *_edge_spacing(run),
         *_warm_up(run),
@@ -103,6 +104,21 @@ def _overloads(verdict: Verdict) -> Iterator[str]:
             f"{names} overloaded from sample {min(verdict.overloads.values())} on: the computer no longer matched the"
             " plant of the scenario, so estimates and alarms may be correct for the overloaded computer"
         )
+
+
+def _channel_faults(verdict: Verdict) -> Iterator[str]:
+    """One sentence for each fault. The scenario has none: the rig has it, or the device is wrong."""
+    for name, faults in itertools.groupby(sorted(verdict.channel_faults, key=_name), _name):
+        first, *others = faults
+        more = f" and {number_of(len(others), 'later sample')}" if others else ""
+        yield (
+            f"the device diagnosed a fault of a channel ({name}) at sample {first.sample}{more}, not a change of the"
+            f" plant; {first.cure}"
+        )
+
+
+def _name(fault: ChannelFault) -> str:
+    return fault.name
 
 
 def _noise_setting(run: Run) -> Iterator[str]:

@@ -45,8 +45,16 @@ instant, which is known only as an interval. ``not judged``: the change was not 
 ESTIMATES, STATISTIC, DIAGNOSES = "estimates of M, B, K", "the trigger's statistic", "diagnoses"
 """Quantities in ``Verdict.not_judged`` that reports show elsewhere."""
 
-DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
-"""Changes that a device can diagnose, with their names in verdicts."""
+CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERAL)
+"""Changes that are faults of a channel. Diagnosed where a parameter has changed, they are wrong."""
+
+GAINS = frozenset({Change.FORCE_GAIN, Change.DISPLACEMENT_GAIN})
+"""Faults of a channel that have an extent."""
+
+DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"} | {
+    fault: fault.name.lower().replace("_", " ") for fault in CHANNEL_FAULTS
+}
+"""Changes that a device can diagnose, with their names in verdicts, such as ``force offset``."""
 
 CURES: Mapping[str, str] = {
     "drift": "remove the mean of the displacement by a high-pass filter, or make the run shorter",
@@ -58,6 +66,35 @@ CURES: Mapping[str, str] = {
     "excitation": "raise the amplitude of the excitation",
 }
 """Measure against each cause of a misfit."""
+
+FAULT_CURES: Mapping[str, str] = {
+    "offset": "measure its code at rest, and correct the zero of its input",
+    "gain": "check its range, its reference voltage and its load",
+    "delay": "check the order in which the channels are sampled, and whether a transfer lost a sample",
+    "stuck": "check its cable and its input",
+    "noise": "check its cable, its shield and its ground",
+}
+"""Measure against each fault of a channel."""
+
+
+@dataclass(frozen=True)
+class ChannelFault:
+    """Fault of a channel that the device diagnosed."""
+
+    name: str
+    """Name in ``DIAGNOSABLE``, such as ``force offset``."""
+    sample: int
+    """Sample after which it was diagnosed."""
+    onset: int
+    """Likeliest sample of its beginning."""
+    extent: float | None
+    """Gain after over gain before; None unless the fault is a gain, or non-finite."""
+
+    @property
+    def cure(self) -> str:
+        """Measure against the fault."""
+        channel, kind = self.name.split()
+        return f"{channel}: {FAULT_CURES[kind]}"
 
 
 @dataclass(frozen=True)
@@ -90,7 +127,7 @@ class DiagnosisVerdict:
     """Verdict on the first diagnosis after the detection of a change."""
 
     named: str
-    """``M``, ``B``, ``K`` or ``several``."""
+    """Name in ``DIAGNOSABLE``: ``M``, ``B``, ``K``, ``several`` or a fault of a channel, such as ``force offset``."""
     right: bool
     delay_n: int
     """Samples from the change to the diagnosis."""
@@ -99,7 +136,7 @@ class DiagnosisVerdict:
     onset_error_n: int
     """Diagnosed minus true sample of the change."""
     extent: float | None
-    """Diagnosed ratio of the new to the old value; None if several parameters were named, or non-finite."""
+    """Diagnosed ratio of the new to the old value; None unless a parameter was named, or non-finite."""
     extent_error: float | None
     """Relative error of ``extent``; None unless exactly one parameter changed and was named."""
 
@@ -230,6 +267,8 @@ class Verdict:
     """Sample indices of the alarms that are false under some hypotheses only."""
     fit: tuple[MisfitPeriod, ...] | None = None
     """Periods of a misfit, in order; None if the device does not watch whether its model fits."""
+    channel_faults: tuple[ChannelFault, ...] = ()
+    """Faults of the channels that the device diagnosed, in order. No scenario contains one."""
 
     def __bool__(self) -> bool:
         raise TypeError('a verdict is neither true nor false: ask for verdict.outcome == "passed"')
@@ -279,6 +318,22 @@ def judge(run: Run) -> Verdict:
         cannot_tell=sheet.cannot_tell,
         overloads=dict(run.conditions.overloads),
         fit=misfit_periods(run) if sheet.misfits else None,
+        channel_faults=channel_faults(run),
+    )
+
+
+def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
+    """Faults of the channels that the device diagnosed."""
+    reported = zip(run.diagnosis_change, run.diagnosis_index, run.diagnosis_onset, run.diagnosis_extent, strict=True)
+    return tuple(
+        ChannelFault(
+            name=DIAGNOSABLE[Change(change)],
+            sample=int(sample),
+            onset=int(onset),
+            extent=float(extent) if Change(change) in GAINS and math.isfinite(extent) else None,
+        )
+        for change, sample, onset, extent in reported
+        if change in CHANNEL_FAULTS
     )
 
 
@@ -372,12 +427,13 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "not_judged": list(verdict.not_judged),
         "cannot_tell": list(verdict.cannot_tell),
         "overloads": dict(verdict.overloads),
-        "fit": None if verdict.fit is None else [_misfit_as_json(period) for period in verdict.fit],
+        "fit": None if verdict.fit is None else [_with_cure(period) for period in verdict.fit],
+        "channel_faults": [_with_cure(fault) for fault in verdict.channel_faults],
     }
 
 
-def _misfit_as_json(period: MisfitPeriod) -> dict[str, Any]:
-    return dataclasses.asdict(period) | {"cure": period.cure}
+def _with_cure(found: MisfitPeriod | ChannelFault) -> dict[str, Any]:
+    return dataclasses.asdict(found) | {"cure": found.cure}
 
 
 @dataclass(frozen=True)

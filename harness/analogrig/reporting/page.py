@@ -49,6 +49,7 @@ def render(run: Run, verdict: Verdict) -> str:
         conditions=tables.conditions(run, verdict),
         tweaks=tables.tweaks(verdict),
         diagnoses=tables.diagnoses(verdict),
+        channel_faults=tables.channel_faults(verdict),
         false_alarms=tables.false_alarms(run, verdict),
         fit=tables.fit(verdict),
         estimates=tables.estimates(verdict),

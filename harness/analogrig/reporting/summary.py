@@ -8,6 +8,7 @@ from analogrig.judging.advice import advice
 from analogrig.judging.verdict import (
     ESTIMATES,
     ChangeVerdict,
+    ChannelFault,
     DiagnosisVerdict,
     MisfitPeriod,
     SegmentEstimate,
@@ -33,18 +34,20 @@ def summary(run: Run, verdict: Verdict) -> str:
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
         lines += [line for tweak in verdict.tweaks for line in _change_lines(tweak)]
-    diagnoses = [_diagnosis_line(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
+    diagnoses = [(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
     if diagnoses:
+        width = max(len("several"), *(len(diagnosis.named) for _, diagnosis in diagnoses))
         lines += [
             "",
-            "  sample  named    right  extent   error       delay  bound   onset error  (samples)",
-            *diagnoses,
+            f"  sample  {'named':{width}}  right  extent   error       delay  bound   onset error  (samples)",
+            *(_diagnosis_line(*each, width) for each in diagnoses),
         ]
     load = load_of(run)
     facts = {
         "false alarms": f"{_alarms(verdict.false_alarms)} in {number_of(run.samples, 'sample')}",
         "false or not, depending on the instants of the changes": verdict.doubtful_alarms
         and f"alarms at {', '.join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))}",
+        "faults of channels": verdict.channel_faults and channel_faults_text(verdict.channel_faults),
         "misfit": verdict.fit and misfit_text(verdict.fit),
         missing_text(run): verdict.missing_n and number_of(verdict.missing_n, "sample"),
         "overload lamps": verdict.overloads and lamps_text(verdict.overloads),
@@ -58,6 +61,12 @@ def summary(run: Run, verdict: Verdict) -> str:
     digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  {digest}"]
     return "\n".join(lines)
+
+
+def channel_faults_text(faults: Sequence[ChannelFault]) -> str:
+    """Faults of the channels: ``displacement stuck at 433 (since 419)``."""
+    shown = [f"{fault.name} at {fault.sample} (since {fault.onset})" for fault in faults[:SHOWN_ALARMS]]
+    return ", ".join([*shown, *(["..."] if len(faults) > SHOWN_ALARMS else [])])
 
 
 def misfit_text(fit: Sequence[MisfitPeriod]) -> str:
@@ -107,13 +116,13 @@ def change_text(tweak: ChangeVerdict) -> str:
     return ", ".join(f"{name} {old:g} -> {tweak.after[name]:g} {UNITS[name]}" for name, old in tweak.before.items())
 
 
-def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:
+def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict, width: int) -> str:
     extent = "-" if diagnosis.extent is None else f"{diagnosis.extent:.3f}"
     error = "-" if diagnosis.extent_error is None else f"{diagnosis.extent_error:+.1%}"
     bound = "none" if diagnosis.bound_n is None else str(diagnosis.bound_n)
     right = "yes" if diagnosis.right else "NO"
     return (
-        f"  {sample:6}  {diagnosis.named:7}  {right:>5}  {extent:>6}  {error:>6}"
+        f"  {sample:6}  {diagnosis.named:{width}}  {right:>5}  {extent:>6}  {error:>6}"
         f"  {diagnosis.delay_n:10}  {bound:>5}  {diagnosis.onset_error_n:+12}"
     )
 

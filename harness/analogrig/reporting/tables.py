@@ -12,6 +12,7 @@ from analogrig.judging.verdict import (
     ESTIMATES,
     STATISTIC,
     ChangeVerdict,
+    ChannelFault,
     DiagnosisVerdict,
     MisfitPeriod,
     SegmentEstimate,
@@ -31,6 +32,9 @@ _MAX_FALSE_ALARMS = 20
 
 _MAX_MISFITS = 20
 """Rows in the table of misfits."""
+
+_MAX_CHANNEL_FAULTS = 20
+"""Rows in the table of faults of the channels."""
 
 _SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
 
@@ -113,11 +117,23 @@ def diagnoses(verdict: Verdict) -> str:
     if DIAGNOSES in verdict.not_judged:
         return "<p>Not judged: the device does not report diagnoses.</p>"
     if not reported:
-        return "<p>The device reported no diagnosis.</p>"
+        return "<p>The device reported no diagnosis of a change.</p>"
     caption = "Diagnoses of the device; delay and isolation bound in samples from the change"
     numbers = ("Extent", "Error", "Delay", "Bound", "Onset error")
     head = heading(("Sample", "Changed", "Named"), numbers, ("Result",))
     return table(caption, head, (_diagnosis_row(*each) for each in reported))
+
+
+def channel_faults(verdict: Verdict) -> str:
+    """Table of the faults of the channels that the device diagnosed."""
+    if DIAGNOSES in verdict.not_judged:
+        return "<p>Not judged: the device does not report diagnoses.</p>"
+    if not verdict.channel_faults:
+        return "<p>The device reported none.</p>"
+    shown = verdict.channel_faults[:_MAX_CHANNEL_FAULTS]
+    caption = "Faults as diagnosed by the device; onset: likeliest sample of the beginning"
+    head = heading(("Sample", "Fault"), ("Onset", "Extent"), ("Cure",))
+    return table(caption, head, (_channel_fault_row(fault) for fault in shown))
 
 
 def false_alarms(run: Run, verdict: Verdict) -> str:
@@ -241,6 +257,11 @@ def _diagnosis_row(tweak: ChangeVerdict, diagnosis: DiagnosisVerdict) -> str:
     cells += [number(diagnosis.extent, ".3f"), number(diagnosis.extent_error, "+.1%")]
     cells += [number(diagnosis.delay_n), number(diagnosis.bound_n), number(diagnosis.onset_error_n, "+d")]
     return row([*cells, cell(word, f"text {kind}")])
+
+
+def _channel_fault_row(fault: ChannelFault) -> str:
+    cells = [_zoom(fault.sample), cell(fault.name), number(fault.onset), number(fault.extent, ".3f")]
+    return row([*cells, cell(fault.cure, "text")])
 
 
 def _misfit_row(period: MisfitPeriod) -> str:

@@ -38,6 +38,7 @@ def _scenario(name: str, excitation: Excitation, samples: int = 640, **changed: 
 
 
 SOFTER = _scenario("softer", dataclasses.replace(_FREE, phase=0.133), stiffness_n_per_m=19_600.0)
+SOFTER_LATER = dataclasses.replace(SOFTER, samples=720, tweaks=(PotChange(640, stiffness_n_per_m=19_600.0),))
 LOCKED = _scenario("softer, one clock", _SQUARE, stiffness_n_per_m=19_600.0)
 _SINGLE = {
     "M falls": {"mass_kg": 30.1},
@@ -50,6 +51,7 @@ _SINGLE = {
     "M and K rise": {"mass_kg": 60.0, "stiffness_n_per_m": 28_500.0},
 }
 HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
+FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
 RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
@@ -150,6 +152,40 @@ def hold(codes: Codes, missing: NDArray[np.bool_]) -> None:
     missing[edges[6] + 20] = True
 
 
+FAULT_AT = 420
+"""First sample of a faulty channel."""
+
+
+def _fails(channel: int, wrong: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Spoil:
+    """Codes of a channel from FAULT_AT on, made of the true ones, which begin one sample earlier."""
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+        codes[FAULT_AT:, channel] = np.round(wrong(codes[FAULT_AT - 1 :, channel].astype(np.float64)))
+
+    return spoil
+
+
+def _noise(deviation: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    return lambda codes: codes[1:] + np.random.default_rng(1995).normal(0.0, deviation, len(codes) - 1)
+
+
+FAULTS: Mapping[str, Spoil] = {
+    "offset of the force": _fails(U, lambda codes: codes[1:] + 150.0),
+    "gain of the force": _fails(U, lambda codes: 341.0 + 1.3 * (codes[1:] - 341.0)),
+    "late force": _fails(U, lambda codes: codes[:-1]),
+    "stuck force": _fails(U, lambda codes: np.repeat(codes[:1], len(codes) - 1)),
+    "noisy force": _fails(U, _noise(40.0)),
+    "offset of the displacement": _fails(Y, lambda codes: codes[1:] + 25.0),
+    "gain of the displacement": _fails(Y, lambda codes: 410.0 + 0.8 * (codes[1:] - 410.0)),
+    "late displacement": _fails(Y, lambda codes: codes[:-1]),
+    "stuck displacement": _fails(Y, lambda codes: np.repeat(codes[:1], len(codes) - 1)),
+    "noisy displacement": _fails(Y, _noise(8.0)),
+}
+"""Faults of a channel, one at a time. Gains are counted from where the force is zero."""
+
+_ARMED = {"warm_up_n": 150}
+"""Plays are too short for the default."""
+
 _FIXED = {"refresh_n": 0, "c": (-1.45, 0.51)}
 """C near the plant's A. A refresh depends on whether A has moved by REFRESH_STEP, which rounding may decide."""
 
@@ -158,11 +194,13 @@ _RESTLESS = {"forgetting": 0.97, "warm_up_n": 100}
 
 _FREE_ALARMS = {"warm_up_n": 60, "refresh_n": 0}
 _TWO_B = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked"}
+_ONE_CLOCK = {**_FIXED, **_ARMED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995}
+"""Settings without a slip, which a late force would be taken for."""
 
 CASES: Mapping[str, ReferenceCase] = {
-    "default": ReferenceCase(SOFTER),
-    "default in blocks": ReferenceCase(SOFTER, exchange="block"),
-    "one clock": ReferenceCase(LOCKED, {**_TWO_B, **_FIXED, "forgetting": 0.997, "isolation": False}),
+    "default": ReferenceCase(SOFTER_LATER),
+    "default in blocks": ReferenceCase(SOFTER, _ARMED, exchange="block"),
+    "one clock": ReferenceCase(LOCKED, {**_TWO_B, **_FIXED, **_ARMED, "forgetting": 0.997, "isolation": False}),
     "anywhere": ReferenceCase(SOFTER, {**_RESTLESS, "edge_instants": "anywhere", "edge_codes": 500.0}),
     "edges become late": ReferenceCase(LATE, _RESTLESS),
     "edges become early": ReferenceCase(EARLY, _RESTLESS),
@@ -173,14 +211,22 @@ CASES: Mapping[str, ReferenceCase] = {
     ),
     "strong prior": ReferenceCase(
         SOFTER,
-        {**_FIXED, "p0": 1e-6, "p0_offset": 1e-2, "forgetting": 0.95, "noise_variance": 50.0, "isolation": False},
+        {
+            **_FIXED,
+            **_ARMED,
+            "p0": 1e-6,
+            "p0_offset": 1e-2,
+            "forgetting": 0.95,
+            "noise_variance": 50.0,
+            "isolation": False,
+        },
     ),
     "missing": ReferenceCase(SOFTER, _RESTLESS, leave_out),
     "saturated": ReferenceCase(HEALTHY, {"code_low": float(LOW), "code_high": float(HIGH)}, saturate),
     "stuck": ReferenceCase(HEALTHY, {**_FIXED, "stuck_n": 8}, hold),
     "idle": ReferenceCase(RARE_EDGES, {**_RESTLESS, "idle_n": 60}),
-    "noise estimated": ReferenceCase(SOFTER, {"noise_estimated": True, "noise_variance": 4.0}),
-    "random walk": ReferenceCase(SOFTER, {"random_walk": 1e-5, "forgetting": 1.0}),
+    "noise estimated": ReferenceCase(SOFTER, {**_ARMED, "noise_estimated": True, "noise_variance": 4.0}),
+    "random walk": ReferenceCase(SOFTER, {**_ARMED, "random_walk": 1e-5, "forgetting": 1.0}),
     "extended": ReferenceCase(
         SOFTER, {**_TWO_B, "nc": 2, "c": (), "refresh_n": 0, "trigger": "none"}, is_optional=True
     ),
@@ -199,12 +245,14 @@ CASES: Mapping[str, ReferenceCase] = {
     "no trigger": ReferenceCase(SOFTER, {"trigger": "none", "c": (), "refresh_n": 35, "idle_n": 0, "forgetting": 0.97}),
     "often refreshed": ReferenceCase(SOFTER, {**_RESTLESS, "refresh_n": 18, "c": (-0.9, 0.2)}),
     **{
-        name: ReferenceCase(_scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed))
+        name: ReferenceCase(
+            _scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed), _ARMED
+        )
         for number, (name, changed) in enumerate(_SINGLE.items())
     },
     "M falls, one clock": ReferenceCase(
         _scenario("M falls, one clock", _SQUARE, 530, **_SINGLE["M falls"]),
-        {**_FIXED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995},
+        _ONE_CLOCK,
     ),
     "ringing plant": ReferenceCase(
         dataclasses.replace(_scenario("ringing", _FREE, 530, damping_n_s_per_m=1250.0), plant=RINGING), _RESTLESS
@@ -217,7 +265,8 @@ CASES: Mapping[str, ReferenceCase] = {
         _RESTLESS,
         leave_out_after_alarm,
     ),
-    "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), {}, leave_out_later),
+    "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), _ARMED, leave_out_later),
+    **{name: ReferenceCase(FAULTY, _ONE_CLOCK if "late" in name else _ARMED, spoil) for name, spoil in FAULTS.items()},
     "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}
