@@ -543,10 +543,11 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
     }
 }
 
-/// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while edges
-/// are in doubt, because theta may have followed an edge that was misread.
+/// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while another
+/// reading of the edges leads, because theta may have followed an edge that was misread. A doubt alone does not suspend
+/// it: with edges in quick succession it never ends.
 EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
-    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
+    if (EST_WITH_EDGES && (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self, shape);
