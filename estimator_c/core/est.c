@@ -912,16 +912,6 @@ float est_scale(const est_t* const self) {
 #endif
 }
 
-bool est_misfit(const est_t* const self) {
-    EST_ASSERT(self != NULL);
-#if EST_WITH_ROBUSTNESS
-    return self->scale.inflation > EST_INFLATION_MISFIT;
-#else
-    (void)self;
-    return false;
-#endif
-}
-
 float est_prefilter(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < EST_NA_MAX));
     return self->whitener.c[index];
