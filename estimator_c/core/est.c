@@ -575,7 +575,7 @@ static void put_on_trial(est_t* const self, const bool overflown) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
-    self->edges.misfit = 0.0F;
+    self->edges.misfit *= 0.5F;
 #else
     (void)self;
     (void)overflown;

@@ -90,10 +90,8 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
 }
 
 /// Noise variance after a complete block, at least `least`. `share_least`: smallest share of the next block.
-static inline float est_scale_follow(est_scale_t* const self,
-                                     const float        noise_variance,
-                                     const float        least,
-                                     const float        share_least) {
+static inline float
+est_scale_follow(est_scale_t* const self, const float noise_variance, const float least, const float share_least) {
     const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
     const float most    = EST_GROWTH_MAX * noise_variance;
     const float limited = (mean < most) ? mean : most;
