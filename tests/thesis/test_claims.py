@@ -270,7 +270,6 @@ def near(ours: Any, expected: Any, rel: float = 0.02) -> bool:
     return bool(ours == pytest.approx(expected, rel=rel))
 
 
-
 def nearly(ours: list[int | None], expected: list[int | None]) -> bool:
     """True within one sample: the C is in single precision and limits P to its value at the start."""
     pairs = list(zip(ours, expected, strict=True))
