@@ -20,10 +20,9 @@
 #define CAUSES_N 5U
 #define CONCLUSION (EVALUATED_END + CAUSES_N)
 
-/// Innovations in a block below which nothing is stated, and those below which their variance is not judged: with many
-/// missing samples the estimate is less certain, and the innovations are larger.
-#define ENOUGH_N 240.0F
-#define MANY_N 480.0F
+/// Innovations in a block below which nothing is stated: with many missing samples the estimate is less certain, and
+/// the innovations are larger.
+#define ENOUGH_N 400.0F
 
 /// Limit of an innovation in standard deviations, squared.
 #define CLIP 9.0F
@@ -45,7 +44,7 @@
 /// Limits of the statistics. DRIFT: squared mean of the innovations over its variance. LINE: power of a line over its
 /// mean. REGIONS: share of the energy of the innovations that
 /// the state of the plant explains. COLOUR: variance of the sums over that of white innovations. KURTOSIS: of the
-/// limited innovations; Gaussian ones have 2.6. EXCESS: variance over the declared one. INFORMATION: on a change of
+/// limited innovations; Gaussian ones have 2.9. EXCESS: variance over the declared one. INFORMATION: on a change of
 /// the mass, see weigh_lack().
 #define DRIFT 40.0F
 #define LINE 22.0F
@@ -249,7 +248,7 @@ static float weigh_noise(const est_fit_watch_t* const self) {
     const float colour   = quotient(self->sums.power, clear_energy_of(self) * COLOUR);
     const float kurtosis = quotient(self->sums.all.fourths, self->sums.all.squares * variance * KURTOSIS);
     const float excess   = quotient(variance, declared_variance(self) * EXCESS);
-    return maximum(maximum(colour, kurtosis), (count_of(self) >= MANY_N) ? excess : 0.0F);
+    return maximum(maximum(colour, kurtosis), excess);
 }
 
 /// Weigh the lack of information on a change of the mass. It scales the second difference of y, whitened.

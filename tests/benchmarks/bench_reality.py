@@ -31,8 +31,8 @@ from .played import PARAMETERS, Change
 from .shipped import ONSET_N, ONSET_SPAN_N, Misfit, answers_to, reported_misfits, settling_n, shipped
 from .simulated import Simulated
 
-MISFIT_N = 2000
-"""Samples within which a misfit must be reported."""
+MISFIT_N, MISFIT_RUNS = 2000, 100
+"""Samples within which a misfit must be reported, and largest number of runs in which it is awaited."""
 
 ROWS = (*CONDITIONS, silverbox.ROW)
 """Names of the rows."""
@@ -57,7 +57,7 @@ them. Rows marked *simulated* integrate the equation of the plant instead. Seeds
 |---|---|
 | false alarms per 1e5 | alarms after the settling time; those up to {CLUSTER_N} samples apart are one cluster |
 | 99 % bound | one-sided upper bound of that rate, with the dispersion of clusters and runs |
-| MISFIT | runs with a misfit within {MISFIT_N:,} samples, by its kind |
+| MISFIT | of the first {MISFIT_RUNS} runs, those with a misfit within {MISFIT_N:,} samples, by its kind |
 | missed | changes without an alarm within 300 samples; 900 to 3,000 where the excitation is slower |
 | delay over bound | mean delay of the detected changes over their mean information bound, and one standard error |
 | required | 1 if the row is as required, else 0 and the reasons |
@@ -104,7 +104,7 @@ class Healthy:
 
     alarms: FalseAlarms
     misfits: Sequence[Sequence[Misfit]] | None
-    """Misfits in the first MISFIT_N samples of each run; None: the device reports none at all."""
+    """Misfits in the first MISFIT_N samples of the first runs; None: the device reports none at all."""
 
     def kinds(self, right: Sequence[str]) -> list[str]:
         """Kind of each run with a misfit: the right one if it is among several, else the first."""
@@ -113,7 +113,7 @@ class Healthy:
 
     def right_share(self, right: Sequence[str]) -> float:
         """Share of the runs with a misfit of one of these kinds."""
-        return sum(kind in right for kind in self.kinds(right)) / len(self.alarms.by_run)
+        return sum(kind in right for kind in self.kinds(right)) / len(self.misfits or self.alarms.by_run)
 
     def figures(self, condition: Condition) -> Iterator[Figure]:
         """False alarms, their bound, and misfits."""
@@ -144,7 +144,8 @@ def play_healthy(condition: Condition, effort: Effort) -> Healthy:
         alarms.append([alarm.index for alarm in found if alarm.index >= settled])
         exposures_n.append(int(played.valid[settled:].sum()))
         try:
-            misfits = None if misfits is None else [*misfits, reported_misfits(played.until(MISFIT_N))]
+            if misfits is not None and len(misfits) < MISFIT_RUNS:
+                misfits = [*misfits, reported_misfits(played.until(MISFIT_N))]
         except LookupError:
             misfits = None
     return Healthy(count_false_alarms(alarms, exposures_n), misfits)

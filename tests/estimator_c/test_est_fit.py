@@ -219,14 +219,6 @@ def test_block_with_few_innovations_states_nothing(estimator: Estimator) -> None
     assert not steps.judged(estimator, status=status).cause.any()
 
 
-def test_variance_is_not_judged_with_many_missing_samples(estimator: Estimator) -> None:
-    """The estimate is less certain then, and the innovations are larger."""
-    steps = Steps(6000)
-    steps.innovation *= 1.8
-    status = np.where(steps.at % 2 == 0, UPDATED, MISSING)
-    assert final(steps.judged(estimator, declared=True, status=status)) != "noise"
-
-
 def test_orders_without_a_mass_are_refused(estimator: Estimator) -> None:
     assert estimator.init(na=1, nb=1, c=(0.0, 0.0))
     assert not estimator.can_watch_fit()
