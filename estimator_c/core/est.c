@@ -172,7 +172,7 @@ EST_SHARED void copy_theta(const est_t* const self, const est_shape_t shape, flo
 /// Set c to the estimate of A, contracted. With noise on the output, the noise of the equations is coloured by A
 /// (thesis section 3.5).
 EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const c) {
-    float factor = 1.0F;
+    float              factor = 1.0F;
     float              plain[EST_NA_MAX];
     const float* const a =
         est_delta_applies(self->config) ? est_delta_to_plain(self->theta, 1.0F, na, plain) : self->theta;
@@ -854,8 +854,8 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
-    est_step_t step   = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
-    step.statistic    = self->trigger.statistic;
+    est_step_t step    = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
+    step.statistic     = self->trigger.statistic;
     const bool updated = step.status == EST_UPDATED;
     if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status))) {
         dispatch_equation(self, updated ? relative_y(self, sample.y) : self->y[0], &step);
