@@ -26,7 +26,7 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 /// Part of the energy that a displacement must explain, of more than which the excess is evidence, and the evidence
 /// that suffices. Displacements that differ explain 0.7 to 0.9 after each edge; noise explains 0.1 on average.
 #define EST_DISPLACED 0.5F
-#define EST_DISPLACED_SUM 1.25F
+#define EST_DISPLACED_SUM 1.5F
 
 /// Begin to compare the innovations after an edge with the effect of a displacement. `before`: innovation before it.
 static inline void est_edges_begin_comparison(est_edges_t* const self, const float before) {

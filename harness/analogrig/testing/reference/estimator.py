@@ -44,7 +44,7 @@ SETTLED = 1.0001
 WEIGHT_DUE, WEIGHT_OVERDUE = 0.5, 0.25
 """Weights below which the d's are limited: in a step with little other work, and in any step."""
 
-DISPLACED, DISPLACED_SUM = 0.5, 1.25
+DISPLACED, DISPLACED_SUM = 0.5, 1.5
 """Part of the energy that a displaced edge must explain, and the sum of the excess that suffices."""
 
 BRIDGED_MAX, BRIDGE_PRECISION = 8, 0.6
