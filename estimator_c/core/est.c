@@ -543,10 +543,11 @@ static void compare_prefilter(est_t* const self) {
     }
 }
 
-/// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while edges
-/// are in doubt, because theta may have followed an edge that was misread.
+/// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while another
+/// reading of the edges leads, because theta may have followed an edge that was misread. A doubt alone does not suspend
+/// it: with edges in quick succession it never ends.
 static void consider_refresh(est_t* const self) {
-    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
+    if (EST_WITH_EDGES && (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self);
@@ -574,7 +575,7 @@ static void put_on_trial(est_t* const self, const bool overflown) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
-    self->edges.misfit = 0.0F;
+    self->edges.misfit *= 0.5F;
 #else
     (void)self;
     (void)overflown;
@@ -914,16 +915,6 @@ float est_scale(const est_t* const self) {
     return self->noise_variance * self->scale.inflation;
 #else
     return self->noise_variance;
-#endif
-}
-
-bool est_misfit(const est_t* const self) {
-    EST_ASSERT(self != NULL);
-#if EST_WITH_ROBUSTNESS
-    return self->scale.inflation > EST_INFLATION_MISFIT;
-#else
-    (void)self;
-    return false;
 #endif
 }
 

@@ -31,7 +31,7 @@
 ///
 /// The false-alarm rate holds from some 2,000 samples after est_init() on, whatever the noise: white noise of 0.3 to 4
 /// codes, 10 to 18 bits, poles from 0.3 to 0.999. If the model does not fit the plant, the trigger becomes less
-/// sensitive, and est_misfit() reports it.
+/// sensitive: est_scale() grows. est_fit.h names the cause.
 ///
 /// Units: signals are in codes of the converter, so that quantisation is 1. The defaults assume noise of about one
 /// code. If signals have another unit, say volts, either divide them by the volts per code, which needs no other
@@ -69,7 +69,7 @@ extern "C" {
 /// | EST_WITH_TRIGGERS           | 1          | 0 omits the triggers other than the cumulative sum                 |
 /// | EST_WITH_ADAPTATION         | 1          | 0 omits nc, random_walk and refresh_n                              |
 /// | EST_WITH_WATCH              | 1          | 0 omits stuck_n, idle_n and the count of saturated samples         |
-/// | EST_WITH_ROBUSTNESS         | 1          | 0 omits noise_estimated, the delta form, est_misfit(), and bridges |
+/// | EST_WITH_ROBUSTNESS         | 1          | 0 omits noise_estimated, the delta form, inflation, and bridges    |
 /// |                             |            | over missing samples: for rigs that the model is known to fit      |
 /// | EST_WITH_CHECKS             | 1          | 0 omits the check of the configuration by est_init()               |
 /// | EST_ASSERT(x)               | assert(x)  | statement that must not continue if x is false: the caller made a  |
@@ -504,11 +504,6 @@ float est_noise_variance(const est_t* self);
 /// Variance that the trigger expects of the noise [codes^2]: the noise variance times the inflation. Cost: constant.
 /// May be called from an interrupt.
 float est_scale(const est_t* self);
-
-/// True iff the model does not fit: two alarms or more that the new estimate did not justify have inflated the scale.
-/// Changes are then detected against the misfit. The inflation decreases by a factor of 4 in some 400,000 samples.
-/// Cost: constant. May be called from an interrupt.
-bool est_misfit(const est_t* self);
 
 /// One coefficient of the prefilter C; zero beyond the order of A. index is in [0, EST_NA_MAX), asserted. Cost:
 /// constant. May be called from an interrupt.

@@ -30,11 +30,10 @@
 #define EST_GROWTH_MAX 9.0F
 
 /// Inflation: factor per unjustified alarm, factor per block on the way back to 1 (a factor of 4 in 400,000 equations),
-/// largest value, and the value from which the model is reported not to fit: two unjustified alarms.
+/// and largest value.
 #define EST_INFLATION_STEP 4.0F
 #define EST_INFLATION_DECAY 0.9998933F
 #define EST_INFLATION_MAX 1.0e6F
-#define EST_INFLATION_MISFIT 8.0F
 
 /// After an alarm, the old estimate is compared with the new one from equation EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N,
 /// and further until an edge of u came, but no further than EST_TRIAL_MAX_N. A trial that ends at an alarm needs

@@ -149,7 +149,7 @@ static est_step_t step(device_t* const self, const est_sample_t sample) {
     }
 #if DEVICE_WITH_FIT
     if (self->watching) {
-        est_fit_enter(&self->fit, &self->estimator, sample, out);
+        est_fit_enter(&self->fit, &self->estimator, out);
     }
 #endif
     return out;

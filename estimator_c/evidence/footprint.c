@@ -41,7 +41,7 @@ OUTSIDE void reset(void) {
 #endif
 #ifdef FOOTPRINT_WATCHES
     sink = est_fit_init(&fit, &config) ? 1.0F : 0.0F;
-    est_fit_enter(&fit, &estimator, sample, step);
+    est_fit_enter(&fit, &estimator, step);
     sink = est_fit_misfit(&fit).strength;
 #endif
 }

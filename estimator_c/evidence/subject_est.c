@@ -54,7 +54,7 @@ SUBJECT void subject_enter(const float u, const float y, const bool valid) {
     while (est_isolation_work(&isolation)) {
     }
 #elif defined(SUBJECT_WATCHES)
-    est_fit_enter(&fit, &estimator, sample, est_step(&estimator, sample));
+    est_fit_enter(&fit, &estimator, est_step(&estimator, sample));
 #else
     (void)est_step(&estimator, sample);
 #endif

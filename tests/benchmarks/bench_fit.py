@@ -22,13 +22,14 @@ LATER_N = 4000
 HEALTHY_N = 20_000
 CHANGED_AT = 1500
 SEED = 41
+WARM_UP_N = 550
 
 
 def figures(trials: int = 100) -> Iterator[Figure]:
     """One row a condition, then the healthy plants and the changes."""
     with tempfile.TemporaryDirectory() as folder:
         estimator = Estimator(compile_driver(Path(folder)))
-        assert estimator.init()
+        assert estimator.init(warm_up_n=WARM_UP_N)
         for name, condition in misfits.CONDITIONS.items():
             watched = estimator.watch_fit(*condition.play(trials, LATER_N, SEED))
             by_then, later = (100.0 * watched.share(condition.cause, k) for k in (STATED_BY_N - 1, LATER_N - 1))

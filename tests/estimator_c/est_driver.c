@@ -320,7 +320,7 @@ void driver_watch_fit(size_t               t,
         }
         for (size_t at = run * n; at < ((run + 1U) * n); at++) {
             const est_sample_t sample = { .u = (float)u[at], .y = (float)y[at], .valid = valid[at] != 0 };
-            est_fit_enter(&fit, &self, sample, est_step(&self, sample));
+            est_fit_enter(&fit, &self, est_step(&self, sample));
             cause[at] = (unsigned char)est_fit_misfit(&fit).kind;
         }
         found[2U * run]        = est_fit_misfit(&fit).strength;
@@ -328,9 +328,9 @@ void driver_watch_fit(size_t               t,
     }
 }
 
-/* The same for n steps that are given, the estimate being theta all the time. found, (2,). */
+/* The same for one run whose innovations, treatment and alarms are given. inflation: of the scale. found, (2,). */
 void driver_judge_fit(size_t               n,
-                      const double*        theta,
+                      double               inflation,
                       const double*        u,
                       const double*        y,
                       const double*        innovation,
@@ -342,13 +342,14 @@ void driver_judge_fit(size_t               n,
     if (!est_init(&self, &config) || !est_fit_init(&fit, &config)) {
         return;
     }
-    set_theta(theta);
     for (size_t k = 0; k < n; k++) {
         const est_sample_t sample = { .u = (float)u[k], .y = (float)y[k], .valid = status[k] != EST_MISSING };
-        const est_step_t   step   = { .status     = (est_status_t)status[k],
-                                      .alarm      = alarm[k] != 0,
-                                      .innovation = (float)innovation[k] };
-        est_fit_enter(&fit, &self, sample, step);
+        est_step_t         step   = est_step(&self, sample);
+        step.status               = (est_status_t)status[k];
+        step.alarm                = alarm[k] != 0;
+        step.innovation           = (float)innovation[k];
+        self.scale.inflation      = (float)inflation;
+        est_fit_enter(&fit, &self, step);
         cause[k] = (unsigned char)est_fit_misfit(&fit).kind;
     }
     found[0] = est_fit_misfit(&fit).strength;

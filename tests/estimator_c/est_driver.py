@@ -249,25 +249,26 @@ class Estimator:
 
     def judge_fit(
         self,
-        theta: ArrayLike,
         u: ArrayLike,
         y: ArrayLike,
         innovation: ArrayLike,
         status: ArrayLike | None = None,
         alarms: ArrayLike = (),
+        inflation: float = 1.0,
     ) -> Watched:
-        """What est_fit makes of one run of steps (n,) that are given; theta stays as it is.
+        """Misfits of one run (n,) whose innovations are given instead of those of the estimator.
 
         :param alarms: samples with an alarm.
+        :param inflation: of the scale.
         """
-        signals: list[NDArray[Any]] = [np.ascontiguousarray(x, np.float64) for x in (theta, u, y, innovation)]
+        signals: list[NDArray[Any]] = [np.ascontiguousarray(x, np.float64) for x in (u, y, innovation)]
         n = len(signals[-1])
         status_ = np.ascontiguousarray(np.zeros(n) if status is None else status, np.uint8)
         alarm = np.zeros(n, np.uint8)
         alarm[np.asarray(alarms, np.int64)] = 1
         cause, found = np.zeros((1, n), np.uint8), np.zeros((1, 2))
         pointers = (ctypes.c_void_p(x.ctypes.data) for x in (*signals, status_, alarm, cause, found))
-        self._c.driver_judge_fit(ctypes.c_size_t(n), *pointers)
+        self._c.driver_judge_fit(ctypes.c_size_t(n), ctypes.c_double(inflation), *pointers)
         return Watched(cause, *found.T)
 
     def diagnose(self, theta: ArrayLike, steps: NDArray[np.float64], slices: int = SLICES_N) -> Diagnosed:

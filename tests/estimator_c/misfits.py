@@ -91,10 +91,19 @@ def _hardened(
     return u, y
 
 
-def _noise(codes: float) -> Callable[[Array, np.random.Generator], Array]:
-    """White noise of which ``codes`` is the standard deviation with that of the plant's own."""
-    added = np.sqrt(codes**2 - NOISE_LSB**2)
-    return lambda y, rng: y + rng.normal(0.0, added, y.shape)
+def _coloured(codes: float, correlation: float) -> Callable[[Array, np.random.Generator], Array]:
+    """Autoregressive noise of first order with this standard deviation."""
+
+    def disturb(y: Array, rng: np.random.Generator) -> Array:
+        driven = rng.normal(0.0, codes * np.sqrt(1.0 - correlation**2), y.shape)
+        return np.asarray(y + signal.lfilter([1.0], [1.0, -correlation], driven, axis=1))
+
+    return disturb
+
+
+def _proportional(part: float) -> Callable[[Array, np.random.Generator], Array]:
+    """White noise whose standard deviation is this part of the displacement."""
+    return lambda y, rng: y * (1.0 + part * rng.normal(0.0, 1.0, y.shape))
 
 
 def _hum(codes: float, cycles: float) -> Callable[[Array, np.random.Generator], Array]:
@@ -112,18 +121,18 @@ def _drift(codes: float) -> Callable[[Array, np.random.Generator], Array]:
 
 
 CONDITIONS = {
-    "noise, 2 LSB": Condition("noise", disturb=_noise(2.0)),
-    "noise, 4 LSB": Condition("noise", disturb=_noise(4.0)),
+    "noise, 2 LSB autoregressive 0.9": Condition("noise", share=0.8, disturb=_coloured(2.0, 0.9)),
+    "noise, 0.1 % of the displacement": Condition("noise", disturb=_proportional(0.001)),
     "hum, 1 LSB, 50 Hz": Condition("hum", disturb=_hum(1.0, 50.0 / 20e3)),
     "hum, 1 LSB, 150 Hz": Condition("hum", disturb=_hum(1.0, 150.0 / 20e3)),
     "hum, 3 LSB, 50 Hz": Condition("hum", disturb=_hum(3.0, 50.0 / 20e3)),
-    "hum, 10 LSB, 50 Hz": Condition("hum", share=0.8, disturb=_hum(10.0, 50.0 / 20e3)),
+    "hum, 10 LSB, 50 Hz": Condition("hum", disturb=_hum(10.0, 50.0 / 20e3)),
     "drift, 0.01 code a sample": Condition("drift", disturb=_drift(0.01)),
     "drift, 0.1 code a sample": Condition("drift", disturb=_drift(0.1)),
-    "spring, cubic 0.3 %": Condition("nonlinear", hardening=0.003),
     "spring, cubic 1 %": Condition("nonlinear", hardening=0.01),
     "spring, cubic 5 %": Condition("nonlinear", hardening=0.05),
+    "spring, cubic 20 %": Condition("nonlinear", hardening=0.2),
     "edges, 190 Hz": Condition("edges", excitation=replace(FREE, half_period_n=20e3 / 380.0)),
-    "edges, 100 ppm": Condition("edges", share=0.8, excitation=replace(FREE, drift_ppm=100.0)),
+    "edges, 100 ppm": Condition("edges", excitation=replace(FREE, drift_ppm=100.0)),
     "excitation, 3 %": Condition("excitation", excitation=replace(FREE, part_of_range=0.03)),
 }

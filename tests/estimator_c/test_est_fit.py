@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import signal
 
 from tests.estimator_c import misfits
 from tests.estimator_c.est_driver import GATHERING, MISSING, UPDATED, Estimator, Watched
@@ -15,29 +16,38 @@ from tests.estimator_c.plants import FRONT, Excitation, simulate
 
 Array = NDArray[np.float64]
 
-THETA = (-1.75, 0.768, 0.002, 0.008, 0.002, 4.0)
-SLOW_THETA = (-1.99, 0.9901, 2e-5, 4e-5, 2e-5, 0.01)
+A, B = (-1.75, 0.768), (0.002, 0.008, 0.002)
+SLOW_A, SLOW_B = (-1.99, 0.9901), (2e-5, 4e-5, 2e-5)
 N = 2000
 """Samples within which a misfit is stated."""
-SETTLING_N, BLOCK_N, EVALUATION_N = 320, 768, 16
+WARM_UP_N = 550
+"""Default of the library."""
+SETTLING_N, BLOCK_N, PERIOD_N = 14 * 24, 768, 768 + 24
+"""Samples before the first block, samples of a block, and samples from one block to the next."""
 
 
 class Steps:
     """Innovations of a model that fits, with variance 1, and the samples that belong to them."""
 
-    def __init__(self, samples: int = N, seed: int = 1) -> None:
+    def __init__(
+        self,
+        samples: int = N,
+        seed: int = 1,
+        force: float = 4000.0,
+        a: tuple[float, float] = A,
+        b: tuple[float, float, float] = B,
+    ) -> None:
         self.rng = np.random.default_rng(seed)
         self.at = np.arange(samples)
-        self.u = 4000.0 * (self.at // 50 % 2)
-        self.y = np.zeros(samples)
-        for k in range(2, samples):
-            past = self.y[k - 1], self.y[k - 2], *self.u[k - 2 : k + 1][::-1], 1.0
-            self.y[k] = np.dot(past, (1.75, -0.768, *THETA[2:]))
+        self.u = force * (self.at // 50 % 2)
+        moved = signal.lfilter(b, (1.0, *a), self.u)
+        self.y = np.round(moved + self.rng.normal(0.0, 1.0, samples))
         self.innovation = self.rng.normal(0.0, 1.0, samples)
 
-    def judged(self, estimator: Estimator, theta: tuple[float, ...] = THETA, **more: object) -> Watched:
-        assert estimator.init(noise_variance=1.0)
-        return estimator.judge_fit(theta, self.u, self.y, self.innovation, **more)  # type: ignore[arg-type]
+    def judged(self, estimator: Estimator, *, declared: bool = False, **more: object) -> Watched:
+        """:param declared: the noise variance is 1 and not estimated."""
+        assert estimator.init(noise_variance=1.0, noise_estimated=int(not declared))
+        return estimator.judge_fit(self.u, self.y, self.innovation, **more)  # type: ignore[arg-type]
 
 
 def final(watched: Watched) -> str:
@@ -57,10 +67,10 @@ def test_mean_of_the_innovations_is_drift(estimator: Estimator, sign: float) -> 
     steps.innovation += 0.6 * sign
     watched = steps.judged(estimator)
     assert final(watched) == "drift"
-    assert watched.strength == pytest.approx(BLOCK_N * 0.36 / 1.36 / 64.0, rel=0.2)
+    assert watched.strength == pytest.approx(BLOCK_N * 0.36 / 1.36 / 40.0, rel=0.2)
 
 
-@pytest.mark.parametrize("line", [1.0, 1.92, 5.5, 13.3, 22.0])
+@pytest.mark.parametrize("line", [1.0, 1.92, 5.5, 10.3, 14.0])
 def test_periodic_innovations_are_hum_with_its_frequency(estimator: Estimator, line: float) -> None:
     """A line is a cycle in a block; the frequency is told to a third of it."""
     steps = Steps()
@@ -74,7 +84,7 @@ def test_broad_peak_of_the_spectrum_is_no_hum(estimator: Estimator) -> None:
     """The fast component takes the correlation away, so that the lines around are all that speaks against hum."""
     steps = Steps()
     steps.innovation *= 0.3
-    for line in range(9, 17):
+    for line in range(5, 13):
         steps.innovation += 0.5 * np.sin(2.0 * np.pi * line / BLOCK_N * steps.at + line**2)
     steps.innovation += 2.7 * np.sin(2.0 * np.pi / 5.0 * steps.at)
     assert final(steps.judged(estimator)) != "hum"
@@ -87,61 +97,42 @@ def test_force_that_steps_all_the_time_has_no_edges_to_judge(estimator: Estimato
     assert final(steps.judged(estimator)) == "none"
 
 
-def test_response_to_the_edges_that_follows_their_direction_is_edges_that_drift(estimator: Estimator) -> None:
-    steps = Steps()
-    steps.innovation += 1e-3 * misfits.whitened(np.diff(steps.u, prepend=0.0), (-1.6, 0.64))
-    assert final(steps.judged(estimator)) == "edges"
-
-
-def test_response_to_the_edges_that_is_different_each_time_is_edges(estimator: Estimator) -> None:
-    steps = Steps()
-    moved = np.diff(steps.u, prepend=0.0) * steps.rng.uniform(-1.0, 1.0, N)
-    steps.innovation += 2e-3 * misfits.whitened(moved, (-1.6, 0.64))
-    assert final(steps.judged(estimator)) == "edges"
-
-
-def test_large_innovations_next_to_edges_are_edges(estimator: Estimator) -> None:
-    steps = Steps()
-    steps.innovation[steps.at % 50 < 3] *= 4.0
-    assert final(steps.judged(estimator)) == "edges"
-
-
 def test_innovations_that_follow_the_level_of_y_are_nonlinear(estimator: Estimator) -> None:
     steps = Steps()
     between = np.abs(steps.y - steps.y.mean()) < 0.9 * steps.y.std()
-    steps.innovation += between - between.mean()
+    steps.innovation += 1.5 * (between - between.mean())
     assert final(steps.judged(estimator)) == "nonlinear"
 
 
-@pytest.mark.parametrize(("growth", "cause"), [(2.0, "nonlinear"), (1.0, "noise")], ids=["with y", "alone"])
+@pytest.mark.parametrize(("growth", "cause"), [(2.0, "nonlinear"), (1.0, "none")], ids=["with y", "alone"])
 def test_innovations_that_grow_with_y_are_nonlinear(estimator: Estimator, growth: float, cause: str) -> None:
     steps = Steps(4000)
-    later = steps.at > SETTLING_N + BLOCK_N + EVALUATION_N
+    later = steps.at > SETTLING_N + PERIOD_N
     steps.y[later] *= growth
     steps.innovation[later] *= 3.0
     assert final(steps.judged(estimator)) == cause
 
 
-@pytest.mark.parametrize("scale", [1.8, 5.0])
-def test_larger_innovations_than_declared_are_noise(estimator: Estimator, scale: float) -> None:
+@pytest.mark.parametrize(("scale", "variance"), [(1.8, 2.74), (5.0, 7.1)])
+def test_larger_innovations_than_declared_are_noise(estimator: Estimator, scale: float, variance: float) -> None:
+    """Innovations are limited to 3 standard deviations of the declared noise."""
     steps = Steps()
     steps.innovation *= scale
-    watched = steps.judged(estimator)
+    watched = steps.judged(estimator, declared=True)
     assert final(watched) == "noise"
-    assert watched.strength == pytest.approx(scale**2 / 2.5, rel=0.15)
+    assert watched.strength == pytest.approx(variance / 2.5, rel=0.15)
 
 
 def test_structure_below_the_declared_noise_does_no_harm(estimator: Estimator) -> None:
     steps = Steps()
     steps.innovation = 0.1 * (steps.innovation + 0.5 + np.sin(2.0 * np.pi * 0.01 * steps.at))
-    assert final(steps.judged(estimator)) == "none"
+    assert final(steps.judged(estimator, declared=True)) == "none"
 
 
 def test_noise_that_is_estimated_is_not_compared_with_the_setting(estimator: Estimator) -> None:
     steps = Steps()
     steps.innovation *= 5.0
-    assert estimator.init(noise_variance=1.0, noise_estimated=1)
-    assert not estimator.judge_fit(THETA, steps.u, steps.y, steps.innovation).cause.any()
+    assert not steps.judged(estimator).cause.any()
 
 
 def test_correlated_innovations_are_noise_even_if_they_are_small(estimator: Estimator) -> None:
@@ -151,37 +142,36 @@ def test_correlated_innovations_are_noise_even_if_they_are_small(estimator: Esti
     assert final(steps.judged(estimator)) == "noise"
 
 
-def test_large_innovations_of_a_plant_that_hardly_moves_are_a_slow_plant(estimator: Estimator) -> None:
+def test_noise_whose_variance_follows_y_is_noise(estimator: Estimator) -> None:
     steps = Steps()
-    steps.innovation *= 5.0
-    assert final(steps.judged(estimator, SLOW_THETA)) == "slow plant"
-
-
-@pytest.mark.parametrize(("theta", "cause"), [(SLOW_THETA, "slow plant"), (THETA, "none")], ids=["slow", "usual"])
-def test_alarms_in_each_block_are_a_slow_plant_if_it_hardly_moves(
-    estimator: Estimator, theta: tuple[float, ...], cause: str
-) -> None:
-    assert final(Steps().judged(estimator, theta, alarms=np.arange(350, N, 300))) == cause
+    steps.innovation *= np.where(steps.y > steps.y.mean(), 1.35, 0.4)
+    assert final(steps.judged(estimator)) == "noise"
 
 
 def test_small_force_is_lack_of_excitation(estimator: Estimator) -> None:
-    steps = Steps()
-    steps.u *= 0.02
-    watched = steps.judged(estimator)
+    watched = Steps(force=80.0).judged(estimator)
     assert final(watched) == "excitation"
     assert watched.strength > 1.0
 
 
+@pytest.mark.parametrize(("inflation", "cause"), [(16.0, "slow plant"), (1.0, "none")])
+def test_lack_of_excitation_of_a_slow_plant_is_stated_with_false_alarms(
+    estimator: Estimator, inflation: float, cause: str
+) -> None:
+    steps = Steps(a=SLOW_A, b=SLOW_B, force=400.0)
+    assert final(steps.judged(estimator, inflation=inflation)) == cause
+
+
 def test_no_force_at_all_is_lack_of_excitation(estimator: Estimator) -> None:
-    steps = Steps()
-    steps.u[:] = 0.0
-    assert final(steps.judged(estimator)) == "excitation"
+    assert final(Steps(force=0.0).judged(estimator)) == "excitation"
 
 
-def test_alarms_in_quick_succession_are_noise(estimator: Estimator) -> None:
-    watched = Steps().judged(estimator, alarms=np.arange(20, N, 20))
+def test_likeliest_cause_is_stated_if_the_scale_is_inflated(estimator: Estimator) -> None:
+    """Two alarms were not justified: the model does not fit, though no statistic exceeds its limit."""
+    watched = Steps().judged(estimator, inflation=16.0)
     assert final(watched) == "noise"
-    assert watched.strength == pytest.approx(BLOCK_N / 20.0 / 18.0, rel=0.1)
+    assert watched.strength == pytest.approx(2.0)
+    assert np.flatnonzero(watched.cause[0])[0] < SETTLING_N + PERIOD_N
 
 
 def test_innovations_after_an_alarm_are_left_out(estimator: Estimator) -> None:
@@ -194,16 +184,15 @@ def test_innovations_after_an_alarm_are_left_out(estimator: Estimator) -> None:
 
 def test_misfit_is_stated_after_two_blocks_and_withdrawn_after_two(estimator: Estimator) -> None:
     steps = Steps(5000)
-    period_n = BLOCK_N + EVALUATION_N
-    bad_until = SETTLING_N + 2 * period_n
+    bad_until = SETTLING_N + 2 * PERIOD_N
     steps.innovation[:bad_until] += 1.0
     cause = steps.judged(estimator).cause[0]
-    assert np.flatnonzero(cause)[[0, -1]].tolist() == [bad_until - 1, bad_until + 2 * period_n - 2]
+    assert np.flatnonzero(cause)[[0, -1]].tolist() == [bad_until - 5, bad_until + 2 * PERIOD_N - 6]
 
 
 def test_single_block_states_nothing(estimator: Estimator) -> None:
     steps = Steps(5000)
-    first = SETTLING_N + BLOCK_N + EVALUATION_N
+    first = SETTLING_N + PERIOD_N
     steps.innovation[first : first + BLOCK_N] += 1.0
     assert not steps.judged(estimator).cause.any()
 
@@ -227,14 +216,6 @@ def test_block_with_few_innovations_states_nothing(estimator: Estimator) -> None
     steps = Steps(6000)
     steps.innovation *= 5.0
     status = np.where(steps.at % 8 == 0, UPDATED, np.where(steps.at % 8 == 7, GATHERING, MISSING))
-    assert not steps.judged(estimator, status=status).cause.any()
-
-
-def test_variance_is_not_judged_with_many_missing_samples(estimator: Estimator) -> None:
-    """The estimate is less certain then, and the innovations are larger."""
-    steps = Steps(6000)
-    steps.innovation *= 1.8
-    status = np.where(steps.at % 2 == 0, UPDATED, MISSING)
     assert not steps.judged(estimator, status=status).cause.any()
 
 
@@ -277,6 +258,6 @@ def test_change_of_the_plant_is_no_misfit(estimator: Estimator, parameter: str, 
 def test_cause_is_named_within_two_thousand_samples(estimator: Estimator, name: str) -> None:
     """9 of 10 runs, where at least 95 % are right over many seeds: misfits.py has the figures."""
     condition = misfits.CONDITIONS[name]
-    assert estimator.init()
+    assert estimator.init(warm_up_n=WARM_UP_N)
     watched = estimator.watch_fit(*condition.play(10, N, seed=7))
     assert watched.share(condition.cause) >= 0.9

@@ -61,7 +61,7 @@ CURES: Mapping[str, str] = {
     "hum": "shield the sensor and its cable, or sample synchronously with the mains",
     "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card',
     "nonlinear": "reduce the amplitude of the excitation, or raise the orders na and nb",
-    "noise": "measure the variance at rest and set noise_variance, or set noise_estimated = true",
+    "noise": "shield or filter the displacement; without noise_estimated, set noise_variance as measured at rest",
     "slow plant": "lower the sample rate, or use a converter with more bits",
     "excitation": "raise the amplitude of the excitation",
 }

@@ -455,7 +455,7 @@ class ReferenceEstimator:
         """Do one step of a refresh of C: check that A is reliable, compare C with A, or take C from A."""
         stage, self.refresh = self.refresh, Refresh.WAITS
         remembers_edge = (1.0 - self.config.forgetting) * self.since_n < REFRESH_MEMORIES
-        if self.doubt is not None:
+        if self.doubt is not None and self.trigger.has_rival:
             return
         if stage is Refresh.TAKES:
             self._take_c()
@@ -501,7 +501,7 @@ class ReferenceEstimator:
     def _alarm(self) -> None:
         if self.config.trigger == "cusum":
             self.trigger.scale.begin_trial(self.delta)
-        self.misfit = 0.0
+        self.misfit *= 0.5
         if self.config.reset == "all":
             self.delta = self._zero
         self.covariance.reset()
