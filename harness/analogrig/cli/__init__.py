@@ -25,6 +25,7 @@ from analogrig.cli import (
     listing,
     new,
     playing,
+    report,
     serve,
     thesis,
 )
@@ -38,6 +39,7 @@ _COMMANDS = (
     campaign.add,
     certify.add,
     compare.add,
+    report.add,
     thesis.add,
     emulation.add_emulate,
     serve.add,
