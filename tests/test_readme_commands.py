@@ -100,17 +100,16 @@ def chosen(tests: Iterable[pytest.Item]) -> list[str]:
 
     A session with the tests of one sort alone, as `.ci/run` has two, runs that sort and enters the environment.
     """
-    parameters = [test.callspec.params for test in tests if isinstance(test, pytest.Function) and _has_command(test)]
-    sorts = {bool(needed(each["command"])) for each in parameters} or {False}
+    sorts = {
+        bool(needed(str(test.callspec.params["command"])))
+        for test in tests
+        if isinstance(test, pytest.Function) and test.path == Path(__file__) and hasattr(test, "callspec")
+    }
     return [
         command
         for command, _ in COMMANDS
-        if (bool(needed(command)) in sorts or command == ENTER) and not tools.missing(needed(command))
+        if (bool(needed(command)) in (sorts or {False}) or command == ENTER) and not tools.missing(needed(command))
     ]
-
-
-def _has_command(test: pytest.Function) -> bool:
-    return test.path == Path(__file__) and hasattr(test, "callspec")
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +123,7 @@ def ended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     environment |= {
         "PYTHONPATH": f"{checkout / 'harness'}{os.pathsep}{checkout / 'emulator'}",  # of the copy, not of the checkout
         "PYTEST_ARGS": "-p no:cacheprovider tests/harness/test_frame.py",
+        "JOBS": "1",
     }
     wait_for_port()
     shell = subprocess.run(

@@ -25,6 +25,12 @@ from tests.harness.fault_runs import (
 )
 from tests.harness.firmware import needs_firmware
 
+TALKED_OVER = {("serial", "sample"), ("can", "sample"), ("can-fd", "block")}
+"""Of the ways of a link that on which every step has its second frame and its last but one tried.
+
+Only the samples go otherwise on the others: handshake, configuration, start and stop are the same conversation.
+"""
+
 
 def test_every_fault_is_documented() -> None:
     for link, faulty in FAULTY.items():
@@ -34,13 +40,14 @@ def test_every_fault_is_documented() -> None:
 @pytest.mark.parametrize(("link", "exchange"), WAYS)
 def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchange: ExchangeKind) -> None:
     stride = 20 if link == "serial" else 100
+    ends = 2 if (link, exchange) in TALKED_OVER else 1
     for kind in FAULTY[link].KINDS:
-        assert outcomes_everywhere(link, kind, exchange, stride).total() > 20
+        assert outcomes_everywhere(link, kind, exchange, stride, ends).total() > 15
 
 
-@pytest.mark.parametrize("first", range(0, 1000, 500))
-def test_faults_by_chance_never_lead_to_a_wrong_estimate(first: int) -> None:
-    assert outcomes_by_chance(range(first, first + 500)).total() == 500
+def test_faults_by_chance_never_lead_to_a_wrong_estimate() -> None:
+    """What one run in a hundred shows is found with a probability of 99 %; `make faults` plays 100,000."""
+    assert outcomes_by_chance(range(500)).total() == 500
 
 
 @pytest.mark.parametrize("first", [1 + 8 * 56, 1 + 8 * 224])
@@ -71,9 +78,9 @@ def test_diagnosis_is_that_of_a_line_without_faults_or_the_run_is_not_valid(kind
     n = BACK_AT + 24
     (said,) = reference(n, ()).diagnoses
     assert BACK_AT < said.index < BACK_AT + 20
-    per_sample = {"to": 1, "from": 8}[direction]
+    per_sample, stride = {"to": (1, 1), "from": (8, 3)}[direction]  # by threes, each of the eight has its turn
     first = steps("sample")[direction].index("samples")
-    for number in range(first + (BACK_AT - 2) * per_sample, first + (said.index + 3) * per_sample):
+    for number in range(first + (BACK_AT - 2) * per_sample, first + (said.index + 3) * per_sample, stride):
         faults = WireFaults((WireFault(kind, direction, number),), seed=number)
         assert play(Case(faults, samples=n)).outcome in {"as without", "lost", "inconclusive"}
 
