@@ -2,22 +2,71 @@
 
 #include "engine.h"
 
-void engine_hold(int64_t samples, int channels, double residual, const double* volts, double* held, double* out) {
-    for (int64_t k = 0; k < samples; k++, volts += channels, out += channels) {
+#include <math.h>
+#include <stddef.h>
+
+/// engine_see() for a number of channels that the compiler may know.
+static inline double see(int64_t       samples,
+                         int           channels,
+                         const double* card,
+                         double        residual,
+                         const double* volts,
+                         const double* normal,
+                         double*       held,
+                         double*       seen) {
+    const double *gain = card, *droop = &gain[channels], *low = &droop[channels], *lsb = &low[channels];
+    const double *noise = &lsb[channels], *offset = &noise[channels];
+    double        excess = 0.0;
+    for (int64_t k = 0; k < samples; k++, volts += channels, normal += channels, seen += channels) {
         for (int i = 0; i < channels; i++) {
-            held[i] = volts[i] + residual * (held[i] - volts[i]);
-            out[i]  = held[i];
+            const double volt = held == NULL ? volts[i] : volts[i] + residual * (held[i] - volts[i]);
+            if (held != NULL) {
+                held[i] = volt;
+            }
+            seen[i] = (volt * gain[i] - droop[i] - low[i]) / lsb[i] + (normal[i] * noise[i] + offset[i]);
+            excess += volts[i] - volts[i];
         }
     }
+    return excess;
 }
 
-void engine_approximate(int64_t count, int bits, const double* levels, const double* seen, uint16_t* codes) {
+int engine_see(int64_t       samples,
+               int           channels,
+               const double* card,
+               double        residual,
+               const double* volts,
+               const double* normal,
+               double*       held,
+               double*       seen) {
+    const double excess = channels == 4 && held == NULL ? see(samples, 4, card, 0.0, volts, normal, NULL, seen) :
+                                                          see(samples, channels, card, residual, volts, normal, held, seen);
+    return isnan(excess) ? 0 : 1;
+}
+
+/// Code by successive approximation: from the highest bit down, keep a bit if the input reaches the level of the code.
+static unsigned approximate(int bits, const double* levels, double seen) {
+    unsigned code = 0;
+    for (unsigned bit = 1U << bits >> 1; bit > 0U; bit >>= 1) {
+        code |= seen >= levels[code | bit] ? bit : 0U;
+    }
+    return code;
+}
+
+void engine_convert(int64_t       count,
+                    int           bits,
+                    const double* levels,
+                    unsigned      stuck_high,
+                    unsigned      stuck_low,
+                    const double* seen,
+                    uint16_t*     codes,
+                    uint8_t*      clipped) {
+    const double end = (double)(1U << bits), last = end - 1.0;
     for (int64_t k = 0; k < count; k++) {
-        unsigned code = 0;
-        for (unsigned bit = 1U << bits >> 1; bit > 0U; bit >>= 1) {
-            code |= seen[k] >= levels[code | bit] ? bit : 0U;
-        }
-        codes[k] = (uint16_t)code;
+        const double   above   = seen[k] + 0.5;
+        const double   limited = above < 0.0 ? 0.0 : above > last ? last : above;
+        const unsigned code    = levels == NULL ? (unsigned)(int)limited : approximate(bits, levels, seen[k]);
+        codes[k]               = (uint16_t)((code | stuck_high) & ~stuck_low);
+        clipped[k]             = (uint8_t)(above < 0.0) | (uint8_t)(above >= end);
     }
 }
 

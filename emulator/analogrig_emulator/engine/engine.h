@@ -169,13 +169,30 @@ void engine_noise_add(int                   n,
                       double*               x,
                       double*               volts);
 
-/// For each sample of `channels` voltages, record in out what a sample-and-hold has acquired: the step from the voltage held
-/// before lacks the part `residual`. held: the voltages held before, then those of the last sample.
-void engine_hold(int64_t samples, int channels, double residual, const double* volts, double* held, double* out);
+/// Record in seen the input of a card's converter in LSB, for `samples` rows of `channels` voltages. Return 1 iff all are finite.
+/// card: rows of `channels` numbers: gain, droop [V], lower end of the range [V], LSB [V], noise [LSB] and offset [LSB].
+/// normal: standard normal numbers, one for each voltage. held: voltages held before, then those of the last sample: the step
+/// from sample to sample lacks the part `residual`. NULL: it lacks nothing.
+int engine_see(int64_t       samples,
+               int           channels,
+               const double* card,
+               double        residual,
+               const double* volts,
+               const double* normal,
+               double*       held,
+               double*       seen);
 
-/// Convert by successive approximation: from the highest bit down, keep a bit if the input reaches the level of the code.
-/// levels: 2^bits transitions, that of code 0 unused; bits is at most 16.
-void engine_approximate(int64_t count, int bits, const double* levels, const double* seen, uint16_t* codes);
+/// Convert `count` inputs in LSB to codes of `bits` bits, at most 16. clipped: 1 where the input is beyond the end codes.
+/// levels: 2^bits transitions, that of code 0 unused, for successive approximation; NULL: the ideal ones.
+/// stuck_high, stuck_low: masks of stuck bits.
+void engine_convert(int64_t       count,
+                    int           bits,
+                    const double* levels,
+                    unsigned      stuck_high,
+                    unsigned      stuck_low,
+                    const double* seen,
+                    uint16_t*     codes,
+                    uint8_t*      clipped);
 
 /// For each sample and channel, record in out the voltage `late` probes after the first of the `stride` probes of that sample,
 /// on the straight line between two probes. before: the probe before the first one. late: at least -1, at most stride - 1.
