@@ -1,9 +1,39 @@
-/// The steps of a data-acquisition card that depend on the sample before or on a table.
+/// Edges of the generator, and the steps of a data-acquisition card.
 
 #include "engine.h"
 
 #include <math.h>
+#include <stdbool.h>
 #include <stddef.h>
+#include <string.h>
+
+static bool is_same(double one, double other) { return one <= other && one >= other; }
+
+int64_t engine_edges(
+    int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick) {
+    int64_t edges = 0, first = 0;
+    for (int64_t i = 0; i < count; i++) {
+        const int64_t ideal = (int64_t)rint(instant[i]), at = ideal < 0 ? 0 : (ideal + grid - 1) / grid * grid;
+        if (edges > 0 && at != tick[edges - 1]) {
+            edges -= edges > 1 && is_same(level[edges - 1], level[edges - 2]) ? 1 : 0;
+        } else if (edges > 0) {
+            edges--;
+        }
+        tick[edges]  = at;
+        level[edges] = level[i];
+        edges++;
+    }
+    edges -= edges > 1 && is_same(level[edges - 1], level[edges - 2]) ? 1 : 0;
+    while (edges > 0 && tick[edges - 1] >= stop) {
+        edges--;
+    }
+    while (first < edges && tick[first] < start) {
+        first++;
+    }
+    memmove(tick, &tick[first], (size_t)(edges - first) * sizeof tick[0]);
+    memmove(level, &level[first], (size_t)(edges - first) * sizeof level[0]);
+    return edges - first;
+}
 
 /// engine_see() for a number of channels that the compiler may know.
 static inline double see(int64_t       samples,

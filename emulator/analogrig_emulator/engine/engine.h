@@ -169,6 +169,12 @@ void engine_noise_add(int                   n,
                       double*               x,
                       double*               volts);
 
+/// Round the instants of `count` edges to ticks, and up to a multiple of grid; those before tick 0 move there. Of edges at one
+/// tick keep the last, and of those only the ones that change the level. Write the edges from tick start to stop - 1 to tick and
+/// level, and return their number. instant: rising; level: the level after each instant, overwritten.
+int64_t engine_edges(
+    int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick);
+
 /// Record in seen the input of a card's converter in LSB, for `samples` rows of `channels` voltages. Return 1 iff all are finite.
 /// card: rows of `channels` numbers: gain, droop [V], lower end of the range [V], LSB [V], noise [LSB] and offset [LSB].
 /// normal: standard normal numbers, one for each voltage. held: voltages held before, then those of the last sample: the step

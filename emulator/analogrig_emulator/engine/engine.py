@@ -255,13 +255,15 @@ class Engine:
         trains = [(self._names[1].index(name), train) for name, train in edges.items() if train.ticks.size]
         if not trains:
             return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
+        if len(trains) == 1:
+            ((i, train),) = trains
+            ticks, levels_v = (np.ascontiguousarray(x, t) for x, t in ((train.ticks, np.int64), (train.levels_v, np.float64)))
+            return ticks, np.full(ticks.size, i, np.int32), levels_v
         ticks = np.concatenate([train.ticks for _, train in trains], dtype=np.int64)
         levels_v = np.concatenate([train.levels_v for _, train in trains], dtype=np.float64)
         inputs = np.repeat(np.array([i for i, _ in trains], np.int32), [train.ticks.size for _, train in trains])
-        if len(trains) > 1:
-            order = np.lexsort((inputs, ticks))
-            ticks, inputs, levels_v = ticks[order], inputs[order], levels_v[order]
-        return ticks, inputs, levels_v
+        order = np.lexsort((inputs, ticks))
+        return ticks[order], inputs[order], levels_v[order]
 
     def _check(self, status: int) -> None:
         if status:
