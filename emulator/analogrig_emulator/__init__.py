@@ -3,7 +3,7 @@
 Start with SuspensionComputer, Excitation and Sampler.
 """
 
-from analogrig_emulator.card.acquisition import acquired, probes_per_sample
+from analogrig_emulator.card.acquisition import acquired, ahead_ticks, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.circuit import (
@@ -119,6 +119,7 @@ __all__ = [
     "TwoMassProgram",
     "VoltageSource",
     "acquired",
+    "ahead_ticks",
     "drawn_levels",
     "drawn_offsets_v",
     "is_repeatable",

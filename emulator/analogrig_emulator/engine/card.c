@@ -100,21 +100,22 @@ void engine_convert(int64_t       count,
     }
 }
 
-void engine_interpolate(int64_t       samples,
-                        int           channels,
-                        int64_t       stride,
-                        const double* before,
-                        const double* probes,
-                        const double* late,
-                        double*       out) {
-    for (int64_t sample = 0; sample < samples; sample++, probes += stride * channels) {
+void engine_take(int64_t        samples,
+                 int            channels,
+                 int64_t        stride,
+                 const int64_t* row,
+                 double         ahead,
+                 const double*  before,
+                 const double*  probes,
+                 const double*  late,
+                 double*        out) {
+    const int64_t width = 2 * (int64_t)channels;
+    for (int64_t sample = 0; sample < samples; sample++, probes += stride * width) {
         for (int channel = 0; channel < channels; channel++, late++, out++) {
-            int64_t row = (int64_t)*late;
-            row -= (double)row > *late ? 1 : 0;
-            const double part  = *late - (double)row;
-            const double early = row < 0 ? before[channel] : probes[row * channels + channel];
-            *out               = part > 0.0 ? early + part * (probes[(row + 1) * channels + channel] - early) : early;
+            const double* const now   = &probes[row[channel] * width + channel];
+            const double* const early = row[channel] == 0 ? &before[channel] : now - width;
+            *out = *now + *late * (*late < 0.0 ? *now - *early : (now[channels] - *now) / ahead);
         }
-        before = &probes[(stride - 1) * channels];
+        before = &probes[(stride - 1) * width];
     }
 }

@@ -35,6 +35,7 @@ void engine_restart(engine_t* const self) {
     self->now        = 0;
     self->counts     = (engine_counts_t){ 0 };
     self->is_slow    = false;
+    self->ahead      = 0;
     self->w          = self->arguments[0];
     self->w_before   = self->arguments[1];
     self->w_there    = self->arguments[2];
@@ -257,10 +258,36 @@ static void record_sample(const engine_t* const self, double* y) {
     }
 }
 
+/// Advance a copy, whose modes are those of the original, and record its y.
+static engine_status_t record_of_copy(const engine_t* const self, double* y) {
+    engine_t copy = *self;
+    copy.w        = &copy.arguments[0][self->w - self->arguments[0]];
+    copy.w_before = &copy.arguments[0][self->w_before - self->arguments[0]];
+    copy.w_there  = &copy.arguments[0][self->w_there - self->arguments[0]];
+    self->mode->is_pinned        = true;
+    const engine_status_t status = advance(&copy, self->now + self->ahead);
+    self->mode->is_pinned        = false;
+    record_sample(&copy, y);
+    return status;
+}
+
+/// Record y of engine_look_ahead().
+static engine_status_t record_ahead(const engine_t* const self, double* y) {
+    double padded[PADDED(ENGINE_MAX_OUTPUTS)];
+    if (!self->is_slow || self->clear < self->now + self->ahead) {
+        return record_of_copy(self, y);
+    }
+    quiet_look_ahead(self, self->ahead, padded);
+    memcpy(y, padded, (size_t)self->outputs * sizeof y[0]);
+    return ENGINE_OK;
+}
+
+static int width_of_row(const engine_t* const self) { return self->ahead > 0 ? 2 * self->outputs : self->outputs; }
+
 /// Record the samples of a quiet stretch that come before a tick. Return their number.
 static int64_t run_quiet(engine_t* const self, int64_t before, double* y) {
     const bool    quiet   = self->is_slow && self->clear == NO_END;
-    const int64_t samples = quiet ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
+    const int64_t samples = quiet && self->ahead == 0 ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
     int64_t       k       = 0;
     while (k < samples) {
         if (self->slow_age == LEAP - 1 && self->outputs % PANEL == 0 && samples - k >= LEAP) {
@@ -301,7 +328,10 @@ engine_status_t engine_run(engine_t*      self,
         }
         if (status == ENGINE_OK) {
             record_sample(self, y);
-            y += self->outputs;
+            if (self->ahead > 0) {
+                status = record_ahead(self, &y[self->outputs]);
+            }
+            y += width_of_row(self);
             self->counts.samples++;
             y += self->outputs * run_quiet(self, edge < edges && tick[edge] <= until ? tick[edge] : until + 1, y);
         }
@@ -331,7 +361,7 @@ engine_status_t engine_play(engine_t*              self,
         status = engine_set_system(self, &circuit[turn]);
         if (status == ENGINE_OK && recorded * ENGINE_TICKS_PER_SAMPLE <= until[turn]) {
             status = engine_run(self, until[turn], taken - first, &tick[first], &input[first], &level[first], y);
-            y += (self->counts.samples - recorded) * self->outputs;
+            y += (self->counts.samples - recorded) * width_of_row(self);
         }
     }
     return status == ENGINE_OK && taken < edges ? ENGINE_EDGE : status;
@@ -352,5 +382,7 @@ void engine_get_overdue(const engine_t* const self, int64_t* tick) {
         tick[k] = mode_overdue_tick(self, k);
     }
 }
+
+void engine_look_ahead(engine_t* const self, int64_t ticks) { self->ahead = ticks; }
 
 void engine_get_counts(const engine_t* const self, engine_counts_t* counts) { *counts = self->counts; }

@@ -136,6 +136,10 @@ void engine_watch(engine_t* self, int64_t patience);
 /// For each kink, write the first tick since engine_watch() at which it had been outside for that long; -1 if there is none.
 void engine_get_overdue(const engine_t* self, int64_t* tick);
 
+/// After each sample record y once more, `ticks` after it: a row then holds both. 0 ends this. Edges and circuits after the
+/// sample are not foreseen, and the samples do not change. Cost: a product a sample, and a copy of the state after an event.
+void engine_look_ahead(engine_t* self, int64_t ticks);
+
 /// Copy the counters.
 void engine_get_counts(const engine_t* self, engine_counts_t* counts);
 
@@ -200,14 +204,17 @@ void engine_convert(int64_t       count,
                     uint16_t*     codes,
                     uint8_t*      clipped);
 
-/// For each sample and channel, record in out the voltage `late` probes after the first of the `stride` probes of that sample,
-/// on the straight line between two probes. before: the probe before the first one. late: at least -1, at most stride - 1.
-void engine_interpolate(int64_t       samples,
-                        int           channels,
-                        int64_t       stride,
-                        const double* before,
-                        const double* probes,
-                        const double* late,
-                        double*       out);
+/// For each sample and channel, record in out the voltage `late` sample periods after row[channel] of the `stride` rows of that
+/// sample. A row has the voltages at its instant, and those `ahead` sample periods later. Between these, and between a row and
+/// the one before, voltages are taken from a straight line. before: the row before the first one.
+void engine_take(int64_t        samples,
+                 int            channels,
+                 int64_t        stride,
+                 const int64_t* row,
+                 double         ahead,
+                 const double*  before,
+                 const double*  probes,
+                 const double*  late,
+                 double*        out);
 
 #endif  // ENGINE_H

@@ -50,7 +50,8 @@ class Engine:
     """Solver of one circuit. It starts at rest (x = 0, u = 0), before its first sample.
 
     system: circuit; outputs: nodes to record; events_per_sample: most mode changes within a sample period, beyond which
-    EngineError is raised.
+    EngineError is raised. ahead_ticks: if not 0, the voltages so many ticks after each sample follow in its row, as they
+    would be without edges and changes after the sample.
     """
 
     def __init__(
@@ -59,8 +60,10 @@ class Engine:
         outputs: Sequence[str],
         sample_rate_hz: float = 20e3,
         events_per_sample: int = 10_000,
+        ahead_ticks: int = 0,
     ) -> None:
         self._outputs = tuple(outputs)
+        self._ahead_ticks = ahead_ticks
         self._names = (system.states, system.inputs)
         self._library = library.load()
         if not 0 < sample_rate_hz < math.inf:
@@ -75,6 +78,7 @@ class Engine:
         if not self._handle:
             raise EngineError("cannot make an engine for {} states, {} inputs, {} kinks, {} outputs".format(*sizes))
         weakref.finalize(self, _release, kind, self._handle)
+        self._library.engine_look_ahead(self._handle, ahead_ticks)
         self._kinks = len(system.kinks)
         self._recorded = 0
         self._now_tick = -1
@@ -134,7 +138,7 @@ class Engine:
     def _allocate(self, samples: int) -> NDArray[np.float64]:
         if samples < 0:
             raise EngineError(f"cannot record {samples} samples")
-        return np.empty((samples, len(self._outputs)))
+        return np.empty((samples, len(self._outputs) * (2 if self._ahead_ticks else 1)))
 
     def _advance_clock(self, samples: int) -> None:
         self._recorded += samples
@@ -205,6 +209,7 @@ class Engine:
         Raises EngineError.
         """
         self._library.engine_restart(self._handle)
+        self._library.engine_look_ahead(self._handle, self._ahead_ticks)
         self._library.engine_watch(self._handle, schedule.patience_ticks)
         self._recorded, self._now_tick = 0, -1
         volts = self._allocate(schedule.samples)

@@ -98,6 +98,7 @@ typedef struct {
     double*       readings;  // panelled w and y over z; used if phi feeds one of them
     slow_t        slow;
     bool          has_slow;
+    bool          is_pinned;  // another engine uses it: it must stay
 } mode_t;
 
 /// The end of a step with respect to the bounds of the present mode. A step inside all bounds is CLEAR if w could not have
@@ -175,6 +176,7 @@ struct engine {
     double        rest[PADDED(ENGINE_MAX_STATES)];  // of the slow states
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
 
+    int64_t ahead;                      // ticks; see engine_look_ahead()
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER
     int64_t overdue[ENGINE_MAX_KINKS];  // results of engine_get_overdue() for kinks that have come back since
@@ -314,6 +316,9 @@ void quiet_leap(engine_t* self, double* y);
 
 /// y of the present sample in a stretch of slow states. y needs room for whole panels.
 void quiet_read(const engine_t* self, double* y);
+
+/// y a number of ticks after the present sample in a stretch of slow states. y needs room for whole panels.
+void quiet_look_ahead(const engine_t* self, int64_t ticks, double* y);
 
 /// x in a stretch of slow states.
 void quiet_get_state(const engine_t* self, double* x);

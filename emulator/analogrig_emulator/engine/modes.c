@@ -59,7 +59,10 @@ static void point_readings(engine_t* const self) {
 
 /// Build the present mode in the place of the oldest of the store.
 static engine_status_t build_mode(engine_t* const self) {
-    double        a[MAX_ELEMENTS];
+    double a[MAX_ELEMENTS];
+    if (self->circuit->store[self->circuit->oldest].is_pinned) {
+        self->circuit->oldest = (self->circuit->oldest + 1) % MODES;
+    }
     mode_t* const mode = &self->circuit->store[self->circuit->oldest];
     kinks_build_map(self, self->piece, a);
     const engine_status_t status = ladder_plan(self, a, &mode->base, &mode->stiff);

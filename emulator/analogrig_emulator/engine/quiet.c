@@ -637,6 +637,15 @@ void quiet_read(const engine_t* const self, double* y) {
                             self->slow_z, y);
 }
 
+void quiet_look_ahead(const engine_t* const self, int64_t ticks, double* y) {
+    const slow_t* slow  = &self->mode->slow;
+    const int     width = width_of(self, slow);
+    double        z[MAX_COLUMNS];
+    memcpy(z, self->slow_z, (size_t)width * sizeof z[0]);
+    move_slow(self, slow, ticks, z);
+    self->kernels->multiply(self->outputs, width, &slow->y[self->slow_age * PANEL_ELEMENTS(self->outputs, width)], z, y);
+}
+
 /// x a number of ticks later.
 static void get_state_after(const engine_t* const self, int64_t ticks, double* x) {
     double        padded[PADDED(ENGINE_MAX_STATES)], z[MAX_COLUMNS];

@@ -127,23 +127,31 @@ class SuspensionComputer:
         samples: int,
         changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
+        ahead_ticks: int = 0,
     ) -> Iterator[NDArray[np.float64]]:
         """Play from rest; yield the volts of CHANNELS in blocks: float64 (block_samples or, last, fewer; 4).
+
+        If ahead_ticks is not 0, a row has 8 volts: those of the sample, and those so many ticks later, as for Engine.
 
         The excitation's first level applies at sample 0. A change takes effect right after its sample is
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
         Raises PotError, ExcitationError and EngineError; for invalid arguments before anything is played.
         """
-        return self.play_planned(excitation, samples, self.plan(changes, samples), block_samples)
+        return self.play_planned(excitation, samples, self.plan(changes, samples), block_samples, ahead_ticks)
 
     def play_planned(
-        self, excitation: Excitation, samples: int, turns: Sequence[PotTurn], block_samples: int = BLOCK_SAMPLES
+        self,
+        excitation: Excitation,
+        samples: int,
+        turns: Sequence[PotTurn],
+        block_samples: int = BLOCK_SAMPLES,
+        ahead_ticks: int = 0,
     ) -> Iterator[NDArray[np.float64]]:
         """Play like play(), with turns from plan()."""
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
         excitation.period_ticks(self.sample_rate_hz)
-        self.machine.restart(Mode.OPERATE)
+        self.machine.restart(Mode.OPERATE, ahead_ticks)
         self._plays += 1
         return self._blocks(self._plays, excitation, samples, list(turns), block_samples)
 
@@ -176,7 +184,8 @@ class SuspensionComputer:
         trains = {SOURCE: edges.within(*self.machine.window(samples))}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
-        volts *= self._signs
+        by_instant = volts.reshape(samples, -1, len(self._signs))
+        by_instant *= self._signs
         return volts
 
     # ---- pots

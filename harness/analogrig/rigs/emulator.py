@@ -40,6 +40,7 @@ from analogrig_emulator import (
     Sampler,
     SuspensionComputer,
     acquired,
+    ahead_ticks,
     drawn_offsets_v,
     is_repeatable,
     preset,
@@ -371,7 +372,8 @@ class EmulatorRig(Rig):
         drawn, card = self._description.computer, self._card
         is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm and not drawn.noise
         is_nominal &= drawn.specimen is None and drawn.values is None
-        return is_nominal and probes_per_sample(card) == 1 and card.clock_drift_ppm == 0
+        is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
+        return is_nominal and is_on_time
 
     def _repeat(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
         count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
