@@ -246,20 +246,24 @@ static bool is_finite(const engine_t* const self) {
 }
 
 static void record_sample(const engine_t* const self, double* y) {
-    double  padded[PADDED(ENGINE_MAX_OUTPUTS)];
-    double* out = self->outputs % PANEL == 0 ? y : padded;
+    const int length = self->is_slow ? row_length(self) : self->outputs;
+    double    padded[PADDED(2 * ENGINE_MAX_OUTPUTS)];
+    double*   out = length % PANEL == 0 ? y : padded;
     if (self->is_slow) {
         quiet_read(self, out);
     } else {
         self->kernels->multiply(self->outputs, self->columns, self->y_panels, self->z, out);
     }
     if (out != y) {
-        memcpy(y, padded, (size_t)self->outputs * sizeof y[0]);
+        memcpy(y, padded, (size_t)length * sizeof y[0]);
     }
 }
 
-/// Advance a copy, whose modes are those of the original, and record its y.
-static engine_status_t record_of_copy(const engine_t* const self, double* y) {
+/// Record y of engine_look_ahead(), unless record_sample() has. A copy advances, whose modes are those of the original.
+static engine_status_t record_ahead(const engine_t* const self, double* y) {
+    if (self->is_slow && self->clear >= self->now + self->ahead) {
+        return ENGINE_OK;
+    }
     engine_t copy = *self;
     copy.w        = &copy.arguments[0][self->w - self->arguments[0]];
     copy.w_before = &copy.arguments[0][self->w_before - self->arguments[0]];
@@ -267,35 +271,24 @@ static engine_status_t record_of_copy(const engine_t* const self, double* y) {
     self->mode->is_pinned        = true;
     const engine_status_t status = advance(&copy, self->now + self->ahead);
     self->mode->is_pinned        = false;
+    quiet_leave(&copy);
     record_sample(&copy, y);
     return status;
 }
 
-/// Record y of engine_look_ahead().
-static engine_status_t record_ahead(const engine_t* const self, double* y) {
-    double padded[PADDED(ENGINE_MAX_OUTPUTS)];
-    if (!self->is_slow || self->clear < self->now + self->ahead) {
-        return record_of_copy(self, y);
-    }
-    quiet_look_ahead(self, self->ahead, padded);
-    memcpy(y, padded, (size_t)self->outputs * sizeof y[0]);
-    return ENGINE_OK;
-}
-
-static int width_of_row(const engine_t* const self) { return self->ahead > 0 ? 2 * self->outputs : self->outputs; }
-
 /// Record the samples of a quiet stretch that come before a tick. Return their number.
 static int64_t run_quiet(engine_t* const self, int64_t before, double* y) {
     const bool    quiet   = self->is_slow && self->clear == NO_END;
-    const int64_t samples = quiet && self->ahead == 0 ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
+    const int64_t samples = quiet ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
+    const int     row     = row_length(self);
     int64_t       k       = 0;
     while (k < samples) {
-        if (self->slow_age == LEAP - 1 && self->outputs % PANEL == 0 && samples - k >= LEAP) {
-            quiet_leap(self, &y[k * self->outputs]);
+        if (self->slow_age == LEAP - 1 && row % PANEL == 0 && samples - k >= LEAP) {
+            quiet_leap(self, &y[k * row]);
             k += LEAP;
         } else {
             quiet_step(self);
-            record_sample(self, &y[k * self->outputs]);
+            record_sample(self, &y[k * row]);
             k++;
         }
     }
@@ -328,12 +321,10 @@ engine_status_t engine_run(engine_t*      self,
         }
         if (status == ENGINE_OK) {
             record_sample(self, y);
-            if (self->ahead > 0) {
-                status = record_ahead(self, &y[self->outputs]);
-            }
-            y += width_of_row(self);
+            status = self->ahead > 0 ? record_ahead(self, &y[self->outputs]) : ENGINE_OK;
+            y += row_length(self);
             self->counts.samples++;
-            y += self->outputs * run_quiet(self, edge < edges && tick[edge] <= until ? tick[edge] : until + 1, y);
+            y += row_length(self) * run_quiet(self, edge < edges && tick[edge] <= until ? tick[edge] : until + 1, y);
         }
     }
     if (status == ENGINE_OK && edge < edges) {
@@ -361,7 +352,7 @@ engine_status_t engine_play(engine_t*              self,
         status = engine_set_system(self, &circuit[turn]);
         if (status == ENGINE_OK && recorded * ENGINE_TICKS_PER_SAMPLE <= until[turn]) {
             status = engine_run(self, until[turn], taken - first, &tick[first], &input[first], &level[first], y);
-            y += (self->counts.samples - recorded) * width_of_row(self);
+            y += (self->counts.samples - recorded) * row_length(self);
         }
     }
     return status == ENGINE_OK && taken < edges ? ENGINE_EDGE : status;

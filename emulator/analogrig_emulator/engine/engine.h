@@ -136,8 +136,9 @@ void engine_watch(engine_t* self, int64_t patience);
 /// For each kink, write the first tick since engine_watch() at which it had been outside for that long; -1 if there is none.
 void engine_get_overdue(const engine_t* self, int64_t* tick);
 
-/// After each sample record y once more, `ticks` after it: a row then holds both. 0 ends this. Edges and circuits after the
-/// sample are not foreseen, and the samples do not change. Cost: a product a sample, and a copy of the state after an event.
+/// From now on record y once more `ticks` after each sample, at most one sample period: a row then holds both. To be called
+/// before the first sample. Edges and circuits after the sample are not foreseen, and the samples do not change.
+/// Cost: a longer product a sample, and a copy of the engine where it does not step slow states.
 void engine_look_ahead(engine_t* self, int64_t ticks);
 
 /// Copy the counters.

@@ -64,6 +64,7 @@ typedef struct {
     double* block;
     int     rank;
     int     least_level;
+    int64_t ahead;    // that of the engine for which y was built
     bool    certain;  // s comes to rest, and energy bounds how far w strays until then
     int     row[ENGINE_MAX_STATES];
     double* change;  // of s in one sample period
@@ -75,7 +76,7 @@ typedef struct {
     double* state;   // x
     double* first;   // s 2^least_level ticks after an event, over the z of that event
     double* w;
-    double* y;       // y now and after 1, 2, ... LEAP - 1 sample periods
+    double* y;       // the row of a sample now and after 1, 2, ... LEAP - 1 sample periods
     double* rest;    // s at rest
     double* rest_w;  // w at rest
     double* energy;  // Q: e'Q e never grows, with e the distance of s from rest
@@ -208,6 +209,9 @@ static inline double kink_upper_bound(const engine_kink_t* kink, unsigned char p
     return piece == PIECE_LOW ? kink->lower : piece == PIECE_MIDDLE ? kink->upper : (double)INFINITY;
 }
 
+/// Numbers in the row of a sample.
+static inline int row_length(const engine_t* self) { return self->ahead > 0 ? 2 * self->outputs : self->outputs; }
+
 static inline void copy_z(const engine_t* self, const double* from, double* to) {
     for (int j = 0; j < self->columns; j++) {
         to[j] = from[j];
@@ -314,11 +318,8 @@ void quiet_step(engine_t* self);
 /// Advance by LEAP samples and record them, with the bits of LEAP single steps.
 void quiet_leap(engine_t* self, double* y);
 
-/// y of the present sample in a stretch of slow states. y needs room for whole panels.
-void quiet_read(const engine_t* self, double* y);
-
-/// y a number of ticks after the present sample in a stretch of slow states. y needs room for whole panels.
-void quiet_look_ahead(const engine_t* self, int64_t ticks, double* y);
+/// Row of the present sample in a stretch of slow states. It needs room for whole panels.
+void quiet_read(const engine_t* self, double* row);
 
 /// x in a stretch of slow states.
 void quiet_get_state(const engine_t* self, double* x);
