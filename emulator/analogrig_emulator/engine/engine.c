@@ -94,6 +94,27 @@ static bool holds(const engine_t* const self, const circuit_t* circuit, const en
            is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks);
 }
 
+/// True if two matrices agree in all columns but the last.
+static bool is_equal_but_last(int rows, int columns, const double* one, const double* other) {
+    bool equal = true;
+    for (int i = 0; i < rows && equal; i++) {
+        equal = is_equal((size_t)columns - 1U, sizeof(double), &one[i * columns], &other[i * columns]);
+    }
+    return equal;
+}
+
+/// True if a circuit differs from the one kept in its constants alone, as by the offsets of amplifiers.
+static bool is_variant(const engine_t* const self, const circuit_t* circuit, const engine_system_t* system) {
+    const sizes_t sizes = sizes_of(self);
+    return circuit->is_set && is_equal_but_last(self->states, self->columns, circuit->abc, system->abc) &&
+           is_equal(sizes.g, sizeof(double), circuit->g, system->g) &&
+           is_equal_but_last(self->kinks, self->columns, circuit->cde, system->cde) &&
+           is_equal(sizes.w_phi, sizeof(double), circuit->w_phi, system->w_phi) &&
+           is_equal_but_last(self->outputs, self->columns, circuit->lmn, system->lmn) &&
+           is_equal(sizes.y_phi, sizeof(double), circuit->y_phi, system->y_phi) &&
+           is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks);
+}
+
 /// Take `count` elements of a block.
 static double* carve(double** block, size_t count) {
     double* const part = *block;
@@ -134,6 +155,21 @@ static void copy(size_t count, size_t size, const void* from, void* to) {
     }
 }
 
+static void pack_circuit(const engine_t* const self, circuit_t* circuit) {
+    panels_pack(self->kinks, self->columns, self->columns, circuit->cde, circuit->cde_panels);
+    panels_pack(self->outputs, self->columns, self->columns, circuit->lmn, circuit->lmn_panels);
+}
+
+/// Give the constants of a variant to a circuit.
+static void retune(const engine_t* const self, const engine_system_t* system, circuit_t* circuit) {
+    const sizes_t sizes = sizes_of(self);
+    copy(sizes.abc, sizeof(double), system->abc, circuit->abc);
+    copy(sizes.cde, sizeof(double), system->cde, circuit->cde);
+    copy(sizes.lmn, sizeof(double), system->lmn, circuit->lmn);
+    pack_circuit(self, circuit);
+    circuit->tuning++;
+}
+
 /// Put a circuit in the place of the one set longest ago, and make it the present one.
 static engine_status_t keep_circuit(engine_t* const self, const engine_system_t* system) {
     const sizes_t sizes = sizes_of(self);
@@ -158,9 +194,19 @@ static engine_status_t keep_circuit(engine_t* const self, const engine_system_t*
     self->circuit   = circuit;
     kinks_list_feeding(self);
     circuit->is_set = kinks_are_unique(self);
-    panels_pack(self->kinks, self->columns, self->columns, circuit->cde, circuit->cde_panels);
-    panels_pack(self->outputs, self->columns, self->columns, circuit->lmn, circuit->lmn_panels);
+    pack_circuit(self, circuit);
     return circuit->is_set ? ENGINE_OK : ENGINE_NOT_UNIQUE;
+}
+
+/// The kept circuit that fits; NULL if there is none.
+static circuit_t* find_circuit(const engine_t* const self,
+                               const engine_system_t* system,
+                               bool (*fits)(const engine_t*, const circuit_t*, const engine_system_t*)) {
+    int place = 0;
+    while (place < CIRCUITS && self->circuits[place] != NULL && !fits(self, self->circuits[place], system)) {
+        place++;
+    }
+    return place < CIRCUITS ? self->circuits[place] : NULL;
 }
 
 engine_status_t engine_set_system(engine_t* const self, const engine_system_t* system) {
@@ -171,12 +217,14 @@ engine_status_t engine_set_system(engine_t* const self, const engine_system_t* s
     if (self->has_system) {
         quiet_leave(self);
     }
-    int place = 0;
-    while (place < CIRCUITS && self->circuits[place] != NULL && !holds(self, self->circuits[place], system)) {
-        place++;
+    circuit_t* equal = find_circuit(self, system, holds);
+    circuit_t* const variant = equal == NULL ? find_circuit(self, system, is_variant) : NULL;
+    if (variant != NULL) {
+        retune(self, system, variant);
+        equal = variant;
     }
-    if (place < CIRCUITS && self->circuits[place] != NULL) {
-        self->circuit = self->circuits[place];
+    if (equal != NULL) {
+        self->circuit = equal;
     } else {
         status = keep_circuit(self, system);
     }

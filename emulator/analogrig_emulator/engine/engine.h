@@ -87,7 +87,9 @@ void engine_free(engine_t* self);
 void engine_restart(engine_t* self);
 
 /// Set or replace the circuit; to be called before engine_run(). x and u keep their values. A circuit equal to the present
-/// one to the bit changes nothing. The last 8 circuits are kept, with the matrices of their modes.
+/// one to the bit changes nothing. The last 8 circuits are kept, with the matrices of their modes. One
+/// that differs from these in its constants alone, as by the offsets of amplifiers, replaces that circuit at a small part of
+/// the cost.
 ///
 /// Fails with ENGINE_NOT_UNIQUE, or as engine_run() where it enters the mode. Without a circuit, engine_run() then fails.
 /// Cost: a comparison with those kept; for a new one a copy, one determinant for each combination of pieces of the kinks that

@@ -99,6 +99,7 @@ typedef struct {
     double*       readings;  // panelled w and y over z; used if phi feeds one of them
     slow_t        slow;
     bool          has_slow;
+    int64_t       tuning;     // that of its circuit when it was built
     bool          is_pinned;  // another engine uses it: it must stay
 } mode_t;
 
@@ -118,6 +119,7 @@ typedef struct {
     int            coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
     mode_t         store[MODES];
     int            stored, oldest;
+    int64_t        tuning;  // how often the constants have changed
 } circuit_t;
 
 /// The inner loops. Memory must not overlap.
@@ -258,6 +260,10 @@ engine_status_t ladder_plan(const engine_t* self, const double* a, int* base, bo
 
 /// Compute the terms of the present mode, and its lowest level. Overwrites a.
 void ladder_build(engine_t* self, double* a);
+
+/// Compute the last column of the terms and levels of the present mode anew, for other constants. It must not be stiff.
+/// Overwrites a. The bits are those of ladder_build() and ladder_reach().
+void ladder_retune(engine_t* self, double* a);
 
 /// Compute the levels of the present mode up to this one.
 void ladder_reach(engine_t* self, int level);
