@@ -68,8 +68,9 @@ int engine_see(int64_t       samples,
                const double* normal,
                double*       held,
                double*       seen) {
-    const double excess = channels == 4 && held == NULL ? see(samples, 4, card, 0.0, volts, normal, NULL, seen) :
-                                                          see(samples, channels, card, residual, volts, normal, held, seen);
+    const double excess = channels == 4 && held == NULL
+                              ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
+                              : see(samples, channels, card, residual, volts, normal, held, seen);
     return isnan(excess) ? 0 : 1;
 }
 
@@ -114,7 +115,7 @@ void engine_take(int64_t        samples,
         for (int channel = 0; channel < channels; channel++, late++, out++) {
             const double* const now   = &probes[row[channel] * width + channel];
             const double* const early = row[channel] == 0 ? &before[channel] : now - width;
-            *out = *now + *late * (*late < 0.0 ? *now - *early : (now[channels] - *now) / ahead);
+            *out                      = *now + *late * (*late < 0.0 ? *now - *early : (now[channels] - *now) / ahead);
         }
         before = &probes[(stride - 1) * width];
     }

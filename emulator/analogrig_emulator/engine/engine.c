@@ -199,7 +199,7 @@ static engine_status_t keep_circuit(engine_t* const self, const engine_system_t*
 }
 
 /// The kept circuit that fits; NULL if there is none.
-static circuit_t* find_circuit(const engine_t* const self,
+static circuit_t* find_circuit(const engine_t* const  self,
                                const engine_system_t* system,
                                bool (*fits)(const engine_t*, const circuit_t*, const engine_system_t*)) {
     int place = 0;
@@ -217,7 +217,7 @@ engine_status_t engine_set_system(engine_t* const self, const engine_system_t* s
     if (self->has_system) {
         quiet_leave(self);
     }
-    circuit_t* equal = find_circuit(self, system, holds);
+    circuit_t*       equal   = find_circuit(self, system, holds);
     circuit_t* const variant = equal == NULL ? find_circuit(self, system, is_variant) : NULL;
     if (variant != NULL) {
         retune(self, system, variant);
@@ -312,10 +312,10 @@ static engine_status_t record_ahead(const engine_t* const self, double* y) {
     if (self->is_slow && self->clear >= self->now + self->ahead) {
         return ENGINE_OK;
     }
-    engine_t copy = *self;
-    copy.w        = &copy.arguments[0][self->w - self->arguments[0]];
-    copy.w_before = &copy.arguments[0][self->w_before - self->arguments[0]];
-    copy.w_there  = &copy.arguments[0][self->w_there - self->arguments[0]];
+    engine_t copy                = *self;
+    copy.w                       = &copy.arguments[0][self->w - self->arguments[0]];
+    copy.w_before                = &copy.arguments[0][self->w_before - self->arguments[0]];
+    copy.w_there                 = &copy.arguments[0][self->w_there - self->arguments[0]];
     self->mode->is_pinned        = true;
     const engine_status_t status = advance(&copy, self->now + self->ahead);
     self->mode->is_pinned        = false;

@@ -239,7 +239,11 @@ int engine_normal_learn(engine_normal_t normal, double* width, uint64_t* limit);
 
 /// Write `count` standard normal numbers, those of numpy's generator PCG64 to the bit, and advance it. generator: the two
 /// halves of its state, then those of its increment, the higher ones first.
-void engine_normal_fill(
-    engine_normal_t normal, const double* width, const uint64_t* limit, uint64_t* generator, int64_t count, double* out);
+void engine_normal_fill(engine_normal_t normal,
+                        const double*   width,
+                        const uint64_t* limit,
+                        uint64_t*       generator,
+                        int64_t         count,
+                        double*         out);
 
 #endif  // ENGINE_H

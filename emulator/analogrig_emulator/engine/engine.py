@@ -262,7 +262,9 @@ class Engine:
             return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
         if len(trains) == 1:
             ((i, train),) = trains
-            ticks, levels_v = (np.ascontiguousarray(x, t) for x, t in ((train.ticks, np.int64), (train.levels_v, np.float64)))
+            ticks, levels_v = (
+                np.ascontiguousarray(x, t) for x, t in ((train.ticks, np.int64), (train.levels_v, np.float64))
+            )
             return ticks, np.full(ticks.size, i, np.int32), levels_v
         ticks = np.concatenate([train.ticks for _, train in trains], dtype=np.int64)
         levels_v = np.concatenate([train.levels_v for _, train in trains], dtype=np.float64)

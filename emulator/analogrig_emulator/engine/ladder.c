@@ -118,7 +118,7 @@ void ladder_retune(engine_t* const self, double* a) {
             f[i]    = k == 1 ? next[i] : f[i] + next[i];
         }
         for (int i = 0; i < n; i++) {
-            term[i] = next[i];
+            term[i]                                                                         = next[i];
             mode->terms[((i / PANEL * TERMS + k - 1) * columns + last) * PANEL + i % PANEL] = term[i];
         }
     }

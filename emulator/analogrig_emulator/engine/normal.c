@@ -28,8 +28,8 @@ typedef struct {
 } source_t;
 
 static inline uint64_t step(uint128_t* state, uint128_t increment) {
-    *state                = *state * MULTIPLIER + increment;
-    const uint64_t high   = (uint64_t)(*state >> 64), mixed = high ^ (uint64_t)*state;
+    *state              = *state * MULTIPLIER + increment;
+    const uint64_t high = (uint64_t)(*state >> 64), mixed = high ^ (uint64_t)*state;
     const unsigned places = (unsigned)(high >> 58);
     return mixed >> places | mixed << (-places & 63U);
 }
@@ -76,9 +76,13 @@ int engine_normal_learn(engine_normal_t normal, double* width, uint64_t* limit) 
     return 1;
 }
 
-void engine_normal_fill(
-    engine_normal_t normal, const double* width, const uint64_t* limit, uint64_t* generator, int64_t count, double* out) {
-    source_t source = { .has_generator = true };
+void engine_normal_fill(engine_normal_t normal,
+                        const double*   width,
+                        const uint64_t* limit,
+                        uint64_t*       generator,
+                        int64_t         count,
+                        double*         out) {
+    source_t source  = { .has_generator = true };
     source.state     = (uint128_t)generator[0] << 64 | generator[1];
     source.increment = (uint128_t)generator[2] << 64 | generator[3];
     uint128_t state  = source.state;
@@ -109,8 +113,12 @@ int engine_normal_learn(engine_normal_t normal, double* width, uint64_t* limit) 
     return 0;
 }
 
-void engine_normal_fill(
-    engine_normal_t normal, const double* width, const uint64_t* limit, uint64_t* generator, int64_t count, double* out) {
+void engine_normal_fill(engine_normal_t normal,
+                        const double*   width,
+                        const uint64_t* limit,
+                        uint64_t*       generator,
+                        int64_t         count,
+                        double*         out) {
     (void)normal;
     (void)width;
     (void)limit;

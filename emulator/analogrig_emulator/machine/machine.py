@@ -380,9 +380,7 @@ class AnalogComputer:
     def _engine(self) -> Engine:
         """Engine, made on first use after a restart: most machines have their pots set before they are played."""
         if self._powered is None:
-            self._powered = Engine(
-                self._system, self._readings, self._sample_rate_hz, ahead_ticks=self._ahead_ticks
-            )
+            self._powered = Engine(self._system, self._readings, self._sample_rate_hz, ahead_ticks=self._ahead_ticks)
             self._powered.watch(self._lamp_delay_ticks)
             self._charge_at_once(self._powered)
         return self._powered

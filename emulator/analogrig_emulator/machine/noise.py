@@ -241,7 +241,7 @@ class NoisySuspension:
             else:
                 noise_v = np.zeros((len(block), len(signs)))
                 noise.add_to(noise_v, signs, now, self._rng)
-                block += np.tile(noise_v, 2)
+                np.add(block, np.tile(noise_v, 2), out=block)
             first += len(block)
             yield block
 

@@ -35,12 +35,12 @@ keep(const library_t* const self, const size_t k, const est_step_t* const step, 
 }
 
 /// Enter sample k; return the number of alarms.
-static size_t enter(library_t* const             self,
-                    const size_t                 k,
-                    const float                  u,
-                    const float                  y,
-                    const uint8_t* const         valid,
-                    const library_out_t* const   out) {
+static size_t enter(library_t* const           self,
+                    const size_t               k,
+                    const float                u,
+                    const float                y,
+                    const uint8_t* const       valid,
+                    const library_out_t* const out) {
     const est_sample_t sample = { .u = u, .y = y, .valid = (valid == 0) || (valid[k] != 0U) };
     const est_step_t   step   = est_step(&self->estimator, sample);
     keep(self, k, &step, out);
