@@ -142,7 +142,8 @@ class Excitation:
         bits = _sequence(self.register_length)
         index = np.arange(first, last + 1)
         high = bits[(index + self.seed) % bits.size]
-        return index - self.phase, np.where(high, self.high_v, self.low_v)
+        levels_v: NDArray[np.float64] = np.where(high, self.high_v, self.low_v)
+        return index.astype(np.float64) - self.phase, levels_v
 
     def _require(self, field: str, holds: object, what: str) -> None:
         if not holds:

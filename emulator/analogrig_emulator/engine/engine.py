@@ -49,9 +49,9 @@ class EngineCounts:
 class Engine:
     """Solver of one circuit. It starts at rest (x = 0, u = 0), before its first sample.
 
-    system: circuit; outputs: nodes to record; events_per_sample: most mode changes within a sample period, beyond which
-    EngineError is raised. ahead_ticks: if not 0, the voltages so many ticks after each sample follow in its row, as they
-    would be without edges and changes after the sample.
+    system: circuit; outputs: nodes to record; events_per_sample: most mode changes within a sample period, or
+    EngineError is raised. ahead_ticks: if not 0, the voltages so many ticks after each sample follow in its row, as
+    they would be without edges and changes after the sample.
     """
 
     def __init__(
@@ -262,10 +262,8 @@ class Engine:
             return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
         if len(trains) == 1:
             ((i, train),) = trains
-            ticks, levels_v = (
-                np.ascontiguousarray(x, t) for x, t in ((train.ticks, np.int64), (train.levels_v, np.float64))
-            )
-            return ticks, np.full(ticks.size, i, np.int32), levels_v
+            inputs = np.full(train.ticks.size, i, np.int32)
+            return np.ascontiguousarray(train.ticks, np.int64), inputs, np.ascontiguousarray(train.levels_v, np.float64)
         ticks = np.concatenate([train.ticks for _, train in trains], dtype=np.int64)
         levels_v = np.concatenate([train.levels_v for _, train in trains], dtype=np.float64)
         inputs = np.repeat(np.array([i for i, _ in trains], np.int32), [train.ticks.size for _, train in trains])
