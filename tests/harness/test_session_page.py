@@ -46,7 +46,7 @@ def add(tmp_path: Path) -> Callable[..., Path]:
     return added
 
 
-def found(folder: Path) -> session_page.Session:
+def found(folder: Path) -> session_page.RunList:
     return find_session(folder, folder / "session.html")
 
 

@@ -66,7 +66,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Session:
+class RunList:
     """Runs below a folder, in the order of their start."""
 
     runs: tuple[Entry, ...]
@@ -78,7 +78,7 @@ class Session:
         return sum(run.outcome == outcome for run in self.runs)
 
 
-def find_session(folder: Path, page: Path) -> Session:
+def find_session(folder: Path, page: Path) -> RunList:
     """Runs below ``folder``: every ``verdict.json`` of a play. Links to folders are not followed.
 
     :param page: the page to be written, whose links lead to the runs.
@@ -102,7 +102,7 @@ def find_session(folder: Path, page: Path) -> Session:
             runs += [entry] if entry else []
     if not runs and not unread:
         raise ConfigurationError(f"{folder}: holds no run: no {VERDICT_FILE} of analogrig run, replay or judge")
-    return Session(tuple(sorted(runs, key=lambda run: (run.started, run.folder))), tuple(unread))
+    return RunList(tuple(sorted(runs, key=lambda run: (run.started, run.folder))), tuple(unread))
 
 
 def _read(parent: Path, folder: Path, start: Path) -> Entry | None:
@@ -155,7 +155,7 @@ def _build(recorded_by: Mapping[str, Any]) -> str:
     return files[0][:8] if files else str(recorded_by.get("commit") or "")[:12]
 
 
-def write_session(session: Session, path: Path) -> None:
+def write_session(session: RunList, path: Path) -> None:
     """Write the page, atomically. The same session gives the same bytes.
 
     :raises RecordingError: it cannot be written.
@@ -164,7 +164,7 @@ def write_session(session: Session, path: Path) -> None:
         file.write(render(session).encode("utf-8", "replace"))
 
 
-def render(session: Session) -> str:
+def render(session: RunList) -> str:
     """The page as text."""
     counts = ", ".join(f"{session.count(outcome)} {outcome}" for outcome in _SIGNS)
     worst = next((outcome for outcome in ("failed", "inconclusive") if session.count(outcome)), "passed")
