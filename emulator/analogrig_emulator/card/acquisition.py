@@ -21,7 +21,6 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card
 from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.engine import library
-from analogrig_emulator.engine.normal import standard_normal
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.errors import SamplerError
 
@@ -125,7 +124,7 @@ def _take_samples(
     for block in probed:
         probes = np.ascontiguousarray(block, np.float64)
         before = probes[0] if before is None else before
-        late = standard_normal(rng, (len(probes) // count, card.channels))
+        late = rng.standard_normal((len(probes) // count, card.channels))
         late *= card.aperture_jitter_s * per_s
         late += card.aperture_delay_s * per_s
         volts = np.empty_like(late)

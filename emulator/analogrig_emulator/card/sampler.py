@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.engine import library
-from analogrig_emulator.engine.normal import standard_normal
 from analogrig_emulator.engine.system import is_integer
 from analogrig_emulator.errors import SamplerError
 
@@ -213,7 +212,7 @@ class Sampler:
         if volts.ndim != 2 or volts.shape[1] != self.card.channels:
             raise SamplerError(f"the card has {self.card.channels} channels, got volts of shape {volts.shape}")
         volts = np.ascontiguousarray(volts, np.float64)
-        normals = standard_normal(self._rng, volts.shape) if normals is None else np.ascontiguousarray(normals)
+        normals = self._rng.standard_normal(volts.shape) if normals is None else np.ascontiguousarray(normals)
         seen_lsb, held_v = np.empty_like(volts), self._held_before(volts)
         held = None if held_v is None else held_v.ctypes.data
         converted = (self.card.analogue.ctypes.data, self._residual, volts.ctypes.data, normals.ctypes.data, held)

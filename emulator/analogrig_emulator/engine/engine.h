@@ -220,30 +220,4 @@ void engine_take(int64_t        samples,
                  const double*  late,
                  double*        out);
 
-/// numpy's bitgen_t: a source of random bits.
-typedef struct {
-    void* state;
-    uint64_t (*next_uint64)(void* state);
-    uint32_t (*next_uint32)(void* state);
-    double (*next_double)(void* state);
-    uint64_t (*next_raw)(void* state);
-} engine_bits_t;
-
-/// numpy's random_standard_normal().
-typedef double (*engine_normal_t)(engine_bits_t* bits);
-
-/// Find the table of numpy's ziggurat of 256 boxes: the width of each box in 52 bits, and the distance from which it is not
-/// accepted at once. Return 0 if this processor has no integers of 128 bits; engine_normal_fill() then does nothing.
-/// Cost: some 14,000 calls of normal.
-int engine_normal_learn(engine_normal_t normal, double* width, uint64_t* limit);
-
-/// Write `count` standard normal numbers, those of numpy's generator PCG64 to the bit, and advance it. generator: the two
-/// halves of its state, then those of its increment, the higher ones first.
-void engine_normal_fill(engine_normal_t normal,
-                        const double*   width,
-                        const uint64_t* limit,
-                        uint64_t*       generator,
-                        int64_t         count,
-                        double*         out);
-
 #endif  // ENGINE_H

@@ -55,8 +55,6 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
     ("engine_noise_add", None, (c_int, c_int, c_int64, POINTER(Noise), *(c_void_p,) * 4)),
     ("engine_take", None, (c_int64, c_int, c_int64, c_void_p, c_double, *(c_void_p,) * 4)),
-    ("engine_normal_learn", c_int, (c_void_p,) * 3),
-    ("engine_normal_fill", None, (*(c_void_p,) * 4, c_int64, c_void_p)),
     ("engine_edges", c_int64, (*(c_int64,) * 4, *(c_void_p,) * 3)),
     ("engine_see", c_int, (c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),
     ("engine_convert", None, (c_int64, c_int, c_void_p, c_uint, c_uint, *(c_void_p,) * 3)),

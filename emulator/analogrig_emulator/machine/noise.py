@@ -29,7 +29,6 @@ from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
 from analogrig_emulator.circuit.nodal import analyse
 from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
 from analogrig_emulator.engine import library
-from analogrig_emulator.engine.normal import standard_normal
 from analogrig_emulator.engine.system import PiecewiseLinear
 from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.machine.suspension import BLOCK_SAMPLES, SuspensionComputer
@@ -177,7 +176,7 @@ class CircuitNoise:
             self.turn(dials)
             begun = row
         stretches.append(library.Noise(len(volts) - begun, *self._propagation.addresses))
-        normal = standard_normal(rng, (len(volts), len(self._x)))
+        normal = rng.standard_normal((len(volts), len(self._x)))
         addresses = [array.ctypes.data for array in (signs, normal, self._x, volts)]
         array_of_stretches = (library.Noise * len(stretches))(*stretches)
         library.load().engine_noise_add(len(self._x), len(signs), len(stretches), array_of_stretches, *addresses)
