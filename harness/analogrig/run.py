@@ -7,6 +7,7 @@ The file is an uncompressed ``.npz``: the arrays under their own names, and ``he
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -218,7 +219,7 @@ class Run:
         """Number of samples that were played."""
         return len(self.codes)
 
-    @property
+    @functools.cached_property
     def datasheet(self) -> Datasheet:
         """Data sheet of the device."""
         return Datasheet.recorded(self.conditions.dut)

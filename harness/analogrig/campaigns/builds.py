@@ -1,33 +1,24 @@
-"""Builds that play a campaign, identified by file contents, and the commands that played it.
+"""Builds that play a campaign, identified by file contents.
 
 The trials of one campaign all come from one build. A name does not identify a build: the firmware, library or analogrig
-behind it may differ on another machine, or when a campaign resumes. The commands stand in a file beside the results,
-which do not depend on it.
+behind it may differ on another machine, or when a campaign resumes.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import json
 from pathlib import Path
 
 import analogrig
 import analogrig_emulator
-from analogrig import config
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.library import LIBRARY
-from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.identity import Identity, version
-from analogrig.storage import replace_file
+from analogrig.errors import ConfigurationError
+from analogrig.identity import version
 
 DIGITS = 16
 """Hex digits of a SHA-256 that identify a build."""
-
-FORMAT, FORMAT_VERSION = "analogrig-campaign-identity", 1
-
-MOST_BYTES = 10_000_000
-"""Largest size of the file of commands."""
 
 _PACKAGES = tuple(Path(str(package.__file__)).parent for package in (analogrig_emulator, analogrig))
 
@@ -79,36 +70,3 @@ def check_device(device: DeviceDescription, planned: str) -> None:
         raise ConfigurationError(
             f"device {device.name}: {device.program} is another build than the one that the campaign was begun with"
         )
-
-
-def commands_of(out: Path) -> Path:
-    """Path of the file of the commands that have played the results ``out``."""
-    return out.with_name(f"{out.name}.identity")
-
-
-def load_commands(path: Path) -> tuple[Identity, ...]:
-    """Commands that have played, in order; none if there is no such file.
-
-    :raises RecordingError: it cannot be read, or is another file.
-    """
-    if not path.exists():
-        return ()
-    other = RecordingError(f"{path}: is no file of identities of a campaign: remove it")
-    try:
-        table = json.loads(config.read_bounded(path, MOST_BYTES))
-        is_ours = (table["format"], table["version"]) == (FORMAT, FORMAT_VERSION)
-        identities = tuple(config.build(Identity, each, str(path)) for each in table["played_by"])
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror or error}") from error
-    except (ConfigurationError, LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise other from error
-    if not is_ours:
-        raise other
-    return identities
-
-
-def save_commands(path: Path, played_by: tuple[Identity, ...]) -> None:
-    """:raises RecordingError: it cannot be written."""
-    table = {"format": FORMAT, "version": FORMAT_VERSION, "played_by": [each.as_table() for each in played_by]}
-    with replace_file(path) as file:
-        file.write(f"{json.dumps(table, indent=1)}\n".encode())

@@ -1,12 +1,13 @@
 """Plan of a campaign: its file, with all the files that it names read in.
 
 A *cell* is one combination of rig, device and values of the grid. Each cell has the same number of trials, with the
-same seeds, so that cells and campaigns can be compared seed by seed. A *chunk* is some consecutive trials of one cell.
+same seeds, so that cells and campaigns can be compared seed by seed. A *part* is some consecutive trials of one cell.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -66,14 +67,16 @@ class Case:
     seed: int
 
 
-class Chunk(NamedTuple):
-    """The trials of one cell that a worker receives at a time."""
+class Part(NamedTuple):
+    """Consecutive trials of one cell."""
 
-    round: int
     cell: int
+    first: int
+    """Place of the first one in the cell, from 0 on."""
+    count: int
 
     def __str__(self) -> str:
-        return f"cell {self.cell}, round {self.round}"
+        return f"cell {self.cell}, trials {self.first} to {self.first + self.count - 1}"
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,7 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> Plan:
+        """:raises ConfigurationError, ValueError: it is none."""
         return config.build(cls, json.loads(text), "the plan of the campaign")
 
     def as_table(self) -> dict[str, Any]:
@@ -134,9 +138,13 @@ class Plan:
         """Plan as JSON text; equal plans give equal text."""
         return json.dumps(self.as_table(), sort_keys=True, separators=(",", ":"))
 
+    def as_plain(self) -> Any:
+        """Plan as JSON has it, with lists for tuples."""
+        return json.loads(self.as_json())
+
     def check_same(self, table: Any, where: str) -> None:
         """:raises ConfigurationError: the plan of that table, as JSON has it, is another; names what differs."""
-        if differences := list_differences(table, json.loads(self.as_json()), ("there", "here")):
+        if differences := list_differences(table, self.as_plain(), ("there", "here")):
             raise ConfigurationError(f"{where} ({differences}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
@@ -148,16 +156,9 @@ class Plan:
             for rig, device, values in itertools.product(range(len(self.rigs)), range(len(self.devices)), combinations)
         ]
 
-    def chunks(self) -> Iterator[Chunk]:
-        """Yield the chunks round by round, so that all cells progress together."""
-        rounds, cells = -(-self.spec.trials // self.spec.chunk), len(self.cells())
-        return (Chunk(number, cell) for number in range(rounds) for cell in range(cells))
-
-    def seeds(self, chunk: Chunk) -> range:
-        first = chunk.round * self.spec.chunk
-        return range(
-            self.spec.first_seed + first, self.spec.first_seed + min(first + self.spec.chunk, self.spec.trials)
-        )
+    def seeds(self, part: Part) -> range:
+        first = self.spec.first_seed + part.first
+        return range(first, first + part.count)
 
     def draw(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""
@@ -168,13 +169,18 @@ class Plan:
         """:raises ConfigurationError: the values make no scenario."""
         values = {**cell.values, **(self.draw(seed) if drawn is None else drawn)}
         try:
-            scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
+            scenario = _scenario(self._base, values, self.spec)
         except ValueError as error:
             raise ConfigurationError(f"{_text(values)}: {error}" if values else str(error)) from error
         rig = dict(self.rigs[cell.rig])
         if "noise_lsb" in values:
             rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
         return Case(rig, self.devices[cell.device], scenario, seed)
+
+    @functools.cached_property
+    def _base(self) -> Scenario:
+        """Scenario before the values of a cell are set."""
+        return Scenario.from_table(self.scenario, "the campaign's scenario")
 
     def _check(self) -> None:
         spec = self.spec

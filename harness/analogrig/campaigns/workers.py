@@ -1,4 +1,4 @@
-"""Workers that play the chunks of a campaign: this process, processes of this machine, or a cluster of Dask.
+"""Workers that play the tasks of a campaign: this process, processes of this machine, or a cluster of Dask.
 
 Each takes tasks when it has capacity, and yields results in any order. Processes and cluster are executors of
 concurrent.futures. Only the tasks in flight on a killed worker are given to another. A task that has killed
@@ -83,6 +83,10 @@ def _check_descriptors(workers: int) -> None:
 class Workers(Protocol):
     """Interface of all workers: play tasks."""
 
+    @property
+    def slots(self) -> int:
+        """Number of tasks that can be in flight."""
+
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         """Yield each task with its result. A task is taken only when a worker can start it.
 
@@ -92,6 +96,8 @@ class Workers(Protocol):
 
 class ThisProcess:
     """Worker that plays the tasks one after the other in this process."""
+
+    slots = 1
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         for task in tasks:
@@ -109,7 +115,8 @@ class _Executors(ABC):
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         busy: dict[Future[Result], tuple[int, Task, int]] = {}
         try:
-            free = list(range(self._start()))
+            self._start()
+            free = list(range(self.slots))
             while True:
                 while free and (task := next(tasks, None)) is not None:
                     slot = free.pop()
@@ -130,9 +137,14 @@ class _Executors(ABC):
         finally:
             self._end()
 
+    @property
     @abstractmethod
-    def _start(self) -> int:
-        """Prepare for the first task; return the number of slots, which are the tasks in flight."""
+    def slots(self) -> int:
+        """Number of tasks that can be in flight."""
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Prepare for the first task."""
 
     @abstractmethod
     def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:
@@ -154,10 +166,13 @@ class Processes(_Executors):
         self._count = count
         self._pools: list[ProcessPoolExecutor] = []
 
-    def _start(self) -> int:
+    @property
+    def slots(self) -> int:
+        return self._count
+
+    def _start(self) -> None:
         prepare()
         self._pools = [_pool() for _ in range(self._count)]
-        return self._count
 
     def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:
         try:
@@ -203,12 +218,15 @@ class Dask(_Executors):
         except (OSError, CancelledError) as error:  # Dask cancels the futures of a client that has lost its scheduler
             raise WorkerError(f"--cluster {self._address}: the connection to the scheduler is lost") from error
 
-    def _start(self) -> int:
-        slots: int = sum(self._client.nthreads().values()) * _IN_HAND
-        if not slots:
+    @property
+    def slots(self) -> int:
+        threads: int = sum(self._client.nthreads().values())
+        return threads * _IN_HAND
+
+    def _start(self) -> None:
+        if not self.slots:
             raise WorkerError(f"--cluster {self._address}: the scheduler has no workers")
         self._executor = self._client.get_executor(pure=False)
-        return slots
 
     def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:  # noqa: ARG002
         future: Future[Result] = self._executor.submit(work, task)
