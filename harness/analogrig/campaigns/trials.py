@@ -46,6 +46,8 @@ _TYPES = {
 
 _COUNTS = ("outcome", "samples", "armed", "false_alarms", "theta")
 
+_PER_CHANGE = ("change", "latency_n", "bound_n")
+
 COLUMNS = (*_TYPES, "why")
 """Names of all columns, in the order of ``Trials.encode``."""
 
@@ -116,6 +118,28 @@ class Trials:
 
     def __getitem__(self, part: slice) -> Trials:
         return Trials(**{field.name: getattr(self, field.name)[part] for field in dataclasses.fields(self)})
+
+    def at(self, places: NDArray[np.int64]) -> Trials:
+        """Trials at these places, without their reasons."""
+        numbers = {name: getattr(self, name)[places] for name in _TYPES}
+        return Trials(**numbers, why=("",) * len(places))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Trials]) -> Trials:
+        """Trials of all parts, in order; the ends of shorter lists of changes are filled as changes that never came."""
+        if not parts:
+            return cls.of([])
+        width = max(part.change.shape[1] for part in parts)
+        found = {}
+        for name in _TYPES:
+            columns = [getattr(part, name) for part in parts]
+            if name in _PER_CHANGE:
+                fill = 0 if name == "change" else _NONE
+                columns = [
+                    np.pad(each, ((0, 0), (0, width - each.shape[1])), constant_values=fill) for each in columns
+                ]
+            found[name] = np.concatenate(columns)
+        return cls(**found, why=tuple(text for part in parts for text in part.why))
 
     def encode(self) -> tuple[bytes, ...]:
         """Columns as zlib streams of little-endian numbers, row by row, in the order of COLUMNS.
