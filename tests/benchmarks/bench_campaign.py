@@ -31,6 +31,7 @@ from analogrig.campaigns.tally import Task
 from analogrig.campaigns.trials import Trials
 from analogrig.campaigns.workers import ThisProcess
 from analogrig.reporting.campaign import write_json, write_page
+from tests import tools
 
 from .figure import Figure
 
@@ -178,14 +179,15 @@ def _sizes(of: str, out: Path) -> Iterator[Figure]:
 def _opened_s(page: Path) -> float:
     from playwright.sync_api import sync_playwright
 
-    from tests.browser import launched
-
-    with sync_playwright() as playwright, contextlib.closing(launched(playwright)) as browser:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=tools.found("chromium"), args=["--no-sandbox"])
         shown = browser.new_page()
         start_s = time.perf_counter()
         shown.goto(page.absolute().as_uri())
         shown.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        return time.perf_counter() - start_s
+        opened_s = time.perf_counter() - start_s
+        browser.close()
+        return opened_s
 
 
 def _compared(of: str, a: Path, b: Path) -> Iterator[Figure]:

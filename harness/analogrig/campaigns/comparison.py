@@ -257,7 +257,14 @@ def sign_flip_p(differences: NDArray[np.float64]) -> float:
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=len(moved))))
         return float(np.mean(_are_as_extreme(signs @ moved, moved.sum())))
     rng = np.random.default_rng(0)
-    return _resampled_p(moved.sum(), lambda k: (2.0 * rng.integers(0, 2, (k, len(moved))) - 1.0) @ moved)
+    row_bytes = -(-len(moved) // 8)
+
+    def draw(k: int) -> NDArray[np.float64]:
+        signs = np.frombuffer(rng.bytes(k * row_bytes), np.uint8).reshape(k, row_bytes)
+        are_kept = np.unpackbits(signs, axis=1, count=len(moved)).astype(np.float64)
+        return np.asarray(2.0 * (are_kept @ moved) - moved.sum())
+
+    return _resampled_p(moved.sum(), draw)
 
 
 def permutation_p(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
