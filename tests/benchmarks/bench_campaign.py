@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import sqlite3
 import subprocess
 import sys
@@ -92,11 +91,13 @@ def _stored(folder: Path, trials: int) -> Iterator[Figure]:
         plan = Plan.of(CampaignSpec.load(str(_spec(folder, f"stored-{name}", trials))))
         files.append(folder / f"{name}.sqlite")
         start_s = time.process_time()
-        results = conduct(plan, _Copier(plan, number), files[-1])
+        results = conduct(plan, _Copier(plan, number), files[-1])  # type: ignore[arg-type]  # narrower
         write_json(results, files[-1].with_suffix(".json"))
         write_page(results, files[-1].with_suffix(".html"))
         if not number:
-            yield Figure(f"{of}: CPU time, copying included", 1e6 * (time.process_time() - start_s) / trials, "us a trial")
+            yield Figure(
+                f"{of}: CPU time, copying included", 1e6 * (time.process_time() - start_s) / trials, "us a trial"
+            )
     yield from _sizes(of, files[0])
     spec = str(folder / "stored-a.toml")
     wall_s, _, memory_mb = _measured("campaign", spec, "--out", str(files[0]))
@@ -114,7 +115,9 @@ class _Copier(ThisProcess):
         self._played = [Trials.of(play_part(text, Part(cell, 0, COPIED))) for cell in range(plan.size)]
 
     def play(  # type: ignore[override]  # narrower than the protocol
-        self, work: Callable[[Task], Played], tasks: Iterator[Task]  # noqa: ARG002
+        self,
+        work: Callable[[Task], Played],
+        tasks: Iterator[Task],
     ) -> Iterator[tuple[Task, Played]]:
         for task in tasks:
             parts = [(part, self._copy(part).encode()) for part in task]
@@ -140,17 +143,36 @@ def _spec(folder: Path, name: str, trials: int) -> Path:
 def _measured(*command: str) -> tuple[float, float, float]:
     """Time on the wall, CPU time and largest memory in MB of a command and its workers."""
     start_s = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "analogrig.cli", *command], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 1):
-        raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}")
-    return time.perf_counter() - start_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0
+    # A process starts with the memory of its parent: a small one stands between this one and the command.
+    words = [sys.executable, "-S", "-c", _LAUNCHER, sys.executable, "-m", "analogrig.cli", *command]
+    told = subprocess.run(words, stdout=subprocess.PIPE, check=True, text=True).stdout
+    status, cpu_s, memory_kb = json.loads(told.splitlines()[-1])
+    if status not in (0, 1):
+        raise RuntimeError(f"{' '.join(command)} ended with {status}")
+    return time.perf_counter() - start_s, cpu_s, memory_kb / 1024.0
+
+
+_LAUNCHER = """
+import resource, subprocess, sys
+status = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+print([status, usage.ru_utime + usage.ru_stime, usage.ru_maxrss])
+"""
 
 
 def _kill_on_the_way(spec: Path, out: Path, trials: int) -> int:
     """Kill the command KILLS times, each time after another share of the trials; return the number of kills."""
-    command = [sys.executable, "-m", "analogrig.cli", "campaign", str(spec), "--workers", str(WORKERS), "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "analogrig.cli",
+        "campaign",
+        str(spec),
+        "--workers",
+        str(WORKERS),
+        "--out",
+        str(out),
+    ]
     kills = 0
     for share in range(1, KILLS + 1):
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:

@@ -122,7 +122,10 @@ def test_plan_reads_the_same_after_a_journey_as_text(tmp_path: Path) -> None:
 
 def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
     spec = "trials = 1\nsamples = 400\ndevices = {}\n"
-    rows = [play_part(planned(tmp_path, spec.format(names)).as_json(), Part(0, 0, 1)) for names in ('["inproc"]', '["host"]')]
+    rows = [
+        play_part(planned(tmp_path, spec.format(names)).as_json(), Part(0, 0, 1))
+        for names in ('["inproc"]', '["host"]')
+    ]
     close_devices()
     assert rows[0] == rows[1]
 
@@ -185,7 +188,7 @@ class Backwards(ThisProcess):
 
 
 def test_order_in_which_parts_come_changes_nothing(tmp_path: Path, reference: Path) -> None:
-    conduct(planned(tmp_path), Backwards(), tmp_path / "back.sqlite")
+    conduct(planned(tmp_path), Backwards(), tmp_path / "back.sqlite")  # type: ignore[arg-type]  # narrower
     assert exported(tmp_path / "back.sqlite") == exported(reference)
 
 
@@ -421,7 +424,7 @@ def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None
     assert quick.missed == 0
     assert quick.miss_rate[1] < 0.5
     assert quick.trials < 20
-    again = conduct(plan, Backwards(), tmp_path / "b.sqlite")
+    again = conduct(plan, Backwards(), tmp_path / "b.sqlite")  # type: ignore[arg-type]  # narrower
     assert exported(again) == exported(results) == exported(tmp_path / "a.sqlite") == exported(tmp_path / "b.sqlite")
     assert len(columns_of(tmp_path / "b.sqlite")[0]) == quick.trials
 
@@ -459,7 +462,7 @@ class Nobody(ThisProcess):
 
 def test_results_that_are_there_are_not_played_again(tmp_path: Path, reference: Path) -> None:
     before = reference.read_bytes()
-    again = conduct(planned(tmp_path), Nobody(), reference)
+    again = conduct(planned(tmp_path), Nobody(), reference)  # type: ignore[arg-type]
     assert exported(again) == exported(reference)
     assert reference.read_bytes() == before
 
@@ -473,7 +476,9 @@ def test_another_campaign_is_not_overwritten(tmp_path: Path, has_ended: bool) ->
     else:
         Store.write(out, plan).close()
     before = out.read_bytes()
-    with pytest.raises(ConfigurationError, match=r"out\.sqlite: holds another campaign \(spec\.chunk is 2 there and 3 here"):
+    with pytest.raises(
+        ConfigurationError, match=r"out\.sqlite: holds another campaign \(spec\.chunk is 2 there and 3 here"
+    ):
         conduct(planned(tmp_path, SPEC.replace("chunk = 2", "chunk = 3")), ThisProcess(), out)
     assert out.read_bytes() == before
 
@@ -499,7 +504,7 @@ DAMAGES: dict[str, str | bytes] = {
     "a bomb": f"UPDATE trials SET armed = x'{zlib.compress(bytes(40_000_000)).hex()}'",
     "more armed than played": "UPDATE trials SET armed = (SELECT theta FROM trials LIMIT 1)",
     "a count": "UPDATE trials SET count = 1000000000",
-    "a place": "UPDATE trials SET first = first + 1",
+    "a place": "UPDATE trials SET first = first + 100",
     "a negative place": "UPDATE trials SET first = -first - 1",
     "no trials": "DELETE FROM trials",
     "no plan": "DELETE FROM campaign",
@@ -530,10 +535,11 @@ def test_damaged_results_are_one_line(
     with pytest.raises(RecordingError, match=r"damaged\.sqlite: ") as error:
         Results.load(path)
     assert "\n" not in str(error.value)
-    assert main(["compare", str(path), str(path)]) == 2
-    said = capsys.readouterr().err
-    assert "damaged.sqlite: " in said
-    assert said.count("\n") == 1
+    if damage != "a command":  # of which a comparison asks nothing
+        assert main(["compare", str(path), str(path)]) == 2
+        said = capsys.readouterr().err
+        assert "damaged.sqlite: " in said
+        assert said.count("\n") == 1
 
 
 def trial(
@@ -587,7 +593,7 @@ def test_command_says_what_came_out_and_writes_the_page(
     assert [cell["stiffness_factor"] for cell in said["cells"]] == ["0.8", "0.9"]
     assert exported(out) == exported(reference)
     before = Path(said["files"]["results"]).read_bytes()
-    assert json.loads(before) == as_json(Results.load(reference)) | {"cells": json.loads(before)["cells"]}
+    assert json.loads(before) == json.loads(exported(reference))
     assert Path(said["files"]["page"]).read_text().startswith("<!doctype html>")
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 0
     assert Path(said["files"]["results"]).read_bytes() == before
@@ -745,7 +751,7 @@ def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Pa
     """A limit on the size of files stands for a disk that is full."""
     planned(tmp_path)
     out = tmp_path / "out.sqlite"
-    limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (9_000, 9_000))"
+    limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (7_500, 7_500))"
     limited = [sys.executable, "-c", f"{limit}; os.execv(sys.argv[1], sys.argv[1:])"]
     command = [*limited, sys.executable, "-m", "analogrig.cli", "campaign", str(tmp_path / "spec.toml")]
     command += ["--out", str(out), "--workers", "1"]
@@ -763,7 +769,8 @@ def test_campaign_that_another_process_has_ended_meanwhile_is_not_played_again(
     out = tmp_path / "out.sqlite"
     out.write_bytes(reference.read_bytes())
     monkeypatch.setattr("analogrig.campaigns.conduct.ended_results", lambda *_: None)
-    assert exported(conduct(planned(tmp_path), Nobody(), out)) == exported(reference)
+    results = conduct(planned(tmp_path), Nobody(), out)  # type: ignore[arg-type]
+    assert exported(results) == exported(reference)
 
 
 def test_trial_that_the_user_interrupts_on_a_line_is_no_result(

@@ -24,7 +24,7 @@ from analogrig.campaigns.store import Store
 from analogrig.campaigns.workers import Processes
 from analogrig.catalogue import Change
 from analogrig.cli import main
-from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.errors import ConfigurationError
 from analogrig.recordings.files import CapturedFrames
 from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, counter_text, number_of, one_line

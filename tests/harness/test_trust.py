@@ -19,8 +19,8 @@ import select
 import shlex
 import shutil
 import socket
-import struct
 import sqlite3
+import struct
 import subprocess
 import sys
 import tomllib
@@ -695,9 +695,7 @@ def test_worker_plays_on_the_rig_that_was_checked_whatever_its_file_says_by_then
         assert rig.description()["instrument"] == f"redpitaya://{checked.allow}"
 
 
-def test_store_of_a_campaign_opens_nothing(
-    folder: Path, library: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_store_of_a_campaign_opens_nothing(folder: Path, library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bait = a_library(folder, monkeypatch, library)
     argv = campaign_of(bait, "inproc")
     assert main(argv) == 0

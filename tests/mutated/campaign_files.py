@@ -38,7 +38,14 @@ def _column(file: sqlite3.Connection, rng: random.Random) -> str:
     names = [row[1] for row in file.execute("PRAGMA table_info(trials)")][2:]
     name = rng.choice(names)
     raw = bytearray(zlib.decompress(file.execute(f"SELECT {name} FROM trials").fetchone()[0]))
-    values: tuple[object, ...] = (None, "x", 1e308, b"", zlib.compress(bytes(50_000_000)), zlib.compress(rng.randbytes(len(raw))))
+    values: tuple[object, ...] = (
+        None,
+        "x",
+        1e308,
+        b"",
+        zlib.compress(bytes(50_000_000)),
+        zlib.compress(rng.randbytes(len(raw))),
+    )
     value = rng.choice(values)
     with contextlib.suppress(sqlite3.IntegrityError):  # a column refuses NULL
         file.execute(f"UPDATE trials SET {name} = ?", (value,))

@@ -51,7 +51,9 @@ class Seeds:
             logs[suffix] = (folder / suffix / f"can.{suffix}").read_bytes()
         logs["trc"] = _as_trc(folder / "log" / "can.log")
         ended, open_store = _campaign(folder)
-        return cls((run, recordings.with_header(run, _of_a_real_rig), *whole), logs, DBC.read_bytes(), ended, open_store)
+        return cls(
+            (run, recordings.with_header(run, _of_a_real_rig), *whole), logs, DBC.read_bytes(), ended, open_store
+        )
 
 
 def _play(*argv: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import analogrig
@@ -16,6 +17,7 @@ from analogrig.devices.description import DeviceDescription
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 from analogrig.identity import version
+from analogrig.storage import replace_file
 
 DIGITS = 16
 """Hex digits of a SHA-256 that identify a build."""
@@ -25,12 +27,15 @@ _PACKAGES = tuple(Path(str(package.__file__)).parent for package in (analogrig_e
 
 @functools.cache
 def of_analogrig() -> str:
-    """Version of analogrig and, after a space, the hash of all files that decide what is played."""
-    sources = sorted(path for folder in _PACKAGES for kind in ("py", "so") for path in folder.rglob(f"*.{kind}"))
+    """Version of analogrig, the hash of all files that decide what is played, and that of its Python alone."""
+    return f"{version()} {_hash_of('py', 'so')} {_hash_of('py')}"
+
+
+def _hash_of(*kinds: str) -> str:
     whole = hashlib.sha256()
-    for path in sources:
+    for path in sorted(path for folder in _PACKAGES for kind in kinds for path in folder.rglob(f"*.{kind}")):
         whole.update(path.read_bytes())
-    return f"{version()} {whole.hexdigest()[:DIGITS]}"
+    return whole.hexdigest()[:DIGITS]
 
 
 def of_device(device: DeviceDescription) -> str:
@@ -47,15 +52,45 @@ def of_device(device: DeviceDescription) -> str:
 
 
 def check_analogrig(planned: str) -> None:
-    """Check that this analogrig has the version of the one that began the campaign.
+    """Check that this analogrig has the version and the Python of the one that began the campaign.
 
     The compilers may differ: the estimates are the same bits.
 
-    :raises ConfigurationError: it has another.
+    :raises ConfigurationError: it has others.
     """
-    begun_by = planned.partition(" ")[0]
+    begun_by, *_, sources = planned.split()
     if version() != begun_by:
         raise ConfigurationError(f"this worker has analogrig {version()}, the campaign was begun by {begun_by}")
+    here = of_analogrig().split()[-1]
+    if here != sources:
+        raise ConfigurationError(
+            f"this worker has analogrig {version()} with the sources {here}, the campaign was begun by {sources}:"
+            " install the same build"
+        )
+
+
+_supplied: dict[str, Path] = {}
+"""Files of devices that came with a campaign from another machine, by their hash."""
+
+
+def supply(files: Mapping[str, bytes], folder: Path) -> None:
+    """Keep files of devices in a folder of this worker; each is used only where its hash is the planned one."""
+    for digest, content in files.items():
+        if hashlib.sha256(content).hexdigest()[:DIGITS] == digest:
+            path = folder / f"analogrig-{digest}"
+            with replace_file(path) as file:
+                file.write(content)
+            path.chmod(0o700)
+            _supplied[digest] = path
+
+
+def supplied(device: DeviceDescription, planned: str) -> Path | None:
+    """File that came with the campaign for a device whose own file is absent here, or another."""
+    if device.program is None or planned not in _supplied:
+        return None
+    if device.program.is_file() and of_device(device) == planned:
+        return None
+    return _supplied[planned]
 
 
 def check_device(device: DeviceDescription, planned: str) -> None:

@@ -4,8 +4,10 @@ The unit is the seed: with one seed both sides, and all cells of a campaign, saw
 quantity is reduced to one number a seed: its mean over all trials with that seed. Differences at common seeds are
 tested by a sign-flip permutation test, which is exact for any distribution. Beyond MOST_UNITS seeds, neighbours flip
 together: a subgroup of the sign flips, for which the test is exact as well. Sides without a common seed are tested by
-permuting the seeds between them. Campaigns are read part by part, some SEEDS_AT_ONCE seeds of all cells at a time. The p-values of all quantities are adjusted together (Holm 1979), so that the
+permuting the seeds between them. The p-values of all quantities are adjusted together (Holm 1979), so that the
 family-wise error rate is at most ``alpha``.
+
+Campaigns are read from their stores some seeds at a time, for all cells.
 """
 
 from __future__ import annotations
@@ -193,7 +195,7 @@ class Pairing:
 def _by_place(places: NDArray[np.int64], values: Values) -> NDArray[np.float64]:
     """Mean of the values at each place; NaN where there are none."""
     sums, counts = (np.bincount(places, each) for each in (values.sums, values.counts))
-    return np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+    return np.asarray(np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0))
 
 
 def _latencies(trials: Trials, other: Trials | None) -> Values:
@@ -244,8 +246,9 @@ def _unpaired(measure: Measure, a: Mapping[Any, Row], b: Mapping[Any, Row]) -> D
     if not (len(x) and len(y)):
         return None
     p = permutation_p(x, y)
-    means = float(x.mean()), float(y.mean())
-    return Difference(measure.name, measure.unit, *means, len(x), UNPAIRED, p, p, NO_DIFFERENCE)
+    return Difference(
+        measure.name, measure.unit, float(x.mean()), float(y.mean()), len(x), UNPAIRED, p, p, NO_DIFFERENCE
+    )
 
 
 def sign_flip_p(differences: NDArray[np.float64]) -> float:
@@ -386,7 +389,11 @@ def _compare_campaigns(a: Campaign, b: Campaign, alpha: float) -> Comparison:
             raise RecordingError(f"{side.path}: holds no valid trial")
     counts = (valid.tolist(), played.tolist())
     return _comparison(
-        pairing.differences(), alpha, (counts[0][0], counts[0][1]), (counts[1][0], counts[1][1]), (pairing.identical, common)
+        pairing.differences(),
+        alpha,
+        (counts[0][0], counts[0][1]),
+        (counts[1][0], counts[1][1]),
+        (pairing.identical, common),
     )
 
 

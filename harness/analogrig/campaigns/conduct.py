@@ -12,20 +12,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from analogrig.campaigns.plan import Plan, device_of
+from analogrig.campaigns.plan import Plan, device_files, device_of
 from analogrig.campaigns.plays import Played, close_devices, play_task
 from analogrig.campaigns.results import Results, load_ended, tally_of
 from analogrig.campaigns.store import NotAStoreError, Store
 from analogrig.campaigns.tally import Tally, Task, Tasks
 from analogrig.campaigns.trials import COLUMNS, Trials
-from analogrig.campaigns.workers import Workers
+from analogrig.campaigns.workers import CampaignWorkers
 from analogrig.errors import ConfigurationError, DeviceError, LinkError
 from analogrig.identity import Identity
 
 
 def conduct(
     plan: Plan,
-    workers: Workers,
+    workers: CampaignWorkers,
     out: Path,
     progress: Callable[[Tally], None] | None = None,
     command: Identity | None = None,
@@ -76,8 +76,9 @@ def ended_results(plan: Plan, out: Path) -> Results | None:
     return results
 
 
-def _play(plan: Plan, workers: Workers, store: Store, tally: Tally) -> Iterator[int]:
+def _play(plan: Plan, workers: CampaignWorkers, store: Store, tally: Tally) -> Iterator[int]:
     """Play what is left; yield the number of trials of each task that has been stored and counted."""
+    workers.supply(device_files(plan.devices))
     tasks, axes = Tasks(plan, tally, workers.slots), len(plan.spec.draw.axes())
     work: Callable[[Task], Played] = functools.partial(play_task, plan.as_json())
     for _, played in workers.play(work, iter(tasks)):

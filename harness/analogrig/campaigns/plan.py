@@ -13,6 +13,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from analogrig import config
 from analogrig.campaigns import builds
 from analogrig.campaigns.spec import MAX_CELLS, MAX_TRIALS, CampaignSpec
 from analogrig.devices.description import DeviceDescription
+from analogrig.devices.library import LIBRARY
 from analogrig.devices.registry import from_table, trusted
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import from_table as rig_of
@@ -253,8 +255,25 @@ def device_of(table: Mapping[str, Any]) -> DeviceDescription:
     described = {key: value for key, value in table.items() if key != "build"}
     device = from_table(described, f"device {table['name']}")
     if "build" in table:
+        if (file := builds.supplied(device, table["build"])) is not None:
+            placed = {key: str(file) if _is_path(value, device.program) else value for key, value in described.items()}
+            device = from_table(placed, f"device {table['name']}")
         builds.check_device(device, table["build"])
     return device
+
+
+def _is_path(value: Any, path: Path | None) -> bool:
+    return isinstance(value, str) and path is not None and bool(value) and Path(value).absolute() == path
+
+
+def device_files(devices: Iterable[Mapping[str, Any]]) -> dict[str, bytes]:
+    """Contents of the files that devices run, by their hash, without those that analogrig brings."""
+    found = {}
+    for table in devices:
+        program = device_of(table).program
+        if program is not None and not program.is_relative_to(LIBRARY.parent):
+            found[str(table["build"])] = program.read_bytes()
+    return found
 
 
 def one_worker_only(rigs: Iterable[Mapping[str, Any]], devices: Iterable[Mapping[str, Any]]) -> str:

@@ -140,9 +140,7 @@ def play_part(plan: str, part: Part) -> list[Row]:
         try:
             rows.append(_play_trial(planned, cells[part.cell], seed))
         except ConfigurationError as error:
-            raise ConfigurationError(
-                f"campaign {planned.spec.name}, cell {part.cell}, seed {seed}: {error}"
-            ) from error
+            raise ConfigurationError(f"campaign {planned.spec.name}, cell {part.cell}, seed {seed}: {error}") from error
     return rows
 
 

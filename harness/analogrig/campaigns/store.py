@@ -70,9 +70,7 @@ class Store:
                 self._file.execute("PRAGMA trusted_schema = OFF")
                 self._file.execute("PRAGMA cell_size_check = ON")
                 self._file.execute(f"PRAGMA locking_mode = {'NORMAL' if is_read_only else 'EXCLUSIVE'}")
-                found = dict(self._file.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall())
-                if found != _SCHEMA:
-                    raise RecordingError(f"{path}: damaged results of a campaign (other tables)")
+                self._check_schema()
                 self.plan_text = self._read_plan()
         except BaseException:
             self._file.close()
@@ -133,10 +131,11 @@ class Store:
 
     def commands(self) -> tuple[Identity, ...]:
         """Commands that have played a part, in order."""
-        query = f"SELECT identity FROM commands ORDER BY number LIMIT {_MOST_COMMANDS}"
+        query = "SELECT identity FROM commands ORDER BY number LIMIT ?"
         with self._wrapped(), self._checked():
             return tuple(
-                config.build(Identity, json.loads(text), str(self.path)) for (text,) in self._file.execute(query)
+                config.build(Identity, json.loads(text), str(self.path))
+                for (text,) in self._file.execute(query, (_MOST_COMMANDS,))
             )
 
     def add_command(self, identity: Identity) -> None:
@@ -164,6 +163,8 @@ class Store:
                 self._file.execute("INSERT INTO cells VALUES (?, ?)", (cell, json.dumps(summary, sort_keys=True)))
         with self._wrapped():
             self._file.execute("PRAGMA journal_mode = DELETE")
+        with contextlib.suppress(OSError):  # a reader may have left it; without a log it means nothing
+            self.path.with_name(f"{self.path.name}-shm").unlink()
 
     def _cut(self, plan: Plan, cell: int, count: int) -> None:
         """Remove the trials of a cell beyond the first ``count``."""
@@ -178,7 +179,7 @@ class Store:
     def _insert(self, plan: Plan, part: Part, columns: Sequence[bytes]) -> None:
         marks = ", ".join("?" * (2 + len(COLUMNS)))
         values = (part.cell * plan.spec.trials + part.first, part.count, *columns)
-        self._file.execute(f"INSERT INTO trials VALUES ({marks})", values)
+        self._file.execute(f"INSERT INTO trials VALUES ({marks})", values)  # noqa: S608 - question marks
 
     def parts(
         self, plan: Plan, numbers: range | None = None, columns: Sequence[str] = COLUMNS
@@ -191,7 +192,7 @@ class Store:
         """
         trials, size = plan.spec.trials, plan.size * plan.spec.trials
         wanted = numbers if numbers is not None else range(size)
-        query = f"SELECT first, count, {', '.join(columns)} FROM trials WHERE first > ? AND first < ? ORDER BY first"
+        query = f"SELECT first, count, {', '.join(columns)} FROM trials WHERE first > ? AND first < ? ORDER BY first"  # noqa: S608 - names of COLUMNS
         end = -1
         with self._wrapped(), self._checked():
             for first, count, *values in self._file.execute(query, (wanted.start - MOST_TRIALS, wanted.stop)):
@@ -207,6 +208,11 @@ class Store:
                     found = dict(zip(columns, values, strict=True))
                     axes = len(plan.spec.draw.axes())
                     yield Part(cell, place, count), Trials.decode(count, found, axes)
+
+    def _check_schema(self) -> None:
+        found = dict(self._file.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall())
+        if found != _SCHEMA:
+            raise RecordingError(f"{self.path}: damaged results of a campaign (other tables)")
 
     def _read_plan(self) -> str:
         rows = self._file.execute("SELECT plan FROM campaign LIMIT 2").fetchall()

@@ -264,8 +264,8 @@ class Distribution:
         sound = trials.is_valid
         error = trials.error[sound & ~np.isnan(trials.error[:, 0])].astype(np.float64)
         place = np.clip(np.floor(error / ERROR_STEP) + ERROR_BINS // 2 + 1, 0, ERROR_BINS + 1).astype(np.int64)
-        for counts, places in zip(self.errors, place.T, strict=True):
-            counts += np.bincount(places, minlength=ERROR_BINS + 2)
+        for i, places in enumerate(place.T):
+            self.errors[i] += np.bincount(places, minlength=ERROR_BINS + 2)
         if self.axes:
             self._add_drawn(trials, sound)
 

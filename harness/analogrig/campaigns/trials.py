@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,9 +136,7 @@ class Trials:
             columns = [getattr(part, name) for part in parts]
             if name in _PER_CHANGE:
                 fill = 0 if name == "change" else _NONE
-                columns = [
-                    np.pad(each, ((0, 0), (0, width - each.shape[1])), constant_values=fill) for each in columns
-                ]
+                columns = [np.pad(each, ((0, 0), (0, width - each.shape[1])), constant_values=fill) for each in columns]
             found[name] = np.concatenate(columns)
         return cls(**found, why=tuple(text for part in parts for text in part.why))
 
@@ -178,31 +177,33 @@ class Trials:
         trials._check(count, columns.keys(), axes)
         return trials
 
-    def _check(self, count: int, names: object, axes: int) -> None:
+    def _check(self, count: int, names: Collection[str], axes: int) -> None:
         """:raises ValueError: the values are impossible."""
-        n = {len(getattr(self, name)) for name in _TYPES}
-        if n != {count}:
+        if {len(getattr(self, name)) for name in _TYPES} != {count}:
             raise ValueError("columns of different lengths")
         if self.outcome.max(initial=0) > INCONCLUSIVE:
             raise ValueError("a trial without an outcome")
-        if names >= {"samples", "armed", "false_alarms"} and not (
-            (self.false_alarms <= self.armed) & (self.armed <= self.samples) & (self.samples <= MAX_SAMPLES)
-        ).all():
+        rising = [getattr(self, name) for name in ("false_alarms", "armed", "samples") if name in names]
+        if any((low > high).any() for low, high in itertools.pairwise([*rising, np.uint32(MAX_SAMPLES)])):
             raise ValueError("counts that cannot be")
-        if names >= {"change", "latency_n", "bound_n"}:
-            if not self.change.shape == self.latency_n.shape == self.bound_n.shape:
-                raise ValueError("columns of different lengths")
-            if (self.change > (EXISTS | MISSED | LATE)).any():
-                raise ValueError("a change without a result")
-            for times in (self.latency_n, self.bound_n):
-                if ((times < _NONE) | (times > MAX_SAMPLES)).any():
-                    raise ValueError("a time that cannot be")
+        if "change" in names:
+            self._check_changes()
         if "error" in names and self.error.shape != (count, len(PARAMETERS)):
             raise ValueError(f"errors that are not {len(PARAMETERS)}")
         if np.isinf(self.error).any():
             raise ValueError("an infinite error")
         if "drawn" in names and (self.drawn.shape[1] != axes or not np.isfinite(self.drawn).all()):
             raise ValueError("drawn values of another campaign")
+
+    def _check_changes(self) -> None:
+        """:raises ValueError: the values are impossible."""
+        if not self.change.shape == self.latency_n.shape == self.bound_n.shape:
+            raise ValueError("columns of different lengths")
+        if (self.change > (EXISTS | MISSED | LATE)).any():
+            raise ValueError("a change without a result")
+        for times in (self.latency_n, self.bound_n):
+            if ((times < _NONE) | (times > MAX_SAMPLES)).any():
+                raise ValueError("a time that cannot be")
 
 
 def _inflate(stream: bytes) -> bytes:

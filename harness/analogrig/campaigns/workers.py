@@ -16,10 +16,11 @@ import resource
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, forkserver, resource_tracker
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from analogrig.errors import ConfigurationError, WorkerError
@@ -83,10 +84,6 @@ def _check_descriptors(workers: int) -> None:
 class Workers(Protocol):
     """Interface of all workers: play tasks."""
 
-    @property
-    def slots(self) -> int:
-        """Number of tasks that can be in flight."""
-
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         """Yield each task with its result. A task is taken only when a worker can start it.
 
@@ -94,10 +91,24 @@ class Workers(Protocol):
         """
 
 
+class CampaignWorkers(Workers, Protocol):
+    """Workers that a campaign can use."""
+
+    @property
+    def slots(self) -> int:
+        """Number of tasks that can be in flight."""
+
+    def supply(self, files: Mapping[str, bytes]) -> None:
+        """Bring the files that devices run to workers on other machines; ``files``: contents by hash."""
+
+
 class ThisProcess:
     """Worker that plays the tasks one after the other in this process."""
 
     slots = 1
+
+    def supply(self, files: Mapping[str, bytes]) -> None:
+        """Files are where they are."""
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         for task in tasks:
@@ -111,6 +122,9 @@ class _Executors(ABC):
     """Error of a task whose worker has died."""
     _most_deaths = MOST_DEATHS
     _complaint = f"{number_of(MOST_DEATHS, 'worker')} died over it, one after the other"
+
+    def supply(self, files: Mapping[str, bytes]) -> None:  # noqa: B027 - workers of this machine need nothing
+        """Bring the files that devices run to workers on other machines."""
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         busy: dict[Future[Result], tuple[int, Task, int]] = {}
@@ -190,6 +204,18 @@ class Processes(_Executors):
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+class _Setup:
+    """Start of a worker of a cluster, also of one that joins later: it keeps the files of the campaign's devices."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = dict(files)
+
+    def __call__(self, worker: Any) -> None:
+        from analogrig.campaigns.builds import supply
+
+        supply(self._files, Path(worker.local_directory))
+
+
 class Dask(_Executors):
     """Workers of a Dask cluster, by the address of its scheduler, such as ``tcp://host:8786``."""
 
@@ -211,6 +237,16 @@ class Dask(_Executors):
             self._client = dask.Client(address, timeout=_ANSWER_S)
         except (OSError, ValueError) as error:
             raise WorkerError(f"--cluster {address}: no scheduler answers ({error})") from error
+
+    def supply(self, files: Mapping[str, bytes]) -> None:
+        if files:
+            plugin: Any = type(
+                "Files", (importlib.import_module("distributed").WorkerPlugin,), {"setup": _Setup(files)}
+            )
+            try:
+                self._client.register_plugin(plugin(), name="analogrig-files")
+            except (OSError, CancelledError) as error:
+                raise WorkerError(f"--cluster {self._address}: the connection to the scheduler is lost") from error
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         try:

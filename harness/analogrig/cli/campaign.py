@@ -13,9 +13,9 @@ from analogrig.cli.options import CAMPAIGN, FILE, add_allow, add_command, add_js
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, open_progress_line, show, show_result
 
 if TYPE_CHECKING:
-    from analogrig.campaigns.tally import Tally
     from analogrig.campaigns.plan import Plan
-    from analogrig.campaigns.workers import Workers
+    from analogrig.campaigns.tally import Tally
+    from analogrig.campaigns.workers import CampaignWorkers
 
 
 MOST_WORKERS = 16
@@ -109,7 +109,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[Workers]:
+def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[CampaignWorkers]:
     """Workers that the command line asks for, by default at most as many as are useful.
 
     ``alone``: a device that cannot be shared, or "".

@@ -267,14 +267,15 @@ def _drawn_maps(results: Results) -> str:
     across, down = (*found.axes, "")[:2]
     names = [*names, [""]][:2]
     maps = []
-    for quantity, sums, counts in zip(MAPPED, (found.latency_n, found.missed), (found.detected, found.visible), strict=True):
-        ratios = dict(
-            zip(
-                itertools.product(*names),
-                (total / count if count else None for total, count in zip(sums.flat, counts.flat, strict=True)),
-                strict=True,
+    for quantity, sums, counts in zip(
+        MAPPED, (found.latency_n, found.missed), (found.detected, found.visible), strict=True
+    ):
+        ratios = {
+            (name, other): total / count if count else None
+            for (name, other), total, count in zip(
+                itertools.product(*names), sums.ravel().tolist(), counts.ravel().tolist(), strict=True
             )
-        )
+        }
         maps.append(_map(quantity, ratios, (across, down), "drawn values, middle of each bin"))
     return (
         '<section aria-labelledby="drawn"><h2 id="drawn">Drawn values</h2>'
@@ -320,7 +321,7 @@ def _histogram(title: str, counts: Sequence[int], ends: tuple[str, str]) -> str:
         f'<figure><figcaption>{caption}</figcaption><svg role="img" aria-label="{caption}"'
         f' width="{_BARS_WIDTH + 4}" height="{_BARS_HEIGHT + 20}" font-size="13">'
         f'<g fill="{_colour(1.0)}">{bars}</g>'
-        f'{_words(0, _BARS_HEIGHT + 15, ends[0], "start")}{_words(_BARS_WIDTH, _BARS_HEIGHT + 15, ends[1], "end")}'
+        f"{_words(0, _BARS_HEIGHT + 15, ends[0], 'start')}{_words(_BARS_WIDTH, _BARS_HEIGHT + 15, ends[1], 'end')}"
         "</svg></figure>"
     )
 
@@ -362,7 +363,7 @@ def _map(
         f'<figure><figcaption>{html.escape(caption)}</figcaption><div class="scroll">'
         f'<svg role="img" aria-label="{html.escape(caption)}"'
         f' width="{_LEFT + len(columns) * width + 2}" height="{_TOP + len(rows) * height + 2}" font-size="13">'
-        f'{"".join(parts)}</svg></div></figure>'
+        f"{''.join(parts)}</svg></div></figure>"
     )
 
 
