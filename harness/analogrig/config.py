@@ -216,7 +216,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
     :raises ConfigurationError: unknown or lacking key, wrong type, or a value that ``cls`` refuses by ValueError.
     """
-    fields, hints = _fields(cls)
+    fields, hints = _fields(typing.cast(Any, cls))
     for key in table:
         if key not in fields:
             raise ConfigurationError(f"{where}: unknown key {_quote(key)} (known: {', '.join(fields)})")

@@ -116,19 +116,19 @@ class _Copier(ThisProcess):
 
     def play(  # type: ignore[override]  # narrower than the protocol
         self,
-        work: Callable[[Task], Played],
+        work: Callable[[Task], Played],  # noqa: ARG002 - it copies instead
         tasks: Iterator[Task],
     ) -> Iterator[tuple[Task, Played]]:
         for task in tasks:
             parts = [(part, self._copy(part).encode()) for part in task]
-            yield task, Played(parts, 2e-3 * sum(part.count for part in task))
+            yield task, Played(parts, 2e-3 * sum(part.trials for part in task))
 
     def _copy(self, part: Part) -> Trials:
-        places = (part.first + np.arange(part.count)) % COPIED
+        places = (part.first + np.arange(part.trials)) % COPIED
         copied = self._played[part.cell].at(places)
         values = vars(copied) | {
             "error": copied.error * self._rng.normal(1.0, 0.1, copied.error.shape).astype(np.float32),
-            "theta": self._rng.integers(1, 2**63, part.count).astype(np.uint64),
+            "theta": self._rng.integers(1, 2**63, part.trials).astype(np.uint64),
             "why": tuple(self._played[part.cell].why[i] for i in places.tolist()),
         }
         return Trials(**values)

@@ -91,7 +91,7 @@ def columns_of(out: Path) -> dict[int, Trials]:
 def stored_trials(path: Path) -> int:
     """Number of trials that an unfinished store holds; 0 while its command has it."""
     with Store.read(path) as store:
-        return sum(part.count for part, _ in store.parts(store.plan()))
+        return sum(part.trials for part, _ in store.parts(store.plan()))
 
 
 # ------------------------------------------------------------------------------------------------------- what is played
@@ -236,14 +236,14 @@ def test_tasks_take_seconds_whatever_a_trial_takes(tmp_path: Path) -> None:
         next(given)
         tasks.note(10, 10 * trial_s)
         parts = next(given)
-        assert sum(part.count for part in parts) == max(1, min(int(TASK_S / trial_s), 20_000))
+        assert sum(part.trials for part in parts) == max(1, min(int(TASK_S / trial_s), 20_000))
 
 
 def test_tasks_cover_every_trial_once(tmp_path: Path) -> None:
     plan = planned(tmp_path, SPEC.replace("trials = 6", "trials = 1007"))
     tasks, seen = Tasks(plan, Tally(plan, no_part), slots=3), []
     for task in tasks:
-        seen += [(part.cell, part.first + i) for part in task for i in range(part.count)]
+        seen += [(part.cell, part.first + i) for part in task for i in range(part.trials)]
         tasks.note(1, 3e-3)
     assert sorted(seen) == [(cell, i) for cell in range(2) for i in range(1007)]
 
@@ -497,11 +497,11 @@ def test_trials_survive_their_encoding(tmp_path: Path) -> None:
         assert np.array_equal(getattr(again, name), getattr(trials, name), equal_nan=name == "error")
 
 
-DAMAGES: dict[str, str | bytes] = {
+DAMAGES: dict[str, str] = {
     "a text for a blob": "UPDATE trials SET theta = 'x'",
     "no zlib": "UPDATE trials SET theta = x'00'",
-    "an outcome": f"UPDATE trials SET outcome = x'{zlib.compress(bytes([9] * 6)).hex()}'",
-    "a bomb": f"UPDATE trials SET armed = x'{zlib.compress(bytes(40_000_000)).hex()}'",
+    "an outcome": f"UPDATE trials SET outcome = x'{zlib.compress(bytes([9] * 6)).hex()}'",  # noqa: S608
+    "a bomb": f"UPDATE trials SET armed = x'{zlib.compress(bytes(40_000_000)).hex()}'",  # noqa: S608
     "more armed than played": "UPDATE trials SET armed = (SELECT theta FROM trials LIMIT 1)",
     "a count": "UPDATE trials SET count = 1000000000",
     "a place": "UPDATE trials SET first = first + 100",
@@ -527,7 +527,7 @@ def test_damaged_results_are_one_line(
     path.write_bytes(whole)
     if damage in DAMAGES:
         with contextlib.closing(sqlite3.connect(path)) as file:
-            file.executescript(str(DAMAGES[damage]))
+            file.executescript(DAMAGES[damage])
             file.commit()
     else:
         changed = {"half": whole[: len(whole) // 2], "bytes": whole[:1024] + whole[5000:4000:-1] + whole[2048:]}
@@ -747,9 +747,9 @@ def test_file_of_somebody_else_in_the_place_of_results_or_page_is_left_alone(
     assert (tmp_path / standing).read_text() == "my own"
 
 
-def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Path) -> None:
+def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path) -> None:
     """A limit on the size of files stands for a disk that is full."""
-    planned(tmp_path)
+    plan = planned(tmp_path, SPEC.replace("trials = 6", "trials = 120"))
     out = tmp_path / "out.sqlite"
     limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (7_500, 7_500))"
     limited = [sys.executable, "-c", f"{limit}; os.execv(sys.argv[1], sys.argv[1:])"]
@@ -759,8 +759,9 @@ def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Pa
     assert ended.returncode == 2, ended
     assert ended.stderr.startswith(f"analogrig: {out}: ")
     assert ended.stderr.count("\n") == 1
-    conduct(planned(tmp_path), ThisProcess(), out)
-    assert exported(out) == exported(reference)
+    conduct(plan, ThisProcess(), out)
+    conduct(plan, ThisProcess(), tmp_path / "whole.sqlite")
+    assert exported(out) == exported(tmp_path / "whole.sqlite")
 
 
 def test_campaign_that_another_process_has_ended_meanwhile_is_not_played_again(

@@ -1,5 +1,7 @@
 """Stores of a campaign, forged: values and bytes that no campaign writes."""
 
+# ruff: noqa: S608 - the names are those of our own columns
+
 from __future__ import annotations
 
 import contextlib

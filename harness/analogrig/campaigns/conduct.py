@@ -86,8 +86,8 @@ def _play(plan: Plan, workers: CampaignWorkers, store: Store, tally: Tally) -> I
         count = 0
         for part, columns in played.parts:
             named: Any = dict(zip(COLUMNS, columns, strict=True))
-            tally.add(part, Trials.decode(part.count, named, axes))
-            count += part.count
+            tally.add(part, Trials.decode(part.trials, named, axes))
+            count += part.trials
         tasks.note(count, played.seconds)
         yield count
 

@@ -75,10 +75,11 @@ class Part(NamedTuple):
     cell: int
     first: int
     """Place of the first one in the cell, from 0 on."""
-    count: int
+    trials: int
+    """Number of trials."""
 
     def __str__(self) -> str:
-        return f"cell {self.cell}, trials {self.first} to {self.first + self.count - 1}"
+        return f"cell {self.cell}, trials {self.first} to {self.first + self.trials - 1}"
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class Plan:
 
     def seeds(self, part: Part) -> range:
         first = self.spec.first_seed + part.first
-        return range(first, first + part.count)
+        return range(first, first + part.trials)
 
     def draw(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""

@@ -174,11 +174,11 @@ class Store:
         end = begin + plan.spec.trials
         self._file.execute("DELETE FROM trials WHERE first >= ? AND first < ?", (begin + part.first, end))
         kept = count - part.first
-        self._insert(plan, part._replace(count=kept), trials[:kept].encode())
+        self._insert(plan, part._replace(trials=kept), trials[:kept].encode())
 
     def _insert(self, plan: Plan, part: Part, columns: Sequence[bytes]) -> None:
         marks = ", ".join("?" * (2 + len(COLUMNS)))
-        values = (part.cell * plan.spec.trials + part.first, part.count, *columns)
+        values = (part.cell * plan.spec.trials + part.first, part.trials, *columns)
         self._file.execute(f"INSERT INTO trials VALUES ({marks})", values)  # noqa: S608 - question marks
 
     def parts(

@@ -41,7 +41,7 @@ class Tally:
         if self._decided[part.cell]:
             return
         if part.first != cell.trials:
-            early[part.first] = part.count
+            early[part.first] = part.trials
             return
         self._count(part, trials)
         while not self._decided[part.cell] and (count := early.pop(cell.trials, None)) is not None:
@@ -113,9 +113,9 @@ class Tasks:
             share = max(self._chunk, wanted // (len(self._cells) + 1))
             part = Part(cell, first, min(end - first, share, wanted - count, MOST_TRIALS))
             parts.append(part)
-            count += part.count
-            if first + part.count < end:
-                gaps.appendleft((first + part.count, end))
+            count += part.trials
+            if first + part.trials < end:
+                gaps.appendleft((first + part.trials, end))
             if gaps:
                 self._cells.append((cell, gaps))
         self._open -= count

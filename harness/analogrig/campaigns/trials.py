@@ -84,7 +84,7 @@ class Trials:
     @property
     def is_valid(self) -> NDArray[np.bool_]:
         """(n,): not inconclusive."""
-        return self.outcome != INCONCLUSIVE
+        return np.asarray(self.outcome != INCONCLUSIVE)
 
     @classmethod
     def of(cls, rows: Sequence[Row], axes: Sequence[str] = ()) -> Trials:
