@@ -280,15 +280,15 @@ def until_stored(process: subprocess.Popen[bytes], path: Path, log_bytes: int) -
 def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
     tmp_path: Path, ended_by: signal.Signals, status: int
 ) -> None:
-    spec = SPEC.replace("trials = 6", "trials = 400")
+    spec = SPEC.replace("trials = 6", "trials = 160")
     plan, out = planned(tmp_path, spec), tmp_path / "out.sqlite"
     process = started(tmp_path / "spec.toml", out)
-    until_stored(process, out, 12_000)
+    until_stored(process, out, 7_000)
     process.send_signal(ended_by)
     _, complaint = process.communicate(timeout=LONG_S)
     assert process.returncode == status
     assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
-    assert 0 < stored_trials(out) < 800
+    assert 0 < stored_trials(out) < 320
     with pytest.raises(RecordingError, match="a campaign that has not ended"):
         Results.load(out)
     if ended_by == signal.SIGINT:

@@ -84,10 +84,15 @@ class Tally:
 
 
 class Tasks:
-    """Tasks of about TASK_S each, whatever a trial takes; all cells progress together."""
+    """Tasks of about TASK_S each, whatever a trial takes.
+
+    Cells that ``[stop]`` may end progress together; others are played one after the other.
+    """
 
     def __init__(self, plan: Plan, tally: Tally, slots: int) -> None:
-        self._tally, self._slots, self._chunk = tally, slots, plan.spec.chunk
+        self._tally, self._slots, self._stops = tally, slots, plan.spec.stop is not None
+        self._chunk = plan.spec.chunk if self._stops else MOST_TRIALS
+        """Least number of trials of a cell in a task: large parts are stored better, small ones end a cell earlier."""
         self._cells = deque(
             (cell, gaps) for cell in range(plan.size) if not tally.has_ended(cell) and (gaps := tally.gaps(cell))
         )
@@ -116,8 +121,10 @@ class Tasks:
             count += part.trials
             if first + part.trials < end:
                 gaps.appendleft((first + part.trials, end))
-            if gaps:
+            if gaps and self._stops:
                 self._cells.append((cell, gaps))
+            elif gaps:
+                self._cells.appendleft((cell, gaps))
         self._open -= count
         return tuple(parts)
 
