@@ -13,49 +13,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Real
-from typing import Any, ClassVar, Never, TypeAlias, TypeVar
+from typing import Any, Never, TypeAlias, TypeVar
 
 from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.part import GROUND, Part
 from analogrig_emulator.circuit.pot import check_dial
 from analogrig_emulator.errors import CircuitError
-
-GROUND = "0"
 
 _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Common part of all elements: name, and the constraints on the fields."""
-
-    positive: ClassVar[tuple[str, ...]] = ()
-    finite: ClassVar[tuple[str, ...]] = ()
-    """Fields that must be finite numbers if given."""
-
-    name: str
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        raise NotImplementedError
-
-    @property
-    def bonds(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of nodes between which the element determines the voltage."""
-        raise NotImplementedError
-
-    @property
-    def spans(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of nodes that must not be the same."""
-        return self.bonds
-
-    @property
-    def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
-        """Bonds whose voltage does not depend on the current."""
-        return ()
-
-
-@dataclass(frozen=True)
-class _TwoEnded(_Part):
+class _TwoEnded(Part):
     a: str
     b: str
 
@@ -91,7 +60,7 @@ class Capacitor(_TwoEnded):
 
 
 @dataclass(frozen=True)
-class Pot(_Part):
+class Pot(Part):
     """A track of track_ohm from top to bottom; dial 0 puts the wiper at the bottom, 1 at the top."""
 
     positive = ("track_ohm",)
@@ -112,7 +81,7 @@ class Pot(_Part):
 
 
 @dataclass(frozen=True)
-class OpAmp(_Part):
+class OpAmp(Part):
     """An op-amp; its state, if the model has one, is the voltage behind the output resistance."""
 
     plus: str
@@ -137,7 +106,7 @@ class OpAmp(_Part):
 
 
 @dataclass(frozen=True)
-class _Source(_Part):
+class _Source(Part):
     plus: str
     minus: str = GROUND
 

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     CurrentSource,
     DiodeLimiter,
@@ -37,6 +36,7 @@ from analogrig_emulator.circuit.circuit import (
     unknown_kind_error,
 )
 from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotModel
 from analogrig_emulator.errors import CircuitError
 

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     Circuit,
     CurrentSource,
@@ -37,6 +36,7 @@ from analogrig_emulator.circuit.circuit import (
     element_error,
 )
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
 from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import Kink, Matrix, PiecewiseLinear, solve_in_place

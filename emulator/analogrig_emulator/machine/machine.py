@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     Circuit,
     Element,
@@ -39,6 +38,7 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
 from analogrig_emulator.circuit.nodal import Nodal, analyse
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear

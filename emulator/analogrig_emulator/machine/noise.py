@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.circuit.circuit import GROUND, Circuit, OpAmp, Pot, Resistor
+from analogrig_emulator.circuit.circuit import Circuit, OpAmp, Pot, Resistor
 from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
 from analogrig_emulator.circuit.nodal import analyse
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
 from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import PiecewiseLinear

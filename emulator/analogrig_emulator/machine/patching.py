@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     Circuit,
     CurrentSource,
@@ -23,6 +22,7 @@ from analogrig_emulator.circuit.circuit import (
     label,
 )
 from analogrig_emulator.circuit.components import is_part_of
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import CircuitError
 
 
