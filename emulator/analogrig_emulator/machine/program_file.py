@@ -230,9 +230,9 @@ class _Reader:
         if not self.inputs:
             raise ProgramError("inputs: there is none; name the quantity that the generator drives")
         lines = list(self._lines())
-        derivatives = self._by_state([line for line, primed in lines if primed])
         definitions = [line for line, primed in lines if not primed]
         self._complete_signals(definitions)
+        derivatives = self._by_state([line for line, primed in lines if primed])
         self._check_names()
         self._check_formulas([*derivatives, *definitions])
         definitions = self._in_order(definitions)

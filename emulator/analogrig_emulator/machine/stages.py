@@ -328,7 +328,7 @@ _TRICKS = dict.fromkeys(("sin", "cos"), ", or generate it with two states: s' = 
 def sum_text(cords: Iterable[Cord]) -> str:
     """Formula of a sum of cords."""
     text = " ".join(cord.text for cord in cords)
-    return text.removeprefix("+ ")
+    return text.removeprefix("+ ").replace("- ", "-", text.startswith("- "))
 
 
 def _power_text(name: str, power: int) -> str:
@@ -337,7 +337,12 @@ def _power_text(name: str, power: int) -> str:
 
 def _is_atom(text: str) -> bool:
     """True if no operator stands outside the brackets of a text."""
-    return not re.search(r"[^\w]", re.sub(r"\(.*\)", "", text))
+    depth = 0
+    for sign in text:
+        depth += (sign == "(") - (sign == ")")
+        if not depth and not (sign.isalnum() or sign in "_)"):
+            return False
+    return True
 
 
 def _bracketed(text: str) -> str:

@@ -49,7 +49,8 @@ class Unit:
 
 def _named(exponents: tuple[int, ...], factor: float) -> Unit:
     """Unit with a text made of its factor and exponents."""
-    parts = [name if n == 1 else f"{name}^{n}" for name, n in zip(_BASE, exponents, strict=True) if n]
+    powers = sorted(zip(_BASE, exponents, strict=True), key=lambda pair: pair[1] < 0)
+    parts = [name if n == 1 else f"{name}^{n}" for name, n in powers if n]
     head = [] if parts and math.isclose(factor, 1.0, rel_tol=_FACTOR_TOLERANCE) else [f"{factor:.6g}"]
     return Unit(exponents, factor, " ".join(head + parts))
 
