@@ -183,8 +183,8 @@ BAD: dict[str, tuple[Change, str]] = {
         "parameters.R: write a",
     ),
     "many rows": (
-        with_row("parameters", "\n".join(f"p{i} = {{ value = 1 }}" for i in range(40))),
-        "parameters: 45 rows",
+        with_row("parameters", "\n".join(f"p{i} = {{ value = 1 }}" for i in range(70))),
+        "parameters: 75 rows",
     ),
     "scale exceeded": (
         swapped("full = 300.0", "full = 150.0"),
@@ -257,7 +257,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "one point": (
         lambda text: text + "[functions]\nf = { points = [[0, 0]] }\n",
-        "functions.f.points: write 2 to 32 pairs",
+        "functions.f.points: write 2 to 64 pairs",
     ),
 }
 

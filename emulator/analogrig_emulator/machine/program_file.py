@@ -47,7 +47,7 @@ from analogrig_emulator.machine.formula import (
 from analogrig_emulator.machine.units import Unit, parse_unit
 
 _MOST_BYTES = 65536
-_MOST_ROWS = 32
+_MOST_ROWS = 64
 """Most rows of a table, lines of equations and points of a function."""
 
 _LARGEST = 1e15
@@ -150,17 +150,22 @@ class Equations:
         """Signals with the functions that compute them, in order."""
         return [(each.name, each.formula.law(self.functions)) for each in self.definitions]
 
-    def slopes(self) -> Callable[[Mapping[str, float], NDArray[np.float64]], NDArray[np.float64]]:
-        """Function of parameters and inputs by name, and states (n,), that computes dx/dt (n,), in s of the plant."""
+    def slopes(self) -> Callable[[Mapping[str, Any], NDArray[np.float64]], NDArray[np.float64]]:
+        """Function of parameters and inputs by name, and states (n, ...), that computes dx/dt, in s of the plant.
+
+        Parameters and inputs may be arrays of the shape of one state.
+        """
         signals = self.signal_laws()
         laws = [each.formula.law(self.functions) for each in self.derivatives]
 
-        def slopes(known: Mapping[str, float], states: NDArray[np.float64]) -> NDArray[np.float64]:
-            values = dict(known)
-            values.update(zip(self.states, states.tolist(), strict=True))
+        def slopes(known: Mapping[str, Any], states: NDArray[np.float64]) -> NDArray[np.float64]:
+            values = {**known, **dict(zip(self.states, states, strict=True))}
             for name, law in signals:
                 values[name] = law(values)
-            return np.array([law(values) for law in laws])
+            found = np.empty_like(states)
+            for i, law in enumerate(laws):
+                found[i] = law(values)
+            return found
 
         return slopes
 

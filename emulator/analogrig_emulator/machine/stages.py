@@ -10,6 +10,7 @@ import enum
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +54,14 @@ class Cord:
     @property
     def text(self) -> str:
         """Term of a formula, with its sign."""
-        body = "*".join(_power_text(name, power) for name, power in self.factors)
-        parts = [part for part in (f"{abs(self.number):g}" if abs(self.number) != 1 else "", body) if part]
-        if self.source != REFERENCE or not parts:
-            parts.append(self.source if _is_atom(self.source) else f"({self.source})")
-        return f"{'-' if self.number < 0 else '+'} {'*'.join(parts)}"
+        above = [_power_text(name, power) for name, power in self.factors if power > 0]
+        below = [_power_text(name, -power) for name, power in self.factors if power < 0]
+        if abs(self.number) != 1:
+            above.insert(0, f"{abs(self.number):g}")
+        if self.source != REFERENCE or not above:
+            above.append(self.source if is_atom(self.source) else f"({self.source})")
+        divisor = f"/({'*'.join(below)})" if len(below) > 1 else "".join(f"/{each}" for each in below)
+        return f"{'-' if self.number < 0 else '+'} {'*'.join(above)}{divisor}"
 
 
 @dataclass(frozen=True)
@@ -100,9 +104,9 @@ class Stages:
             product *= float(value) ** power
         return product
 
-    def add_signals(self, quantities: dict[str, NDArray[np.float64]], values: Mapping[str, float]) -> None:
+    def add_signals(self, quantities: dict[str, Any], values: Mapping[str, float]) -> None:
         """Add the value of every stage but the integrators to the quantities, which hold inputs and states."""
-        quantities.setdefault(REFERENCE, np.float64(1.0))  # type: ignore[arg-type]
+        quantities.setdefault(REFERENCE, np.float64(1.0))
         for stage in self.stages:
             if stage.kind is not StageKind.INTEGRATOR:
                 quantities[stage.name] = self._computed(stage, quantities, values)
@@ -332,10 +336,10 @@ def sum_text(cords: Iterable[Cord]) -> str:
 
 
 def _power_text(name: str, power: int) -> str:
-    return (name if _is_atom(name) else f"({name})") + (f"**{power}" if power != 1 else "")
+    return (name if is_atom(name) else f"({name})") + (f"**{power}" if power != 1 else "")
 
 
-def _is_atom(text: str) -> bool:
+def is_atom(text: str) -> bool:
     """True if no operator stands outside the brackets of a text."""
     depth = 0
     for sign in text:
@@ -346,7 +350,7 @@ def _is_atom(text: str) -> bool:
 
 
 def _bracketed(text: str) -> str:
-    return text if _is_atom(text) or re.fullmatch(r"[\w*]+", text) else f"({text})"
+    return text if is_atom(text) or re.fullmatch(r"[\w*]+", text) else f"({text})"
 
 
 def _joined(one: Factors, other: Factors) -> Factors:

@@ -6,8 +6,7 @@ period of the one before. The parameters take their values, then each in turn th
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,16 +17,17 @@ from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.program_file import Equations
 from analogrig_emulator.machine.stages import StageKind, Stages
 
-_HALF_PERIODS = 6
+_HALF_PERIODS = 4
 _POINTS = 200
 """Instants per half period at which quantities are taken."""
 
 _MOST_EVALUATIONS = 20_000
-_DIVERGED = 1e30
+_TOLERANCE = 1e-5
+_LARGEST = 1e30
 _LINEAR = (StageKind.SUMMER, StageKind.INTEGRATOR)
 
 _States = NDArray[np.float64]
-_Slopes = Callable[[Mapping[str, float], _States], _States]
+"""(states, settings)"""
 
 
 @dataclass(frozen=True)
@@ -62,60 +62,63 @@ def reaches(stages: Stages) -> dict[str, Reach]:
     Raises ProgramError if the equations have no bounded solution, or a stage none at all.
     """
     equations = stages.equations
-    found: dict[str, Reach] = {}
-    solve = _solver(equations, is_linear=all(stage.kind in _LINEAR for stage in stages.stages))
-    for values in settings(equations):
+    every = list(settings(equations))
+    for values in every:
         _check_rest(stages, values)
-        with np.errstate(all="ignore"):
-            quantities = _trajectory(equations, values, solve)
+    found: dict[str, Reach] = {}
+    with np.errstate(all="ignore"):
+        inputs, states = _played(stages, every)
+        for values, played in zip(every, states.T, strict=True):
+            quantities = inputs | dict(zip(equations.states, played, strict=True))
             stages.add_signals(quantities, values)
-        for name, each in quantities.items():
-            if not np.isfinite(each).all():
-                raise ProgramError(f"trial play: {name} is not finite{_with(equations, values)}")
-            found[name] = found.get(name, Reach()).with_values(each)
+            for name, each in quantities.items():
+                found[name] = found.get(name, Reach()).with_values(each)
     _check_domains(stages, found)
     return found
 
 
-_Solve = Callable[[Mapping[str, float], _States, NDArray[np.float64]], NDArray[np.float64]]
-"""States at instants in s, from the state at the first: (instants, states)."""
-
-
-def _trajectory(equations: Equations, values: Mapping[str, float], solve: _Solve) -> dict[str, NDArray[np.float64]]:
-    """Inputs and states at every instant of a trial play."""
+def _played(
+    stages: Stages, every: Sequence[Mapping[str, float]]
+) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+    """Inputs (instants,) by name, and states (instants, states, settings)."""
+    equations = stages.equations
+    is_linear = all(stage.kind in _LINEAR for stage in stages.stages)
+    solve = _solved_linear if is_linear else _solved
+    slopes = equations.slopes()
     instants_s = np.linspace(0.0, 0.5 * equations.period_s, _POINTS)
-    state = np.zeros(len(equations.states))
-    inputs: dict[str, list[NDArray[np.float64]]] = {name: [] for name in equations.inputs}
-    states = []
+    parameters = {name: np.array([values[name] for values in every]) for name in equations.parameters}
+    levels = _levels(equations)
+    state = np.zeros((len(equations.states), len(every)))
+    stretches = []
     for half in range(_HALF_PERIODS):
-        levels = {
-            name: quantity.trial[1 - (half >> place) % 2]
-            for place, (name, quantity) in enumerate(equations.inputs.items())
-        }
-        try:
-            stretch = solve({**values, **levels}, state, instants_s)
-        except (ArithmeticError, ValueError) as cause:
-            raise ProgramError(
-                f"trial play: {cause}{_with(equations, values)}; change a parameter, the trial levels of an input, "
-                "or a divisor that comes near zero"
-            ) from None
-        _check_bounded(equations, values, stretch)
+        known = parameters | {name: each[half] for name, each in levels.items()}
+        stretch = solve(slopes, known, state, instants_s)
+        _check_bounded(equations, every, stretch)
         state = stretch[-1]
-        states.append(stretch)
-        for name, level in levels.items():
-            inputs[name].append(np.full(_POINTS, level))
-    table = np.concatenate(states)
-    return {name: np.concatenate(each) for name, each in inputs.items()} | {
-        name: table[:, i] for i, name in enumerate(equations.states)
+        stretches.append(stretch)
+    inputs = {name: np.repeat(each, _POINTS) for name, each in levels.items()}
+    return inputs, np.concatenate(stretches)
+
+
+def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:
+    """Level of each input in each half period."""
+    halves = np.arange(_HALF_PERIODS)
+    return {
+        name: np.array(quantity.trial)[1 - (halves >> place) % 2]
+        for place, (name, quantity) in enumerate(equations.inputs.items())
     }
 
 
-def _check_bounded(equations: Equations, values: Mapping[str, float], stretch: NDArray[np.float64]) -> None:
-    for name, column in zip(equations.states, stretch.T, strict=True):
-        if not (np.abs(column) < _DIVERGED).all():
-            raise ProgramError(
-                f"trial play: state {name} grows without bound{_with(equations, values)}; correct a sign or a value"
-            )
+def _check_bounded(equations: Equations, every: Sequence[Mapping[str, float]], stretch: NDArray[np.float64]) -> None:
+    for place, values in enumerate(every):
+        for name, column in zip(equations.states, stretch[:, :, place].T, strict=True):
+            if not (np.abs(column) < _LARGEST).all():
+                changed = [f"{key} = {value:g}" for key, value in values.items() if value != equations.values[key]]
+                where = f" with {', '.join(changed)}" if changed else ""
+                raise ProgramError(
+                    f"trial play: state {name} grows without bound{where}; correct a sign or a value, "
+                    "or a divisor that comes near zero"
+                )
 
 
 def _check_rest(stages: Stages, values: Mapping[str, float]) -> None:
@@ -150,55 +153,55 @@ def _check_domains(stages: Stages, found: Mapping[str, Reach]) -> None:
                 )
 
 
-def _with(equations: Equations, values: Mapping[str, float]) -> str:
-    changed = [f"{name} = {value:g}" for name, value in values.items() if value != equations.values[name]]
-    return f" with {', '.join(changed)}" if changed else ""
-
-
-def _solver(equations: Equations, *, is_linear: bool) -> _Solve:
-    slopes = equations.slopes()
-    return (
-        (lambda known, state, instants_s: _solved_linear(slopes, known, state, instants_s))
-        if is_linear
-        else (lambda known, state, instants_s: _solved(slopes, known, state, instants_s))
-    )
+_Slopes = Callable[[Mapping[str, Any], _States], _States]
 
 
 def _solved_linear(
-    slopes: _Slopes, known: Mapping[str, float], state: _States, instants_s: NDArray[np.float64]
+    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Exact solution by a matrix exponential, for equal steps."""
+    """Exact solution by matrix exponentials, for equal steps: (instants, states, settings)."""
     from scipy.linalg import expm
 
-    n = len(state)
-    constant = slopes(known, np.zeros(n))
-    system = np.zeros((n + 1, n + 1))
-    system[:n, n] = constant
-    for i, unit in enumerate(np.eye(n)):
-        system[:n, i] = slopes(known, unit) - constant
+    n, count = state.shape
+    constant = slopes(known, np.zeros_like(state))
+    system = np.zeros((count, n + 1, n + 1))
+    system[:, :n, n] = constant.T
+    for i in range(n):
+        unit = np.zeros_like(state)
+        unit[i] = 1.0
+        system[:, :n, i] = (slopes(known, unit) - constant).T
     if not np.isfinite(system).all():
-        raise ArithmeticError("a coefficient is not finite")
+        raise ProgramError("trial play: a coefficient is not finite; change a value or range of a parameter")
     step = expm(system * (instants_s[1] - instants_s[0]))
-    rows = [np.append(state, 1.0)]
-    for _ in itertools.islice(instants_s, 1, None):
-        rows.append(step @ rows[-1])
+    rows = [np.concatenate((state, np.ones((1, count))))]
+    for _ in instants_s[1:]:
+        rows.append(np.einsum("sij,js->is", step, rows[-1]))
     return np.array(rows)[:, :n]
 
 
 def _solved(
-    slopes: _Slopes, known: Mapping[str, float], state: _States, instants_s: NDArray[np.float64]
+    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Numerical solution, with at most _MOST_EVALUATIONS of the slopes."""
-    from scipy.integrate import LSODA
+    """Numerical solution, with at most _MOST_EVALUATIONS of the slopes: (instants, states, settings)."""
+    from scipy.integrate import RK45
 
-    solver = LSODA(lambda _, states: slopes(known, states), 0.0, state, instants_s[-1], rtol=1e-8, atol=1e-12)
-    rows, at = [state], 1
+    def flat(_: float, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        return slopes(known, states.reshape(state.shape)).ravel()
+
+    solver = RK45(flat, 0.0, state.ravel(), instants_s[-1], rtol=_TOLERANCE, atol=_TOLERANCE**2)
+    rows, at = [state.ravel()], 1
     while at < len(instants_s):
-        message = solver.step()
-        if solver.status == "failed" or solver.nfev > _MOST_EVALUATIONS:
-            raise ArithmeticError(message or f"more than {_MOST_EVALUATIONS} evaluations for half a period: too stiff")
+        solver.step()
+        if solver.status == "failed" or not (np.abs(solver.y) < _LARGEST).all():
+            rows += [np.full(state.size, np.nan)] * (len(instants_s) - at)
+            break
+        if solver.nfev > _MOST_EVALUATIONS:
+            raise ProgramError(
+                f"trial play: stiff, more than {_MOST_EVALUATIONS} evaluations in half a period of "
+                f"{2 * instants_s[-1]:g} s; write a shorter period_s, or change a parameter"
+            )
         dense = solver.dense_output()
         while at < len(instants_s) and instants_s[at] <= solver.t:
             rows.append(dense(instants_s[at]))
             at += 1
-    return np.array(rows)
+    return np.array(rows).reshape(-1, *state.shape)
