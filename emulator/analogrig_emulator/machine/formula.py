@@ -204,7 +204,7 @@ class Power(Formula):
 
 
 @dataclass(frozen=True)
-class Call(Formula):
+class FunctionCall(Formula):
     """Function of FUNCTIONS, or one that the file gives, with its arguments."""
 
     function: str
@@ -320,7 +320,7 @@ class _Reading:
         wanted = 1 if name in self.tables else FUNCTIONS[name].arguments
         if len(arguments) != wanted:
             raise ProgramError(f"{name} takes {wanted} argument{'s' * (wanted > 1)}, not {len(arguments)}")
-        return Call(ast.unparse(node), name, tuple(self.formula(each) for each in arguments))
+        return FunctionCall(ast.unparse(node), name, tuple(self.formula(each) for each in arguments))
 
 
 def _not_allowed(node: ast.expr) -> ProgramError:

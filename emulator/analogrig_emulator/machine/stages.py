@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.errors import ProgramError
-from analogrig_emulator.machine.formula import CONSTANTS, Call, Formula, Name, Negative, Operation, Power
+from analogrig_emulator.machine.formula import CONSTANTS, Formula, FunctionCall, Name, Negative, Operation, Power
 from analogrig_emulator.machine.program_file import Equation, Equations, Points
 
 REFERENCE = "1"
@@ -191,7 +191,7 @@ class _Builder:
                 return self._combined(node.sign, self._terms(node.left), self._terms(node.right))
             case Power():
                 return self._power(self._terms(node.base), node.power)
-            case Call():
+            case FunctionCall():
                 return self._call(node.function, node.arguments)
         raise TypeError(type(node))
 
