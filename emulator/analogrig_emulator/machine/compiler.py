@@ -50,6 +50,9 @@ _CAPACITORS_FARAD = (1e-6, 1e-7, 1e-8, 1e-9)
 _LOOP_FARAD = 47e-12
 """Capacitor across an amplifier with a multiplier in its loop: without it the loop rings."""
 
+_BARRED_V = 0.05
+"""Voltage beyond zero at which a root's diode conducts: at zero itself it would switch without end at rest."""
+
 _OFF_OHM = 1e12
 _ON_OHM = 1e3
 _HEADROOM = 1.2
@@ -423,19 +426,22 @@ class _Patcher:
         other = stage.name if is_root else stage.cords[1].source
         other_sign = sign if is_root else self._signs[other]
         product_full = self._fulls[stage.name] * self._fulls[other]
-        cords = [self._cord(stage, 0, self._fulls[dividend.source] / product_full)]
+        ratio = self._fulls[dividend.source] / product_full
+        # Small resistors make the loop fast; a gain of 10 would make the input's too small for its source.
+        ohm = GAIN_10_OHM if ratio * extremes(self._stages, dividend, stage.place)[1] <= 1 + _EXACT else INPUT_OHM
+        cords = [self._cord(stage, 0, ratio, ohm)]
         # The product must cancel the dividend's current.
         product_sign = -self._source_sign(stage, dividend)
         name, node = f"XU{number}", f"xu{number}"
         scale_v = MACHINE_V * sign * other_sign * product_sign
         self._elements += [
             Multiplier(name, out, self._nodes[other, other_sign], node, scale_v),
-            Resistor(f"R{number}X", node, junction, INPUT_OHM),
+            Resistor(f"R{number}X", node, junction, ohm),
             Capacitor(f"C{number}", junction, out, _LOOP_FARAD),
         ]
         if is_root:  # The diode bars the other root, where the loop would latch up.
             ends = (junction, out) if sign > 0 else (out, junction)
-            self._elements.append(DiodeLimiter(f"L{number}", *ends, 0.0, _ON_OHM, _OFF_OHM))
+            self._elements.append(DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM))
         else:
             self._elements.append(Resistor(f"R{number}FB", junction, out, _OFF_OHM))
             cords.append(PatchedCord(stage.cords[1], self._nodes[other, other_sign], other_sign, 1.0, 1, name))
@@ -486,8 +492,8 @@ class _Patcher:
         """Volts at the stage by volt at the source, for a coefficient of 1 in the plant's units."""
         return self._fulls[cord.source] / self._fulls[stage.name]
 
-    def _cord(self, stage: PatchStage, place: int, ratio: float) -> PatchedCord:
-        """Cord into an amplifier; ratio: coefficient by product of the cord's number and factors."""
+    def _cord(self, stage: PatchStage, place: int, ratio: float, ohm: float = INPUT_OHM) -> PatchedCord:
+        """Cord into an amplifier; ratio: coefficient by product of the cord's number and factors; ohm: for gain 1."""
         cord, number = stage.cords[place], self._amplifiers[stage.name]
         most = ratio * extremes(self._stages, cord, stage.place)[1]
         coefficient = ratio * abs(cord.number) * self._stages.factor(cord.factors, self._stages.equations.values)
@@ -500,7 +506,7 @@ class _Patcher:
             pot = self._pot_name(cord)
             node = f"w_{pot}"
             self._elements.append(Pot(pot, top, node, GROUND, TRACK_OHM, 0.0))
-        self._elements.append(Resistor(resistor, node, f"s{number}", INPUT_OHM if gain == 1 else GAIN_10_OHM))
+        self._elements.append(Resistor(resistor, node, f"s{number}", ohm / gain))
         return PatchedCord(cord, top, sign, coefficient, gain, resistor, pot, ratio * abs(cord.number) / gain)
 
     def _check_coefficient(self, stage: PatchStage, cord: Cord, coefficient: float, most: float) -> None:
