@@ -24,7 +24,7 @@ from analogrig_emulator import EmulatorError
 
 T = TypeVar("T")
 
-Kind = Literal["scenarios", "rigs", "devices", "campaigns"]
+Kind = Literal["scenarios", "rigs", "devices", "campaigns", "programs"]
 
 MAX_FILE_BYTES = 1_000_000
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -277,3 +278,9 @@ def test_bad_file_is_refused_in_one_line(kind: str, tmp_path: Path) -> None:
 def test_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ProgramError, match="absent.toml: cannot be read: No such file"):
         load_program(tmp_path / "absent.toml")
+
+
+def test_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    with pytest.raises(ProgramError, match="pipe.toml: cannot be read: it is no regular file"):
+        load_program(tmp_path / "pipe.toml")

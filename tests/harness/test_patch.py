@@ -20,6 +20,13 @@ def test_sheet_drawing_and_deck_are_written(tmp_path: Path, capsys: pytest.Captu
     assert deck.read_text().startswith("* program dc-motor") and ".tran" in deck.read_text()
 
 
+def test_shipped_program_goes_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["patch", "pendulum"]) == 0
+    assert "pendulum with damping" in capsys.readouterr().out
+    assert main(["patch", "pendolum"]) == 2
+    assert "no program is called 'pendolum': there are bump-stop, dc-motor" in capsys.readouterr().err
+
+
 def test_json_has_scales_and_dials(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["patch", str(MOTOR), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -172,6 +172,8 @@ class Equations:
 
 def read_program(path: str | Path) -> Equations:
     """Program of a file. Raises ProgramError that names the file, the place and the cure."""
+    if Path(path).exists() and not Path(path).is_file():
+        raise ProgramError(f"{path}: cannot be read: it is no regular file")
     try:
         with Path(path).open("rb") as file:
             data = file.read(_MOST_BYTES + 1)

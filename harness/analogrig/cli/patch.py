@@ -17,10 +17,10 @@ def add(commands: Any) -> None:
         commands,
         "patch",
         "compile a program file, and print its scaling sheet",
-        "patch fixtures/programs/dc-motor.toml",
+        "patch dc-motor",
         "patch motor.toml --drawing build/motor.svg --netlist build/motor.cir",
     )
-    command.add_argument("file", type=Path, metavar=FILE, help="program file")
+    command.add_argument("program", metavar="PROGRAM", help="program file, or the name of a shipped one")
     command.add_argument("--drawing", type=Path, metavar=FILE, help="drawing of the patch, an .svg file")
     command.add_argument("--netlist", type=Path, metavar=FILE, help="SPICE deck of the patch, for ngspice")
     add_json(command)
@@ -28,6 +28,7 @@ def add(commands: Any) -> None:
 
 
 def _patch(arguments: argparse.Namespace) -> int:
+    from analogrig.config import locate
     from analogrig.errors import ConfigurationError
     from analogrig.output import move_aside
     from analogrig.storage import replace_file
@@ -38,17 +39,18 @@ def _patch(arguments: argparse.Namespace) -> int:
     if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
         raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
     wanted = [path for path in (arguments.drawing, arguments.netlist) if path is not None]
+    file = locate("programs", arguments.program)
     for path in wanted:
-        move_aside(path, [arguments.file])
-    program = load_program(arguments.file)
+        move_aside(path, [file])
+    program = load_program(file)
     texts = {}
     if arguments.drawing is not None:
         texts[arguments.drawing] = patch_drawing(program)
     if arguments.netlist is not None:
         texts[arguments.netlist] = _deck(program)
     for path, text in texts.items():
-        with replace_file(path) as file:
-            file.write(text.encode())
+        with replace_file(path) as out:
+            out.write(text.encode())
     if arguments.json:
         full = {name: program.scales.full(name) for name in program.equations.quantities}
         files = {"files": [str(path) for path in wanted]}
