@@ -85,11 +85,15 @@ BAD: dict[str, tuple[Change, str]] = {
     "unknown key": (swapped("speed =", "sped ="), "unknown key 'sped'; did you mean 'speed'"),
     "unknown key of a row": (swapped("pot = false", "pots = false"), "parameters.d: unknown key 'pots'; did you mean"),
     "no name": (swapped('name = "motor"', ""), "name is missing"),
+    "control characters": (
+        swapped("speed = 10", 'speed = 10\ndescription = "a\\u001b[2J"'),
+        "description: write one line",
+    ),
     "name with a slash": (swapped('name = "motor"', 'name = "../motor"'), "name '../motor': write letters, digits"),
     "no speed": (swapped("speed = 10", ""), "speed is missing"),
     "speed of zero": (swapped("speed = 10", "speed = 0"), "speed: 0 is zero; it must be positive"),
     "speed is text": (swapped("speed = 10", 'speed = "fast"'), "speed: 'fast' is no number"),
-    "no equations": (lambda text: text.replace("equations =", "about ="), "equations is missing"),
+    "no equations": (lambda text: text.replace("equations =", "description ="), "equations is missing"),
     "no states": (
         lambda text: text[: text.index("[states]")] + text[text.index("[parameters]") :],
         "states: there is none",

@@ -36,7 +36,7 @@ def patch_drawing(program: PatchedProgram) -> str:
     for inverter in inverters(program):
         rows += _inverter(inverter, y)
         y += _LINE + _GAP
-    title = f"{program.name}: {program.equations.about}" if program.equations.about else program.name
+    title = f"{program.name}: {program.equations.description}" if program.equations.description else program.name
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{y}" viewBox="0 0 {_WIDTH} {y}" role="img">'
         f"<title>{escape(title)}</title><style>{_STYLE}</style>"

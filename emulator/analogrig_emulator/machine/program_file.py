@@ -50,6 +50,7 @@ _MOST_BYTES = 65536
 _MOST_ROWS = 64
 """Most rows of a table, lines of equations and points of a function."""
 
+_MOST_DESCRIPTION = 200
 _LARGEST = 1e15
 _LEAST = 1e-15
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")
@@ -124,7 +125,7 @@ class Equations:
     """
 
     name: str
-    about: str
+    description: str
     speed: float
     period_s: float
     channels: tuple[str, ...]
@@ -210,7 +211,7 @@ class _Reader:
 
     _KEYS = (
         "name",
-        "about",
+        "description",
         "speed",
         "period_s",
         "channels",
@@ -248,7 +249,7 @@ class _Reader:
         speed = _number("speed", self._table.get("speed"), low=_LEAST)
         return Equations(
             name=self._name(),
-            about=_text("about", self._table.get("about", "")),
+            description=self._description(),
             speed=speed,
             period_s=_number("period_s", self._table.get("period_s", speed / _CIRCUIT_HZ), low=_LEAST),
             channels=self._channels(),
@@ -327,6 +328,12 @@ class _Reader:
         if not _PROGRAM_NAME.fullmatch(name):
             raise ProgramError(f"name {name[:40]!r}: write letters, digits, - and _, at most 64")
         return name
+
+    def _description(self) -> str:
+        text = _text("description", self._table.get("description", ""))
+        if text and not (text.isprintable() and len(text) <= _MOST_DESCRIPTION):
+            raise ProgramError(f"description: write one line of at most {_MOST_DESCRIPTION} printable characters")
+        return text
 
     def _channels(self) -> tuple[str, ...]:
         known = [*self.inputs, *self.states, *self.signals]

@@ -14,7 +14,7 @@ from analogrig_emulator.machine.stages import StageKind, is_atom
 def scaling_sheet(program: PatchedProgram) -> str:
     """Text of the sheet: quantities with scales, computing elements with their inputs, pots with dials."""
     equations = program.equations
-    head = f"{program.name}: {equations.about}" if equations.about else program.name
+    head = f"{program.name}: {equations.description}" if equations.description else program.name
     parts = [
         [head, f"1 s of the machine is {equations.speed:g} s of the plant."],
         ["Quantities: 10 V stand for the full scale.", *_table(_quantities(program))],
