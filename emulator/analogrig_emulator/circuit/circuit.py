@@ -15,6 +15,7 @@ from itertools import pairwise
 from numbers import Real
 from typing import Any, Never, TypeAlias, TypeVar
 
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier, breakpoint_fault
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND, Part
 from analogrig_emulator.circuit.pot import check_dial
@@ -202,9 +203,23 @@ class Switch(_TwoEnded):
         return self.on_ohm if closed else self.off_ohm
 
 
-Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch
+Element: TypeAlias = (
+    Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch | Multiplier | Function
+)
 _T = TypeVar("_T")
-_E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, CurrentSource, DiodeLimiter, Switch)
+_E = TypeVar(
+    "_E",
+    Resistor,
+    Capacitor,
+    Pot,
+    OpAmp,
+    VoltageSource,
+    CurrentSource,
+    DiodeLimiter,
+    Switch,
+    Multiplier,
+    Function,
+)
 
 _LEAST = 1e-100
 """Least ohms and farads: no reciprocal of them, nor of an end stop's part of a track, overflows."""
@@ -404,6 +419,10 @@ def _check_element(element: Element) -> None:
         check_dial(element.dial, element.name)
     if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
         raise element_error(element, f"on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
+    if isinstance(element, Multiplier) and element.scale_v == 0:
+        raise element_error(element, "scale_v must not be 0")
+    if isinstance(element, Function) and (fault := breakpoint_fault(element.breakpoints)):
+        raise element_error(element, fault)
 
 
 def _check_value(element: Element, field: str) -> None:
@@ -477,6 +496,9 @@ def _check_feedback(elements: tuple[Element, ...]) -> None:
     for amp in elements:
         if isinstance(amp, OpAmp):
             for node in {amp.plus, amp.minus} - {GROUND}:
+                acts.setdefault(node, []).append(amp.out)
+        elif isinstance(amp, Multiplier | Function):
+            for node in amp.nodes[:-1]:
                 acts.setdefault(node, []).append(amp.out)
     for amp in elements:
         if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reachable(amp.out, acts):

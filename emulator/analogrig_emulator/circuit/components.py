@@ -35,6 +35,7 @@ from analogrig_emulator.circuit.circuit import (
     VoltageSource,
     unknown_kind_error,
 )
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotModel
@@ -317,7 +318,7 @@ class Components:
             case OpAmp():
                 yield replace(element, model=self._specimen(element, draws))
                 yield from self._inputs(element, draws)
-            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch():
+            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch() | Multiplier() | Function():
                 yield element
             case _:
                 raise unknown_kind_error(element)

@@ -8,8 +8,10 @@
 static bool is_within(int value, int low, int high) { return value >= low && value <= high; }
 
 engine_t*
-engine_new(int states, int inputs, int kinks, int outputs, double sample_period_s, int64_t events_per_sample) {
+engine_new(
+    int states, int inputs, int products, int kinks, int outputs, double sample_period_s, int64_t events_per_sample) {
     if (!is_within(states, 0, ENGINE_MAX_STATES) || !is_within(inputs, 0, ENGINE_MAX_INPUTS) ||
+        !is_within(products, 0, ENGINE_MAX_PRODUCTS) || products > inputs || 2 * products > kinks ||
         !is_within(kinks, 0, ENGINE_MAX_KINKS) || !is_within(outputs, 0, ENGINE_MAX_OUTPUTS) ||
         !(sample_period_s > 0.0)) {
         return NULL;
@@ -21,11 +23,13 @@ engine_new(int states, int inputs, int kinks, int outputs, double sample_period_
     self->kernels           = kernels_find();
     self->states            = states;
     self->inputs            = inputs;
+    self->products          = products;
     self->kinks             = kinks;
     self->outputs           = outputs;
     self->columns           = states + inputs + 1;
     self->tick_s            = sample_period_s / (double)ENGINE_TICKS_PER_SAMPLE;
     self->events_per_sample = events_per_sample;
+    products_plan(self);
     engine_restart(self);
     return self;
 }
@@ -59,6 +63,7 @@ void engine_free(engine_t* const self) {
         for (int k = 0; k < MODES; k++) {
             free(self->circuits[i]->store[k].block);
             free(self->circuits[i]->store[k].slow.block);
+            products_free(self->circuits[i]->store[k].collocation);
         }
         free(self->circuits[i]->block);
         free(self->circuits[i]);
@@ -70,13 +75,13 @@ void engine_free(engine_t* const self) {
 
 /// Number of elements of each array of engine_system_t.
 typedef struct {
-    size_t abc, g, cde, w_phi, lmn, y_phi, kinks;
+    size_t abc, g, cde, w_phi, lmn, y_phi, kinks, products;
 } sizes_t;
 
 static sizes_t sizes_of(const engine_t* const self) {
     const size_t n = (size_t)self->states, q = (size_t)self->kinks, p = (size_t)self->outputs;
     const size_t columns = (size_t)self->columns;
-    return (sizes_t){ n * columns, n * q, q * columns, q * q, p * columns, p * q, q };
+    return (sizes_t){ n * columns, n * q, q * columns, q * q, p * columns, p * q, q, (size_t)self->products };
 }
 
 static bool is_equal(size_t count, size_t size, const void* one, const void* other) {
@@ -91,7 +96,8 @@ static bool holds(const engine_t* const self, const circuit_t* circuit, const en
            is_equal(sizes.w_phi, sizeof(double), circuit->w_phi, system->w_phi) &&
            is_equal(sizes.lmn, sizeof(double), circuit->lmn, system->lmn) &&
            is_equal(sizes.y_phi, sizeof(double), circuit->y_phi, system->y_phi) &&
-           is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks);
+           is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks) &&
+           is_equal(sizes.products, sizeof(engine_product_t), circuit->products, system->products);
 }
 
 /// True if two matrices agree in all columns but the last.
@@ -130,7 +136,8 @@ static circuit_t* new_circuit(const engine_t* const self) {
     const size_t     matrices  = sizes.abc + sizes.g + sizes.cde + sizes.w_phi + sizes.lmn + sizes.y_phi;
     circuit_t* const circuit   = calloc(1, sizeof *circuit);
     if (circuit != NULL) {
-        circuit->block = malloc((matrices + of_panels) * sizeof(double) + sizes.kinks * sizeof(engine_kink_t) + 1U);
+        circuit->block = malloc((matrices + of_panels) * sizeof(double) + sizes.kinks * sizeof(engine_kink_t) +
+                                sizes.products * sizeof(engine_product_t) + 1U);
     }
     if (circuit == NULL || circuit->block == NULL) {
         free(circuit);
@@ -146,6 +153,7 @@ static circuit_t* new_circuit(const engine_t* const self) {
     circuit->cde_panels = carve(&free_part, of_kinks);
     circuit->lmn_panels = carve(&free_part, of_panels - of_kinks);
     circuit->kink       = (engine_kink_t*)(void*)free_part;
+    circuit->products   = (engine_product_t*)(void*)&circuit->kink[sizes.kinks];
     return circuit;
 }
 
@@ -189,9 +197,11 @@ static engine_status_t keep_circuit(engine_t* const self, const engine_system_t*
     copy(sizes.lmn, sizeof(double), system->lmn, circuit->lmn);
     copy(sizes.y_phi, sizeof(double), system->y_phi, circuit->y_phi);
     copy(sizes.kinks, sizeof(engine_kink_t), system->kinks, circuit->kink);
+    copy(sizes.products, sizeof(engine_product_t), system->products, circuit->products);
     circuit->stored = 0;
     circuit->oldest = 0;
     self->circuit   = circuit;
+    products_set_laws(self, circuit->products);
     kinks_list_feeding(self);
     circuit->is_set = kinks_are_unique(self);
     pack_circuit(self, circuit);
@@ -257,6 +267,9 @@ engine_status_t engine_set_state(engine_t* const self, const double* x) {
 
 static engine_status_t advance(engine_t* const self, int64_t tick) {
     engine_status_t status = ENGINE_OK;
+    if (self->products > 0) {
+        return products_advance(self, tick);
+    }
     while (status == ENGINE_OK && self->now < tick) {
         if (!quiet_advance(self, tick)) {
             status = events_advance(self, tick);
@@ -268,7 +281,7 @@ static engine_status_t advance(engine_t* const self, int64_t tick) {
 /// Advance to the instant of an edge and apply it. An edge to the present level is ignored: it must not change how the
 /// steps are cut.
 static engine_status_t take_edge(engine_t* const self, int64_t tick, int32_t input, double level) {
-    if (tick < self->now || input < 0 || input >= self->inputs) {
+    if (tick < self->now || input < 0 || input >= self->inputs - self->products) {
         return ENGINE_EDGE;
     }
     const int    column = self->states + (int)input;

@@ -13,6 +13,10 @@
 /// is found by Newton's method. Soon after it the fast states follow the slow ones, which alone are then stepped. Where a
 /// Lyapunov function proves that no event comes before the next edge, w is looked at no more.
 ///
+/// The last elements of u may be products: functions of two elements of w each, its arguments. Between events a circuit with
+/// products is affine but for them. It is stepped by exponential collocation: the products are polynomials through the
+/// Lobatto nodes of a step, and all else follows exactly.
+///
 /// The library is C99 with malloc, libm and the vectors of GCC and clang, for the host: not for interrupts and not for the
 /// device. One engine must not be used by two threads at once; different engines may. Results depend on the inputs alone,
 /// not on how a run is cut into calls, on the compiler's options or on the processor. RAM: 10 kB an engine, 40 kB a
@@ -28,10 +32,12 @@
 #include <stdint.h>
 
 #define ENGINE_MAX_STATES 32
-#define ENGINE_MAX_INPUTS 8
-#define ENGINE_MAX_KINKS 64
+#define ENGINE_MAX_INPUTS 24
+#define ENGINE_MAX_PRODUCTS 16
+#define ENGINE_MAX_KINKS 128
 #define ENGINE_MAX_OUTPUTS 256
 #define ENGINE_MAX_UNKNOWNS 256
+#define ENGINE_MAX_FACTOR_TERMS 16
 #define ENGINE_LEVELS 23
 #define ENGINE_TICKS_PER_SAMPLE (INT64_C(1) << (ENGINE_LEVELS - 1))
 
@@ -45,7 +51,7 @@ typedef enum {
     ENGINE_NOT_FINITE = 4,  ///< the state is no longer finite
     ENGINE_EDGE      = 5,  ///< an edge is out of order, in the past, beyond the run, or of an input that does not exist
     ENGINE_NO_SYSTEM = 6,  ///< no circuit was set, or the last one was refused
-    ENGINE_NOT_UNIQUE = 7,  ///< w = r + P phi(w) has no solution, or several, for some r
+    ENGINE_NOT_UNIQUE = 7,  ///< w = r + P phi(w) has no solution, or several, for some r; or products feed one another
 } engine_status_t;
 
 /// One kink: phi(w) = slope[p] w + intercept[p], with p = 0 below lower, 1 between, 2 above upper.
@@ -56,7 +62,15 @@ typedef struct {
     double intercept[3];
 } engine_kink_t;
 
-/// A circuit, as arrays of the caller. They are copied.
+/// One product: the value at p of the polynomial with coefficients x, in order of powers, times that of y at q. Its arguments
+/// p and q are two elements of w without limits.
+typedef struct {
+    double x[ENGINE_MAX_FACTOR_TERMS];
+    double y[ENGINE_MAX_FACTOR_TERMS];
+} engine_product_t;
+
+/// A circuit, as arrays of the caller. They are copied. The arguments of the products are the last elements of w, in their
+/// order.
 typedef struct {
     const double*        abc;    ///< states rows
     const double*        g;      ///< states x kinks
@@ -65,6 +79,7 @@ typedef struct {
     const double*        lmn;    ///< outputs rows
     const double*        y_phi;  ///< R, outputs x kinks
     const engine_kink_t* kinks;
+    const engine_product_t* products;
 } engine_system_t;
 
 /// Counters since engine_new() or engine_restart().
@@ -76,9 +91,11 @@ typedef struct {
     int64_t modes_built;  ///< ladders computed; exceeds the number of modes if the store is too small
 } engine_counts_t;
 
-/// Return a new engine at rest before its first sample: x = 0, u = 0. NULL iff a size is out of range, the sample period is
-/// not positive, or memory is short. Cost: one calloc.
-engine_t* engine_new(int states, int inputs, int kinks, int outputs, double sample_period_s, int64_t events_per_sample);
+/// Return a new engine at rest before its first sample: x = 0, u = 0. products: number of inputs, the last ones, that are
+/// products; kinks: elements of w, the arguments of products among them. NULL iff a size is out of range, the sample period
+/// is not positive, or memory is short. Cost: one calloc.
+engine_t* engine_new(
+    int states, int inputs, int products, int kinks, int outputs, double sample_period_s, int64_t events_per_sample);
 
 /// Free the engine. NULL is allowed.
 void engine_free(engine_t* self);

@@ -27,7 +27,8 @@ _REASONS = {
     4: "the state is no longer finite: the circuit is unstable",
     5: "the edges are out of order, before the last sample recorded, or beyond the last sample of the run",
     6: "no circuit was set, or the last one was refused",
-    7: "limiters and amplifiers feed one another so that there is no unique solution: is there positive feedback?",
+    7: "limiters, amplifiers and multipliers feed one another so that there is no unique solution: "
+    "is there positive feedback, or a loop of ideal elements?",
 }
 
 
@@ -72,11 +73,16 @@ class Engine:
             raise EngineError(
                 f"{len(self._outputs)} nodes are to be recorded; the engine takes at most {library.MAX_OUTPUTS}"
             )
-        sizes = (len(system.states), len(system.inputs), len(system.kinks), len(self._outputs))
+        inputs, products = len(system.inputs) + len(system.products), len(system.products)
+        sizes = (len(system.states), inputs, products, len(system.kinks), len(self._outputs))
         kind = (self._library, (*sizes, 1.0 / sample_rate_hz, events_per_sample))
         self._handle = _take(kind)
         if not self._handle:
-            raise EngineError("cannot make an engine for {} states, {} inputs, {} kinks, {} outputs".format(*sizes))
+            raise EngineError(
+                "cannot make an engine for {} states, {} inputs ({} of them products), {} kinks, {} outputs".format(
+                    *sizes
+                )
+            )
         weakref.finalize(self, _release, kind, self._handle)
         self._library.engine_look_ahead(self._handle, ahead_ticks)
         self._kinks = len(system.kinks)

@@ -6,6 +6,7 @@
 ///     modes.c     the mode in which the circuit is, and the store of modes
 ///     kinks.c     arguments w of the kinks, and the circuit with the kinks substituted
 ///     ladder.c    matrix exponentials
+///     products.c  steps of a circuit with products
 ///     matrices.c  panels, products, linear equations
 ///     kernels.c   inner loops, from lanes.h
 ///     noise.c     noise of a linear circuit, independent of the rest
@@ -83,6 +84,13 @@ typedef struct {
     double* reach;   // (w - rest_w)^2 <= reach e'Q e, for each kink
 } slow_t;
 
+/// Nodes of a step of a circuit with products, beyond its beginning; and all of them.
+#define NODES 4
+#define ORDER (NODES + 1)
+
+/// Matrices of a mode of a circuit with products, for steps of each level.
+typedef struct collocation collocation_t;
+
 /// A mode and its matrices, in one block. base: level of the shortest step, of h = 2^base ticks. |A h| is so small that
 /// TERMS terms give the exponential of any part of h, unless `stiff`: then base is 0.
 typedef struct {
@@ -101,6 +109,7 @@ typedef struct {
     bool          has_slow;
     int64_t       tuning;     // that of its circuit when it was built
     bool          is_pinned;  // another engine uses it: it must stay
+    collocation_t* collocation;  // of a circuit with products, else NULL
 } mode_t;
 
 /// The end of a step with respect to the bounds of the present mode. A step inside all bounds is CLEAR if w could not have
@@ -108,12 +117,20 @@ typedef struct {
 /// at the speed of the step before. At the top of a peak the first alone may be zero.
 typedef enum { CLEAR, NEAR, CROSSED } judgement_t;
 
+/// A product, and the degrees of its factors.
+typedef struct {
+    engine_product_t factors;
+    int              x_degree, y_degree;
+} law_t;
+
 /// A circuit and its modes. Arrays as in engine_system_t, in one block.
 typedef struct {
     bool           is_set;  // it has a unique solution
     double*        block;
     double *       abc, *g, *cde, *w_phi, *lmn, *y_phi;
     engine_kink_t* kink;
+    engine_product_t* products;
+    law_t          law[ENGINE_MAX_PRODUCTS];
     double *       cde_panels, *lmn_panels;
     bool           feeds;                                     // phi feeds some w or y
     int            coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
@@ -148,7 +165,7 @@ typedef struct {
 struct engine {
     const kernels_t* kernels;
 
-    int     states, inputs, kinks, outputs, columns;
+    int     states, inputs, products, kinks, outputs, columns;  // inputs: products included
     double  tick_s;
     int64_t events_per_sample;
 
@@ -180,6 +197,10 @@ struct engine {
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
 
     int64_t ahead;                      // ticks; see engine_look_ahead()
+    double weight[ORDER][ORDER];                     // moments of a polynomial from its values at the nodes
+    double moments[ORDER * ENGINE_MAX_PRODUCTS];     // of the products in the last step
+    int    level;                                    // of the next step, if nothing ends it before
+
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER
     int64_t overdue[ENGINE_MAX_KINKS];  // results of engine_get_overdue() for kinks that have come back since
@@ -297,6 +318,27 @@ engine_status_t mode_enter(engine_t* self);
 
 /// First tick at which a kink had been outside its middle piece for `patience` ticks; NEVER if there is none by now.
 int64_t mode_overdue_tick(const engine_t* self, int kink);
+
+// ---------------------------------------------        PRODUCTS        ---------------------------------------------
+
+/// Set what depends on the nodes alone.
+void products_plan(engine_t* self);
+
+/// Set the laws of the present circuit.
+void products_set_laws(const engine_t* self, const engine_product_t* products);
+
+/// Compute the matrices of the present mode from its map [A B c]: those of its lowest level, the others as they are needed.
+engine_status_t products_build(engine_t* self, const double* a);
+
+/// Free the matrices of a mode. NULL is allowed.
+void products_free(collocation_t* matrices);
+
+/// Set w and the products in z from the state and the other inputs. Fails like kinks_solve(), and with ENGINE_NOT_UNIQUE if
+/// the products feed one another.
+engine_status_t products_solve(engine_t* self);
+
+/// Advance to a tick, and enter the modes on the way.
+engine_status_t products_advance(engine_t* self, int64_t tick);
 
 // ---------------------------------------------         STEPS          ---------------------------------------------
 

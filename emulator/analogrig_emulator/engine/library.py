@@ -11,10 +11,12 @@ from analogrig_emulator.errors import EngineError
 
 # The limits of engine/engine.h.
 MAX_STATES = 32
-MAX_INPUTS = 8
-MAX_KINKS = 64
+MAX_INPUTS = 24
+MAX_PRODUCTS = 16
+MAX_KINKS = 128
 MAX_OUTPUTS = 256
 MAX_UNKNOWNS = 256
+MAX_FACTOR_TERMS = 16
 
 _HERE = Path(__file__).parents[1]
 _BUILD = "make setup"
@@ -29,7 +31,7 @@ class Counts(ctypes.Structure):
 class System(ctypes.Structure):
     """The C type engine_system_t."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks"))
+    _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks", "products"))
 
 
 class Noise(ctypes.Structure):
@@ -39,7 +41,7 @@ class Noise(ctypes.Structure):
 
 
 _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
-    ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_double, c_int64)),
+    ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_int, c_double, c_int64)),
     ("engine_free", None, (c_void_p,)),
     ("engine_restart", None, (c_void_p,)),
     ("engine_set_system", c_int, (c_void_p, POINTER(System))),

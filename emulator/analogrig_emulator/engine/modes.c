@@ -98,12 +98,15 @@ static engine_status_t build_mode(engine_t* const self) {
         kinks_build_readings(self, mode->piece, mode->readings);
     }
     point_readings(self);
+    if (self->products > 0) {
+        return products_build(self, a);
+    }
     ladder_build(self, a);
     return ENGINE_OK;
 }
 
 engine_status_t mode_enter(engine_t* const self) {
-    engine_status_t status = kinks_solve(self);
+    engine_status_t status = self->products > 0 ? products_solve(self) : kinks_solve(self);
     if (status != ENGINE_OK) {
         return status;
     }
