@@ -11,6 +11,7 @@ from analogrig_emulator.circuit.circuit import (
     Circuit,
     CurrentSource,
     DiodeLimiter,
+    Element,
     OpAmp,
     Pot,
     Resistor,
@@ -29,6 +30,7 @@ from analogrig_emulator.circuit.components import (
     PotGrade,
 )
 from analogrig_emulator.circuit.nodal import piecewise_linear
+from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn
 from analogrig_emulator.circuit.spice import Deck, to_spice
@@ -60,6 +62,7 @@ __all__ = [
     "FRONT",
     "IDEAL",
     "LAMP_DELAY_S",
+    "MULTIPLIERS",
     "NOMINAL",
     "OP_AMP_GRADES",
     "PROGRAMS",
@@ -81,15 +84,19 @@ __all__ = [
     "Dielectric",
     "DiodeLimiter",
     "Edges",
+    "Element",
     "EmulatorError",
     "Engine",
     "EngineError",
     "Excitation",
     "ExcitationError",
     "ForceLaw",
+    "Function",
     "Grade",
     "Mass",
     "Mode",
+    "Multiplier",
+    "MultiplierModel",
     "ModeError",
     "NoisySuspension",
     "OpAmp",

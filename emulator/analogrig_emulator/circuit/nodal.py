@@ -121,8 +121,9 @@ class Nodal:
         branches = [element.name for element in self._capacitors] + [
             source.name for source in circuit.of(VoltageSource)
         ]
-        held = (part for part in (*amps, *self._multipliers) if not (part.model.has_state and part.model.rout_ohm > 0))
-        branches += [*(part.name for part in held), *(function.name for function in self._functions)]
+        outputs: tuple[OpAmp | Multiplier, ...] = (*amps, *self._multipliers)
+        branches += [part.name for part in outputs if not (part.model.has_state and part.model.rout_ohm > 0)]
+        branches += [function.name for function in self._functions]
 
         self._nodes = circuit.nodes
         self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
@@ -132,7 +133,7 @@ class Nodal:
         holders: list[Capacitor | OpAmp | Multiplier] = [*self._capacitors, *self._poles, *followers]
         self._state = {element.name: i for i, element in enumerate(holders)}
         self._columns = len(self._state) + len(self._inputs) + len(self._multipliers) + 1
-        limited = (*self._poles, *followers)
+        limited: tuple[OpAmp | Multiplier, ...] = (*self._poles, *followers)
         self._kinks = tuple(replace(kink, element=part.name) for part in limited for kink in _kinks(part))
         first_source = len(self._kinks)
         self._kinks += tuple(
@@ -478,8 +479,8 @@ class _Laws:
         ends += [(row[function.x], row[GROUND]) for function in bent]
         ends += [(row[node], row[GROUND]) for part in multipliers for node in (part.x, part.y)]
         plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
-        first, limited = len(capacitors), (*poles, *followers)
-        states = first + len(limited)
+        limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
+        first, states = len(capacitors), len(capacitors) + len(limited)
         kinds = [
             (i, slews) for i, part in enumerate(limited, first) for slews in (True, False) if _limits(part, slews=slews)
         ]

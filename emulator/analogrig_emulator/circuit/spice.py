@@ -196,7 +196,8 @@ class _DeckWriter:
             circuit.with_dials(change.values)
             if change.ramp_n:
                 raise CircuitError(f"pots {', '.join(change.values)}: a deck turns pots at once; ramp_n must be 0")
-        amps = [part.name for part in (*circuit.of(OpAmp), *circuit.of(Multiplier)) if part.model.has_state]
+        amps = [amp.name for amp in circuit.of(OpAmp) if amp.model.has_state]
+        amps += [multiplier.name for multiplier in circuit.of(Multiplier) if multiplier.model.has_state]
         _known("state", self._deck.initial_v, [*(capacitor.name for capacitor in circuit.of(Capacitor)), *amps])
         _known("node", nodes or (), circuit.nodes)
         for node in circuit.nodes:

@@ -7,8 +7,7 @@
 
 static bool is_within(int value, int low, int high) { return value >= low && value <= high; }
 
-engine_t*
-engine_new(
+engine_t* engine_new(
     int states, int inputs, int products, int kinks, int outputs, double sample_period_s, int64_t events_per_sample) {
     if (!is_within(states, 0, ENGINE_MAX_STATES) || !is_within(inputs, 0, ENGINE_MAX_INPUTS) ||
         !is_within(products, 0, ENGINE_MAX_PRODUCTS) || products > inputs || 2 * products > kinks ||

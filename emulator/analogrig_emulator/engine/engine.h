@@ -72,13 +72,13 @@ typedef struct {
 /// A circuit, as arrays of the caller. They are copied. The arguments of the products are the last elements of w, in their
 /// order.
 typedef struct {
-    const double*        abc;    ///< states rows
-    const double*        g;      ///< states x kinks
-    const double*        cde;    ///< kinks rows
-    const double*        w_phi;  ///< P, kinks x kinks
-    const double*        lmn;    ///< outputs rows
-    const double*        y_phi;  ///< R, outputs x kinks
-    const engine_kink_t* kinks;
+    const double*           abc;    ///< states rows
+    const double*           g;      ///< states x kinks
+    const double*           cde;    ///< kinks rows
+    const double*           w_phi;  ///< P, kinks x kinks
+    const double*           lmn;    ///< outputs rows
+    const double*           y_phi;  ///< R, outputs x kinks
+    const engine_kink_t*    kinks;
     const engine_product_t* products;
 } engine_system_t;
 

@@ -94,21 +94,21 @@ typedef struct collocation collocation_t;
 /// A mode and its matrices, in one block. base: level of the shortest step, of h = 2^base ticks. |A h| is so small that
 /// TERMS terms give the exponential of any part of h, unless `stiff`: then base is 0.
 typedef struct {
-    unsigned char piece[ENGINE_MAX_KINKS];
-    int           base;
-    bool          stiff;
-    double*       block;
-    int           capacity;  // of the block
-    int           top;       // the highest level computed so far
-    double*       ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels base .. top, states only
-    double*       looks;     // panelled w over the z of 2^level ticks before, for the same levels
-    double*       change;    // the matrix of level `top`, row-major
-    double*       terms;     // ([A B c] h)^k / k! for k = 1 .. TERMS, as series_pack() stores them
-    double*       readings;  // panelled w and y over z; used if phi feeds one of them
-    slow_t        slow;
-    bool          has_slow;
-    int64_t       tuning;     // that of its circuit when it was built
-    bool          is_pinned;  // another engine uses it: it must stay
+    unsigned char  piece[ENGINE_MAX_KINKS];
+    int            base;
+    bool           stiff;
+    double*        block;
+    int            capacity;  // of the block
+    int            top;       // the highest level computed so far
+    double*        ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels base .. top, states only
+    double*        looks;     // panelled w over the z of 2^level ticks before, for the same levels
+    double*        change;    // the matrix of level `top`, row-major
+    double*        terms;     // ([A B c] h)^k / k! for k = 1 .. TERMS, as series_pack() stores them
+    double*        readings;  // panelled w and y over z; used if phi feeds one of them
+    slow_t         slow;
+    bool           has_slow;
+    int64_t        tuning;       // that of its circuit when it was built
+    bool           is_pinned;    // another engine uses it: it must stay
     collocation_t* collocation;  // of a circuit with products, else NULL
 } mode_t;
 
@@ -125,18 +125,18 @@ typedef struct {
 
 /// A circuit and its modes. Arrays as in engine_system_t, in one block.
 typedef struct {
-    bool           is_set;  // it has a unique solution
-    double*        block;
-    double *       abc, *g, *cde, *w_phi, *lmn, *y_phi;
-    engine_kink_t* kink;
+    bool              is_set;  // it has a unique solution
+    double*           block;
+    double *          abc, *g, *cde, *w_phi, *lmn, *y_phi;
+    engine_kink_t*    kink;
     engine_product_t* products;
-    law_t          law[ENGINE_MAX_PRODUCTS];
-    double *       cde_panels, *lmn_panels;
-    bool           feeds;                                     // phi feeds some w or y
-    int            coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
-    mode_t         store[MODES];
-    int            stored, oldest;
-    int64_t        tuning;  // how often the constants have changed
+    law_t             law[ENGINE_MAX_PRODUCTS];
+    double *          cde_panels, *lmn_panels;
+    bool              feeds;                                     // phi feeds some w or y
+    int               coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
+    mode_t            store[MODES];
+    int               stored, oldest;
+    int64_t           tuning;  // how often the constants have changed
 } circuit_t;
 
 /// The inner loops. Memory must not overlap.
@@ -196,10 +196,10 @@ struct engine {
     double        rest[PADDED(ENGINE_MAX_STATES)];  // of the slow states
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
 
-    int64_t ahead;                      // ticks; see engine_look_ahead()
-    double weight[ORDER][ORDER];                     // moments of a polynomial from its values at the nodes
-    double moments[ORDER * ENGINE_MAX_PRODUCTS];     // of the products in the last step
-    int    level;                                    // of the next step, if nothing ends it before
+    int64_t ahead;                                 // ticks; see engine_look_ahead()
+    double  weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes
+    double  moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the products in the last step
+    int     level;                                 // of the next step, if nothing ends it before
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER

@@ -38,9 +38,9 @@ static const double nodes[ORDER] = { 0.0, 0.17267316464601143, 0.5, 0.8273268353
 /// Matrices of steps of one level, panelled. z is [x u 1] at the beginning, v the products at the other nodes.
 typedef struct {
     double* block;
-    double* arguments;       // of the products at the other nodes, over z
-    double* feedback;        // the same, over v
-    double* change[NODES];   // of x up to each node, over [z v]
+    double* arguments;      // of the products at the other nodes, over z
+    double* feedback;       // the same, over v
+    double* change[NODES];  // of x up to each node, over [z v]
 } rung_t;
 
 /// The moments of a node are stored row-major: [x u 1 and k = 0 | k = 1 | .. | k = 4], as differences from x.
@@ -55,9 +55,7 @@ struct collocation {
 
 // ---------------------------------------------        MATRICES        ---------------------------------------------
 
-static int stride_of(const engine_t* const self) {
-    return PADDED(self->columns + (ORDER - 1) * self->products);
-}
+static int stride_of(const engine_t* const self) { return PADDED(self->columns + (ORDER - 1) * self->products); }
 
 static int width_of(const engine_t* const self) { return self->columns + NODES * self->products; }
 
@@ -179,7 +177,7 @@ static bool allocate_rung(const engine_t* const self, rung_t* rung) {
     const int of_arguments = PANEL_ELEMENTS(count, self->columns);
     const int of_feedback  = PANEL_ELEMENTS(count, NODES * self->products);
     const int of_change    = PANEL_ELEMENTS(self->states, width);
-    rung->block = malloc((size_t)(of_arguments + of_feedback + NODES * of_change) * sizeof(double));
+    rung->block            = malloc((size_t)(of_arguments + of_feedback + NODES * of_change) * sizeof(double));
     if (rung->block == NULL) {
         return false;
     }
@@ -216,7 +214,7 @@ static void fill_rung(const engine_t* const self, double* const* moments, rung_t
 /// Matrices of the present mode for steps of a level. NULL if memory is short.
 static const rung_t* reach(engine_t* const self, int level) {
     collocation_t* const matrices = self->mode->collocation;
-    rung_t* const             rung     = &matrices->rungs[level];
+    rung_t* const        rung     = &matrices->rungs[level];
     if (rung->block != NULL) {
         return rung;
     }
@@ -272,8 +270,8 @@ engine_status_t products_build(engine_t* const self, const double* a) {
         }
     }
     matrices->base = matrices->top = mode->base;
-    int    halvings = 0;
-    double ticks    = (double)(INT64_C(1) << mode->base);
+    int    halvings                = 0;
+    double ticks                   = (double)(INT64_C(1) << mode->base);
     while (mode->stiff && matrix_norm(n, stride, matrices->map) * ticks > TAYLOR_NORM) {
         ticks *= 0.5;
         halvings++;
@@ -359,10 +357,10 @@ engine_status_t products_solve(engine_t* const self) {
 
 /// One step under trial.
 typedef struct {
-    double values[ORDER * ENGINE_MAX_PRODUCTS];    // of the products at the nodes, the beginning first
-    double moments[ORDER * ENGINE_MAX_PRODUCTS];   // of the polynomials through them
-    double vector[MAX_WIDTH];                      // [z v]
-    double z[PADDED(MAX_COLUMNS)];                 // at the end
+    double values[ORDER * ENGINE_MAX_PRODUCTS];   // of the products at the nodes, the beginning first
+    double moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the polynomials through them
+    double vector[MAX_WIDTH];                     // [z v]
+    double z[PADDED(MAX_COLUMNS)];                // at the end
 } step_t;
 
 /// Extend the polynomials of the step before to the nodes of this one.
@@ -443,8 +441,7 @@ static void arrive(const engine_t* const self, const rung_t* rung, int node, con
     for (int i = 0; i < self->states; i++) {
         z[i] += change[i];
     }
-    memcpy(&z[column_of(self, 0)], &step->values[(node + 1) * self->products],
-           (size_t)self->products * sizeof z[0]);
+    memcpy(&z[column_of(self, 0)], &step->values[(node + 1) * self->products], (size_t)self->products * sizeof z[0]);
 }
 
 /// True if an argument is beyond its bound at a node within a step.

@@ -135,12 +135,8 @@ def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
 
 def _check_feedback(circuit: Circuit, amp: OpAmp, drivers: set[str]) -> None:
     bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
-    fed_back = (
-        {amp.out}
-        | {  # a multiplier in the feedback divides
-            part.out for part in (*circuit.of(Multiplier), *circuit.of(Function)) if amp.out in part.nodes[:-1]
-        }
-    )
+    computing: tuple[Multiplier | Function, ...] = (*circuit.of(Multiplier), *circuit.of(Function))
+    fed_back = {amp.out} | {part.out for part in computing if amp.out in part.nodes[:-1]}
     if amp.minus != amp.out and not fed_back & _reachable(amp.minus, bonds, drivers | {GROUND}):
         raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
