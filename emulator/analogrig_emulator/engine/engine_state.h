@@ -178,9 +178,9 @@ struct engine {
     double  z[PADDED(MAX_COLUMNS)];  // [x u 1] now; without x in a stretch of slow states
     int64_t origin;                  // tick of the last event, edge or new circuit
     double  origin_z[PADDED(MAX_COLUMNS)];
-    int64_t clear;                   // no event comes up to this tick; NO_END in a quiet stretch and at its end
-    int64_t stride;                  // ticks from w_before to w; 0 if w has a kink between
-    int     look;                    // level of the next look from the origin; above TOP_LEVEL if there is none
+    int64_t clear;   // no event comes up to this tick; NO_END in a quiet stretch and at its end
+    int64_t stride;  // ticks from w_before to w; 0 if w has a kink between
+    int look;  // level of the next look from the origin, above TOP_LEVEL if there is none; with products, of the next step
     double *w, *w_before, *w_there;  // arguments of the kinks: at `clear`, a stride earlier, at the end of a step
     double  arguments[3][PADDED(ENGINE_MAX_KINKS)];
     int64_t events_left;
@@ -197,9 +197,8 @@ struct engine {
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
 
     int64_t ahead;                                 // ticks; see engine_look_ahead()
-    double  weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes
-    double  moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the products in the last step
-    int     level;                                 // of the next step, if nothing ends it before
+    double weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes
+    double moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the products in the last step
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER

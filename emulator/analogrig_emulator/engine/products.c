@@ -344,6 +344,9 @@ engine_status_t products_solve(engine_t* const self) {
         multiply_out(self, &self->w[self->kinks - 2 * self->products], values);
         for (int i = 0; i < self->products; i++) {
             settled = settled && fabs(values[i] - held[i]) <= SETTLED * fabs(held[i]);
+            if (!isfinite(values[i])) {
+                return ENGINE_NOT_UNIQUE;  // they feed one another without bound: all w were finite
+            }
             held[i] = values[i];
         }
         if (settled) {
@@ -460,12 +463,9 @@ static bool strays(const engine_t* const self, const rung_t* rung, const step_t*
 }
 
 /// Longest step towards a tick that ends on a multiple of its length, and is no longer than the time since the last event.
-static int choose_level(engine_t* const self, int64_t tick) {
+static int choose_level(const engine_t* const self, int64_t tick) {
     const int64_t since = self->now - self->origin;
-    if (self->stride == 0) {
-        self->level = self->mode->base;
-    }
-    int level = self->level;
+    int           level = self->look;
     while (level > 0) {
         const int64_t ticks = INT64_C(1) << level;
         if ((ticks <= since || level <= self->mode->base) && self->now % ticks == 0 && self->now + ticks <= tick) {
@@ -520,15 +520,15 @@ engine_status_t products_advance(engine_t* const self, int64_t tick) {
         const rung_t*   rung    = reach(self, level);
         const outcome_t outcome = rung == NULL ? FAILED : attempt(self, rung, level, &step, &tail);
         if (outcome == TOO_LONG) {
-            self->level = level - 1;
+            self->look = level - 1;
             continue;
         }
         if (outcome == FAILED) {
             return rung == NULL ? ENGINE_NO_MEMORY : ENGINE_NOT_UNIQUE;
         }
         accept(self, level, &step);
-        if (level == self->level && level < TOP_LEVEL && tail < GROWING * TAIL_V) {
-            self->level++;
+        if (level == self->look && level < TOP_LEVEL && tail < GROWING * TAIL_V) {
+            self->look++;
         }
         if (outcome == LEFT) {
             self->counts.events++;
