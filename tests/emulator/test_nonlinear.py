@@ -37,7 +37,7 @@ from analogrig_emulator import (
     piecewise_linear,
     preset,
 )
-from analogrig_emulator.circuit.components import OP_AMP_GRADES
+from analogrig_emulator.circuit.components import MULTIPLIER_GRADES, OP_AMP_GRADES, Components, MultiplierGrade
 from analogrig_emulator.circuit.spice import Accuracy
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
@@ -55,7 +55,7 @@ def oscillator(model: OpAmpModel, damping: Resistor, *law: Element) -> Circuit:
     stages = (("RF", "in", 100e3), ("R2", "u1", 40e3), ("R3", "u2", 100e3), ("R4", "u2", 10e3))
     inputs = [Resistor(name, node, f"s{i}", ohm) for i, (name, node, ohm) in enumerate(stages, 1)]
     amps = [OpAmp(f"U{i}", "0", f"s{i}", f"u{i}", model) for i in range(1, 5)]
-    feedback = [
+    feedback: list[Element] = [
         Resistor("R1FB", "s1", "u1", 40e3),
         Capacitor("C2", "s2", "u2", 1e-9),
         Capacitor("C3", "s3", "u3", 1e-9),
@@ -199,13 +199,32 @@ def test_each_error_of_a_multiplier_enters_as_its_law_says(
 
 @pytest.mark.parametrize(("side", "fraction"), [("x", 0.004), ("y", 0.001)])
 def test_nonlinearity_is_the_data_sheet_s_fraction_of_full_scale(side: str, fraction: float) -> None:
-    model = MultiplierModel(**{f"{side}_nonlinearity": fraction})
+    model = replace(IDEAL, **{f"{side}_nonlinearity": fraction})  # type: ignore[arg-type]
     other = "y" if side == "x" else "x"
     inputs = np.linspace(-10.0, 10.0, 41)
     bent = [outputs(Multiplier("M", "x", "y", "o", model=model), **{side: v, other: 10.0})[0] - v for v in inputs]
     assert np.abs(bent).max() == pytest.approx(fraction * 10.0, rel=0.01)
     assert bent[0] == pytest.approx(0.0, abs=1e-12)
     assert bent[-1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_specimens_of_a_grade_stay_within_the_data_sheet_s_typical_errors() -> None:
+    """Each error is drawn from the multiplier's name, and its own switch draws no other."""
+    grade = MULTIPLIER_GRADES["ad633"]
+    nominal = Multiplier("M1", "x", "y", "o", model=AD633)
+    models = [_fitted(nominal, grade, seed) for seed in range(200)]
+    for field in ("gain_error", "x_offset_v", "y_offset_v", "z_offset_v", "x_nonlinearity", "y_nonlinearity"):
+        limit = getattr(grade, field)
+        drawn = np.array([getattr(model, field) for model in models])
+        assert 0.95 * limit < np.abs(drawn).max() <= limit
+        alone = _fitted(nominal, MultiplierGrade(**{field: limit}), 7)
+        assert alone == replace(AD633, **{field: drawn[7]})
+
+
+def _fitted(multiplier: Multiplier, grade: MultiplierGrade, seed: int) -> MultiplierModel:
+    (fitted,) = Components(multipliers=grade, seed=seed).fit([multiplier])
+    assert isinstance(fitted, Multiplier)
+    return fitted.model
 
 
 def test_the_bandwidth_is_one_pole() -> None:
@@ -234,7 +253,12 @@ def test_the_output_resistance_divides_with_the_load() -> None:
 
 def test_a_multiplier_in_the_feedback_divides_and_takes_square_roots() -> None:
     amp = OpAmp("U", "0", "s", "o", OpAmpModel(gbw_hz=3e6))
-    around = [Resistor("R1", "u", "s", 10e3), Resistor("R2", "m", "s", 10e3), Capacitor("C", "s", "o", 50e-12), amp]
+    around: list[Element] = [
+        Resistor("R1", "u", "s", 10e3),
+        Resistor("R2", "m", "s", 10e3),
+        Capacitor("C", "s", "o", 50e-12),
+        amp,
+    ]
     for u, y in ((3.0, 5.0), (-2.0, 4.0), (6.0, 8.0)):
         quotient = outputs(*around, Multiplier("M", "o", "y", "m", model=AD633), samples=10, u=u, y=y)[-1]
         assert quotient == pytest.approx(-10.0 * u / y, abs=1e-6)
@@ -244,7 +268,11 @@ def test_a_multiplier_in_the_feedback_divides_and_takes_square_roots() -> None:
 
 
 def test_ideal_multipliers_follow_one_another_without_a_state_between() -> None:
-    fifth = [Multiplier("M1", "x", "x", "a"), Multiplier("M2", "a", "a", "b"), Multiplier("M3", "b", "x", "o")]
+    fifth: list[Element] = [
+        Multiplier("M1", "x", "x", "a"),
+        Multiplier("M2", "a", "a", "b"),
+        Multiplier("M3", "b", "x", "o"),
+    ]
     assert outputs(*fifth, x=8.0)[0] == pytest.approx(8.0**5 / 1e4, rel=1e-14)
 
 
@@ -274,7 +302,7 @@ def test_a_cubic_by_segments_stiffens_the_spring_as_in_ngspice(ngspice: NgSpice)
 
 
 def test_a_comparator_switches_a_multiplier() -> None:
-    switch = [Function.comparator("G", "x", "c", (0.0, 10.0)), Multiplier("M", "c", "y", "o")]
+    switch: list[Element] = [Function.comparator("G", "x", "c", (0.0, 10.0)), Multiplier("M", "c", "y", "o")]
     assert [outputs(*switch, x=x, y=7.0)[0] for x in (-3.0, -0.01, 0.01, 3.0)] == pytest.approx(
         [0.0, 0.0, 7.0, 7.0], abs=1e-9
     )
@@ -298,8 +326,12 @@ def test_a_function_bends_the_argument_of_a_multiplier_in_a_loop(ngspice: NgSpic
 
 
 def test_ideal_multipliers_in_a_loop_are_refused() -> None:
-    """Its law v = v^2 / 10 + 4 has two solutions or none."""
-    loop = [Resistor("R1", "x", "p", 1e3), Resistor("R2", "o", "p", 1e3), Multiplier("M", "p", "p", "o", 0.5)]
+    """With the node at p, 2 p = 10 + 2 p^2 has no solution."""
+    loop: list[Element] = [
+        Resistor("R1", "x", "p", 1e3),
+        Resistor("R2", "o", "p", 1e3),
+        Multiplier("M", "p", "p", "o", 0.5),
+    ]
     with pytest.raises(EngineError, match="a loop of ideal elements"):
         outputs(*loop, x=10.0)
 
