@@ -21,6 +21,7 @@
 /// device. One engine must not be used by two threads at once; different engines may. Results depend on the inputs alone,
 /// not on how a run is cut into calls, on the compiler's options or on the processor. RAM: 10 kB an engine, 40 kB a
 /// circuit; for each of up to 64 modes 45 kB with seven states, and 40 kB once it has been without events for a sample period.
+/// With products, a mode takes some 12 kB for each length of step in use instead.
 ///
 /// Rows of [A B c], [C D e] and [L M n] are stored side by side: (states + inputs + 1) columns, row-major.
 ///
