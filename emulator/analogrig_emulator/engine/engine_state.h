@@ -197,8 +197,8 @@ struct engine {
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
 
     int64_t ahead;                                 // ticks; see engine_look_ahead()
-    double weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes
-    double moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the products in the last step
+    double  weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes
+    double  moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the products in the last step
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER
