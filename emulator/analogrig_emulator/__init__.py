@@ -45,8 +45,10 @@ from analogrig_emulator.errors import (
     ExcitationError,
     ModeError,
     PotError,
+    ProgramError,
     SamplerError,
 )
+from analogrig_emulator.machine.compiler import PatchedProgram, load_program
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
 from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
@@ -107,6 +109,7 @@ __all__ = [
     "OpAmpGrade",
     "OpAmpModel",
     "Parameter",
+    "PatchedProgram",
     "PiecewiseLinear",
     "Pot",
     "PotError",
@@ -114,6 +117,7 @@ __all__ = [
     "PotModel",
     "PotTurn",
     "Program",
+    "ProgramError",
     "Repeat",
     "RepeatedPlay",
     "Resistor",
@@ -134,6 +138,7 @@ __all__ = [
     "drawn_levels",
     "drawn_offsets_v",
     "is_repeatable",
+    "load_program",
     "piecewise_linear",
     "preset",
     "probes_per_sample",
