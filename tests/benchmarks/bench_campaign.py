@@ -24,7 +24,7 @@ import numpy as np
 
 from analogrig.campaigns.conduct import conduct
 from analogrig.campaigns.plan import Part, Plan
-from analogrig.campaigns.plays import Played, play_part
+from analogrig.campaigns.plays import PlayedTask, play_part
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.tally import Task
 from analogrig.campaigns.trials import Trials
@@ -74,7 +74,7 @@ def _played(folder: Path, trials: int) -> Iterator[Figure]:
     of = f"{trials:,} trials played"
     wall_s, cpu_s, memory_mb = _measured("campaign", str(spec), "--workers", str(WORKERS), "--out", str(whole))
     yield Figure(f"{of}: time on the wall", wall_s, "s")
-    yield Figure(f"{of}: CPU time of all processes", 1e3 * cpu_s / trials, "ms a trial")
+    yield Figure(f"{of}: CPU time of the command without its workers", 1e3 * cpu_s / trials, "ms a trial")
     yield Figure(f"{of}: memory", memory_mb, "MB")
     yield from _sizes(of, whole)
     kills = _kill_on_the_way(spec, killed, trials)
@@ -116,12 +116,12 @@ class _Copier(ThisProcess):
 
     def play(  # type: ignore[override]  # narrower than the protocol
         self,
-        work: Callable[[Task], Played],  # noqa: ARG002 - it copies instead
+        work: Callable[[Task], PlayedTask],  # noqa: ARG002 - it copies instead
         tasks: Iterator[Task],
-    ) -> Iterator[tuple[Task, Played]]:
+    ) -> Iterator[tuple[Task, PlayedTask]]:
         for task in tasks:
             parts = [(part, self._copy(part).encode()) for part in task]
-            yield task, Played(parts, 2e-3 * sum(part.trials for part in task))
+            yield task, PlayedTask(parts, 2e-3 * sum(part.trials for part in task))
 
     def _copy(self, part: Part) -> Trials:
         places = (part.first + np.arange(part.trials)) % COPIED

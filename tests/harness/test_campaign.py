@@ -22,7 +22,7 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.campaigns.conduct import conduct
 from analogrig.campaigns.plan import Part, Plan, one_worker_only, rig_table
-from analogrig.campaigns.plays import Played, close_devices, play_part, play_task
+from analogrig.campaigns.plays import PlayedTask, close_devices, play_part, play_task
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import row
 from analogrig.campaigns.spec import CampaignSpec
@@ -183,7 +183,7 @@ class Backwards(ThisProcess):
 
     slots = 3
 
-    def play(self, work: Callable[[Task], Played], tasks: Iterator[Task]) -> Iterator[tuple[Task, Played]]:  # type: ignore[override]
+    def play(self, work: Callable[[Task], PlayedTask], tasks: Iterator[Task]) -> Iterator[tuple[Task, PlayedTask]]:  # type: ignore[override]
         return iter([(task, work(task)) for task in tasks][::-1])
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.campaigns.plan import Plan, device_files, device_of
-from analogrig.campaigns.plays import Played, close_devices, play_task
+from analogrig.campaigns.plays import PlayedTask, close_devices, play_task
 from analogrig.campaigns.results import Results, load_ended, tally_of
 from analogrig.campaigns.store import NotAStoreError, Store
 from analogrig.campaigns.tally import Tally, Task, Tasks
@@ -80,7 +80,7 @@ def _play(plan: Plan, workers: CampaignWorkers, store: Store, tally: Tally) -> I
     """Play what is left; yield the number of trials of each task that has been stored and counted."""
     workers.supply(device_files(plan.devices))
     tasks, axes = Tasks(plan, tally, workers.slots), len(plan.spec.draw.axes())
-    work: Callable[[Task], Played] = functools.partial(play_task, plan.as_json())
+    work: Callable[[Task], PlayedTask] = functools.partial(play_task, plan.as_json())
     for _, played in workers.play(work, iter(tasks)):
         store.add(plan, played.parts)
         count = 0

@@ -111,7 +111,7 @@ class _Benches(threading.local):
 _benches = _Benches()
 
 
-class Played(NamedTuple):
+class PlayedTask(NamedTuple):
     """What a worker returns of a task."""
 
     parts: list[tuple[Part, tuple[bytes, ...]]]
@@ -120,7 +120,7 @@ class Played(NamedTuple):
     """Time that they took."""
 
 
-def play_task(plan: str, task: Sequence[Part]) -> Played:
+def play_task(plan: str, task: Sequence[Part]) -> PlayedTask:
     """Play the parts of a task of the plan (``Plan.as_json``): the same trials in every process on every machine.
 
     :raises ConfigurationError: the build here is another, or a device refuses its configuration; names cell and seed.
@@ -129,7 +129,7 @@ def play_task(plan: str, task: Sequence[Part]) -> Played:
     planned, _ = _plan(plan)
     axes = list(planned.spec.draw.axes())
     parts = [(part, Trials.of(play_part(plan, part), axes).encode()) for part in task]
-    return Played(parts, time.monotonic() - start_s)
+    return PlayedTask(parts, time.monotonic() - start_s)
 
 
 def play_part(plan: str, part: Part) -> list[Row]:

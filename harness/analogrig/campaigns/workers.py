@@ -204,7 +204,7 @@ class Processes(_Executors):
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-class _Setup:
+class _FileSupply:
     """Start of a worker of a cluster, also of one that joins later: it keeps the files of the campaign's devices."""
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
@@ -241,7 +241,7 @@ class Dask(_Executors):
     def supply(self, files: Mapping[str, bytes]) -> None:
         if files:
             plugin: Any = type(
-                "Files", (importlib.import_module("distributed").WorkerPlugin,), {"setup": _Setup(files)}
+                "Files", (importlib.import_module("distributed").WorkerPlugin,), {"setup": _FileSupply(files)}
             )
             try:
                 self._client.register_plugin(plugin(), name="analogrig-files")
