@@ -38,8 +38,6 @@ Volts = NDArray[np.float64]
 
 FOLDER = Path(__file__).parents[2] / "fixtures" / "programs"
 PROGRAMS = sorted(path.stem for path in FOLDER.glob("*.toml"))
-PLAYED = ("bump-stop", "dc-motor", "front", "rc-battery", "shock", "two-mass")
-"""Programs without multipliers."""
 
 LSB_V = 10.0 / 4096
 RATE_HZ = 20e3
@@ -121,7 +119,7 @@ def dials_of(program: PatchedProgram, values: dict[str, float]) -> dict[str, flo
 # ---- linear programs, played
 
 
-@pytest.mark.parametrize("name", PLAYED)
+@pytest.mark.parametrize("name", PROGRAMS)
 def test_ideal_parts_play_the_equations(name: str) -> None:
     program = program_of(name)
     changes = changes_of(program)
@@ -132,7 +130,7 @@ def test_ideal_parts_play_the_equations(name: str) -> None:
     assert np.abs(volts - by_scipy(program, excitation, changes)).max() < 0.05 * LSB_V
 
 
-@pytest.mark.parametrize("name", PLAYED)
+@pytest.mark.parametrize("name", PROGRAMS)
 def test_every_amplifier_agrees_with_ngspice(ngspice: NgSpice, name: str) -> None:
     program = program_of(name)
     computer = SuspensionComputer(program, rng=np.random.default_rng(3))

@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias, cast
 
 from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
@@ -57,7 +56,6 @@ _OFF_OHM = 1e12
 _ON_OHM = 1e3
 _HEADROOM = 1.2
 _ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-_Patched: TypeAlias = Element | Multiplier | Function
 
 _LEAST_COEFFICIENT = 2e-4
 """One winding of a pot's 5000."""
@@ -114,7 +112,7 @@ class PatchedProgram(Program):
     patch: tuple[PatchedElement, ...]
     inverters: Mapping[str, str]
     input_nodes: Mapping[str, str]
-    elements: tuple[_Patched, ...]
+    elements: tuple[Element, ...]
 
     __hash__ = object.__hash__
 
@@ -172,8 +170,7 @@ class PatchedProgram(Program):
 
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
         given = iter(models)
-        parts = [replace(each, model=next(given)) if isinstance(each, OpAmp) else each for each in self.elements]
-        return cast(list[Element], parts)
+        return [replace(each, model=next(given)) if isinstance(each, OpAmp) else each for each in self.elements]
 
 
 def load_program(path: str | Path) -> PatchedProgram:
@@ -289,7 +286,7 @@ class _Patcher:
         self._inputs = list(stages.equations.inputs)
         self._signs = signs_of(rows, self._inputs, self._divisor_signs)
         self._nodes: dict[tuple[str, int], str] = {}
-        self._elements: list[_Patched] = []
+        self._elements: list[Element] = []
         self._amplifiers: dict[str, int] = {}
         self._uses = self._users(rows)
         self._pots: list[str] = []
