@@ -39,6 +39,7 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.components import MULTIPLIER_GRADES, OP_AMP_GRADES, Components, MultiplierGrade
 from analogrig_emulator.circuit.spice import Accuracy
+from analogrig_emulator.engine import engine as engine_module
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]
@@ -139,6 +140,33 @@ def test_cutting_a_run_into_calls_changes_no_bit() -> None:
     volts = whole.run(120, {"F": edges.within(*whole.window(120))})
     parts = [cut.run(n, {"F": edges.within(*cut.window(n))}) for n in (1, 50, 0, 7, 62)]
     assert np.array_equal(volts, np.concatenate(parts))
+
+
+def test_other_offsets_in_a_kept_engine_are_those_in_an_engine_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    shifted = replace(AD633, x_offset_v=0.02, z_offset_v=0.01)
+    circuits = [duffing(replace(TL07X, vos_v=vos_v), law) for vos_v in (0.0, 2e-3) for law in (AD633, shifted)]
+    edges = square(80, 6.0)
+
+    def played(circuit: Circuit) -> Volts:
+        engine = Engine(piecewise_linear(circuit), ("u1", "u3", "m2"), SAMPLE_RATE_HZ)
+        return engine.run(80, {"F": edges.within(*engine.window(80))})
+
+    kept = [played(circuit) for circuit in (*circuits, circuits[0])]
+    for circuit, volts in zip((*circuits, circuits[0]), kept, strict=True):
+        monkeypatch.setattr(engine_module, "_idle", {})
+        assert np.array_equal(volts, played(circuit))
+    assert not np.array_equal(kept[0], kept[1])
+
+
+def test_voltages_ahead_are_those_of_a_finer_grid() -> None:
+    finer = 64
+    looking = Engine(piecewise_linear(duffing()), ("u3", "m2"), SAMPLE_RATE_HZ, ahead_ticks=TICKS_PER_SAMPLE // finer)
+    edges = square(60, 6.0)
+    volts = looking.run(60, {"F": edges.within(*looking.window(60))})
+    fast = Engine(piecewise_linear(duffing()), ("u3", "m2"), SAMPLE_RATE_HZ * finer)
+    every = fast.run(59 * finer + 2, {"F": Edges(edges.ticks * finer, edges.levels_v)})
+    np.testing.assert_allclose(volts[:, :2], every[::finer][:60], rtol=0, atol=5e-5)
+    np.testing.assert_allclose(volts[:, 2:], every[1::finer][:60], rtol=0, atol=5e-5)
 
 
 def test_a_ramp_of_a_pot_ends_where_a_pot_at_once_does() -> None:

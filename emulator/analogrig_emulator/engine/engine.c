@@ -111,7 +111,8 @@ static bool is_equal_but_last(int rows, int columns, const double* one, const do
 /// True if a circuit differs from the one kept in its constants alone, as by the offsets of amplifiers.
 static bool is_variant(const engine_t* const self, const circuit_t* circuit, const engine_system_t* system) {
     const sizes_t sizes = sizes_of(self);
-    return circuit->is_set && is_equal_but_last(self->states, self->columns, circuit->abc, system->abc) &&
+    return circuit->is_set && self->products == 0 &&
+           is_equal_but_last(self->states, self->columns, circuit->abc, system->abc) &&
            is_equal(sizes.g, sizeof(double), circuit->g, system->g) &&
            is_equal_but_last(self->kinks, self->columns, circuit->cde, system->cde) &&
            is_equal(sizes.w_phi, sizeof(double), circuit->w_phi, system->w_phi) &&
