@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
+from analogrig.campaigns import builds
 from analogrig.campaigns.conduct import conduct
-from analogrig.campaigns.plan import Part, Plan, one_worker_only, rig_table
+from analogrig.campaigns.plan import Part, Plan, device_files, device_of, one_worker_only, rig_table
 from analogrig.campaigns.plays import PlayedTask, close_devices, play_part, play_task
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import row
@@ -703,6 +704,22 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
     assert f"devices[0].build is '{before}' there and '{after}' here" in complaint
     assert complaint.count("\n") == 1
     assert out.read_bytes() == kept
+
+
+def test_library_that_came_with_the_campaign_is_used_where_its_hash_is_the_planned_one(tmp_path: Path) -> None:
+    library = changed_library(tmp_path)
+    plan = planned(tmp_path, f"trials = 1\nsamples = 300\ndevices = ['inproc:{library}']\n", [str(library)])
+    files = device_files(plan.devices)
+    library.unlink()
+    with pytest.raises(ConfigurationError, match=r"own\.so"):
+        device_of(plan.devices[0])
+    builds.supply(dict.fromkeys(files, b"another"), tmp_path / "worker")
+    with pytest.raises(ConfigurationError, match=r"own\.so"):
+        device_of(plan.devices[0])
+    builds.supply(files, tmp_path / "worker")
+    program = device_of(plan.devices[0]).program
+    assert program is not None
+    assert (program.parent, program.read_bytes()) == (tmp_path / "worker", LIBRARY.read_bytes() + b" ")
 
 
 @pytest.mark.parametrize("device", ["qemu-m4:{file}", "inproc:{file}"])
