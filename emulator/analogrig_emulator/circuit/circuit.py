@@ -17,7 +17,7 @@ from typing import Any, Never, TypeAlias, TypeVar
 
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier, breakpoint_fault
 from analogrig_emulator.circuit.opamp import OpAmpModel
-from analogrig_emulator.circuit.part import GROUND, Part
+from analogrig_emulator.circuit.part import GROUND, CircuitPart
 from analogrig_emulator.circuit.pot import check_dial
 from analogrig_emulator.errors import CircuitError
 
@@ -25,7 +25,7 @@ _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
 @dataclass(frozen=True)
-class _TwoEnded(Part):
+class _TwoEnded(CircuitPart):
     a: str
     b: str
 
@@ -61,7 +61,7 @@ class Capacitor(_TwoEnded):
 
 
 @dataclass(frozen=True)
-class Pot(Part):
+class Pot(CircuitPart):
     """A track of track_ohm from top to bottom; dial 0 puts the wiper at the bottom, 1 at the top."""
 
     positive = ("track_ohm",)
@@ -82,7 +82,7 @@ class Pot(Part):
 
 
 @dataclass(frozen=True)
-class OpAmp(Part):
+class OpAmp(CircuitPart):
     """An op-amp; its state, if the model has one, is the voltage behind the output resistance."""
 
     plus: str
@@ -107,7 +107,7 @@ class OpAmp(Part):
 
 
 @dataclass(frozen=True)
-class _Source(Part):
+class _Source(CircuitPart):
     plus: str
     minus: str = GROUND
 

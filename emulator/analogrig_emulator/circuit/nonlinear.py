@@ -19,7 +19,7 @@ from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import ClassVar
 
-from analogrig_emulator.circuit.part import GROUND, Part
+from analogrig_emulator.circuit.part import GROUND, CircuitPart
 from analogrig_emulator.engine.system import Kink, Product
 from analogrig_emulator.errors import CircuitError
 
@@ -120,7 +120,7 @@ MULTIPLIERS: Mapping[str, MultiplierModel] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class Multiplier(Part):
+class Multiplier(CircuitPart):
     """Four-quadrant multiplier: v(out) = v(x) v(y) / scale_v, but for the errors of its model.
 
     scale_v: 10 V in a usual machine. A negative scale is a differential x input with its two ends exchanged. The same
@@ -154,7 +154,7 @@ class Multiplier(Part):
 
 
 @dataclass(frozen=True)
-class Function(Part):
+class Function(CircuitPart):
     """Diode function generator: v(out) is a function of v(x) in straight pieces.
 
     breakpoints: at least two pairs (v(x), v(out)) in V, with v(x) ascending. The first and the last piece go on beyond

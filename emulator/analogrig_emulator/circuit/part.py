@@ -9,7 +9,7 @@ GROUND = "0"
 
 
 @dataclass(frozen=True)
-class Part:
+class CircuitPart:
     """Common part of all elements: name, and the constraints on the fields."""
 
     positive: ClassVar[tuple[str, ...]] = ()
