@@ -57,7 +57,7 @@ export OPENBLAS_NUM_THREADS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
-        cost coverage bit-exact analyze eva mutate mutants fuzz fuzz-serve faults hostile defects repositories line-faults packages kills \
+        cost coverage bit-exact analyze eva mutate mutants fuzz fuzz-serve faults hostile defects repositories line-faults packages programs kills \
         can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -106,6 +106,9 @@ metrics: ## figures of structure and documents; ARGS="dea2ac6 HEAD" compares com
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+programs: $(PRODUCTS) ## 100 random programs against their equations; ARGS="COUNT FIRST_SEED" draws others
+	@$(BIN)/python -m tests.benchmarks.soak_programs $(or $(ARGS),100)
 
 packages: $(PRODUCTS) ## the manifests of the C estimator under PlatformIO, ESP-IDF and kconfiglib; downloads 60 MB
 	@$(BIN)/python -m tests.estimator_c.ecosystems
