@@ -51,10 +51,13 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
+# Tests start thousands of processes, several at a time: none compiles the modules again or spreads over all processors.
+unexport PYTHONDONTWRITEBYTECODE
+export OPENBLAS_NUM_THREADS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
-        cost coverage bit-exact analyze eva mutate mutants fuzz fuzz-serve faults hostile defects repositories line-faults packages kills \
+        cost coverage bit-exact analyze eva mutate mutants fuzz fuzz-serve faults hostile defects repositories line-faults packages programs kills \
         can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -103,6 +106,9 @@ metrics: ## figures of structure and documents; ARGS="dea2ac6 HEAD" compares com
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+programs: $(PRODUCTS) ## 100 random programs against their equations; ARGS="COUNT FIRST_SEED" draws others
+	@$(BIN)/python -m tests.benchmarks.soak_programs $(or $(ARGS),100)
 
 packages: $(PRODUCTS) ## the manifests of the C estimator under PlatformIO, ESP-IDF and kconfiglib; downloads 60 MB
 	@$(BIN)/python -m tests.estimator_c.ecosystems

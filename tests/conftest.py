@@ -33,12 +33,16 @@ ALLOWED_SKIPS = os.environ.get("ANALOGRIG_CI", "")
 LACKING = pytest.StashKey[tuple[str, ...]]()
 SLOWEST = (
     "test_foreign_repositories",
-    "test_readme_commands",
-    "test_coverage",
+    "test_fault_runs",
     "test_shipped_properties",
+    "test_readme_commands",
+    "test_guest",
+    "test_cost",
+    "test_planted_defects",
+    "test_kills",
     "test_packaging",
 )
-"""Modules to start with: one that is left for the end has a processor to itself while others are idle."""
+"""Modules to start with, in order: one that is left for the end has a processor to itself while others are idle."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -70,7 +74,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if lacking:
             item.stash[LACKING] = lacking
             item.add_marker(pytest.mark.skip(reason=tools.reason(lacking)))
-    items.sort(key=lambda item: item.path.stem not in SLOWEST)
+    rank = {name: number for number, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(SLOWEST)))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -23,6 +23,7 @@ from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.description import describe
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario
+from analogrig_emulator.machine.compiler import load_program
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "harness" / "docs"
@@ -106,6 +107,8 @@ def test_every_toml_file_of_a_page_is_accepted(page: Path, tmp_path: Path) -> No
                 config.build(RealDescription, {**rest, **rig}, "rig")
         elif table.get("kind") == "emulator":
             describe(str(path))
+        elif "equations" in table:
+            load_program(path)
         elif "trials" in table:
             CampaignSpec.load(str(path))
         elif "kind" in table:

@@ -127,7 +127,7 @@ def test_rig_is_played_behind_the_served_instrument(example: Path) -> None:
 @pytest.mark.parametrize("example", ["campaign"], indirect=True)
 def test_campaign_is_played(example: Path) -> None:
     run("analogrig campaign campaign.toml --workers 1", example)
-    assert list((example / "build" / "campaign").glob("*.json"))
+    assert list((example / "build" / "campaign").glob("*.sqlite"))
 
 
 def scripts() -> list[str]:

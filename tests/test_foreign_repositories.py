@@ -121,15 +121,16 @@ def without(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def with_ours(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The programs of an environment with analogrig[pytest], of the Python version of the parameter."""
-    python = sys.executable if request.param == THIS else interpreter(request.param)
-    return (
-        made_once(
-            tmp_path_factory,
-            f"with_{request.param}",
-            lambda folder: environment_with(folder, f"{wheel}[pytest]", python=python),
-        )
-        / "bin"
+    if request.param == THIS:
+        users: Path = request.getfixturevalue("users_environment")
+        return users
+    python = interpreter(request.param)
+    made = made_once(
+        tmp_path_factory,
+        f"with_{request.param}",
+        lambda folder: environment_with(folder, f"{wheel}[pytest]", python=python),
     )
+    return made / "bin"
 
 
 def repository(folder: Path, way: Way, *, packages: bool) -> Path:

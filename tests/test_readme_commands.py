@@ -15,7 +15,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pytest
@@ -55,6 +55,7 @@ def commands() -> list[tuple[str, str]]:
 
 
 COMMANDS = commands()
+ENTER = ". .venv/bin/activate"
 
 
 def statuses(comment: str) -> set[int]:
@@ -94,20 +95,35 @@ def wait_for_port() -> None:
     pytest.fail(f"port {SERVED_PORT} is in use, and README.md serves there")
 
 
-@pytest.fixture(scope="module")
-def ended(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, tuple[int, str]]:
-    """Status and output of each command that was run."""
-    checkout = copy(tmp_path_factory.mktemp("readme") / "checkout")
-    pasted = [
-        f"{command}\nprintf '\\n%s %s\\n' '{END_OF}' $?\n"
+def chosen(tests: Iterable[pytest.Item]) -> list[str]:
+    """Commands to run, in order: those that need tools work without the others, and the others without those.
+
+    A session with the tests of one sort alone, as `.ci/run` has two, runs that sort and enters the environment.
+    """
+    sorts = {
+        bool(needed(str(test.callspec.params["command"])))
+        for test in tests
+        if isinstance(test, pytest.Function) and test.path == Path(__file__) and hasattr(test, "callspec")
+    }
+    return [
+        command
         for command, _ in COMMANDS
-        if not tools.missing(needed(command))
+        if (bool(needed(command)) in (sorts or {False}) or command == ENTER) and not tools.missing(needed(command))
     ]
+
+
+@pytest.fixture(scope="module")
+def ended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, tuple[int, str]]:
+    """Status and output of each command that was run."""
+    run = chosen(request.session.items)
+    checkout = copy(tmp_path_factory.mktemp("readme") / "checkout")
+    pasted = [f"{command}\nprintf '\\n%s %s\\n' '{END_OF}' $?\n" for command in run]
     drop = ("ANALOGRIG", "HIL", "PYTEST", "VIRTUAL_ENV", "MAKE", "MFLAGS", "NO_COLOR", "FORCE_COLOR", "CLICOLOR")
     environment = {key: value for key, value in os.environ.items() if not key.startswith(drop)}
     environment |= {
         "PYTHONPATH": f"{checkout / 'harness'}{os.pathsep}{checkout / 'emulator'}",  # of the copy, not of the checkout
         "PYTEST_ARGS": "-p no:cacheprovider tests/harness/test_frame.py",
+        "JOBS": "1",
     }
     wait_for_port()
     shell = subprocess.run(
@@ -115,7 +131,6 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, tuple[int, s
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     parts = re.split(rf"^{END_OF} (\d+)\n", shell.stdout, flags=re.MULTILINE)
-    run = [command for command, _ in COMMANDS if not tools.missing(needed(command))]
     assert len(parts) == 2 * len(run) + 1, (
         f"a command has read the lines that follow it, or ended the shell:\n{shell.stdout}"
     )

@@ -57,9 +57,10 @@ def without_blocks(text: str) -> str:
 def tree() -> set[str]:
     """Files and folders of the checkout by every end of their paths: a page may leave out what its reader knows."""
     ends = set()
-    for path in CHECKOUT.rglob("*"):
+    tops = [path for path in CHECKOUT.iterdir() if path.name not in {".git", ".venv", "build"}]
+    for path in (path for top in tops for path in (top, *top.rglob("*"))):
         parts = path.relative_to(CHECKOUT).parts
-        if parts[0] not in {".git", ".venv", "build"} and "__pycache__" not in parts:
+        if "__pycache__" not in parts:
             ends |= {"/".join(parts[i:]) for i in range(len(parts))}
     return ends
 

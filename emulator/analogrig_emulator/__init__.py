@@ -3,7 +3,7 @@
 Start with SuspensionComputer, Excitation and Sampler.
 """
 
-from analogrig_emulator.card.acquisition import acquired, probes_per_sample
+from analogrig_emulator.card.acquisition import acquired, ahead_ticks, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.circuit import (
@@ -11,6 +11,7 @@ from analogrig_emulator.circuit.circuit import (
     Circuit,
     CurrentSource,
     DiodeLimiter,
+    Element,
     OpAmp,
     Pot,
     Resistor,
@@ -20,15 +21,18 @@ from analogrig_emulator.circuit.circuit import (
 from analogrig_emulator.circuit.components import (
     COMPONENTS,
     DIELECTRICS,
+    MULTIPLIER_GRADES,
     NOMINAL,
     OP_AMP_GRADES,
     Components,
     Dielectric,
     Grade,
+    MultiplierGrade,
     OpAmpGrade,
     PotGrade,
 )
 from analogrig_emulator.circuit.nodal import piecewise_linear
+from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn
 from analogrig_emulator.circuit.spice import Deck, to_spice
@@ -41,8 +45,10 @@ from analogrig_emulator.errors import (
     ExcitationError,
     ModeError,
     PotError,
+    ProgramError,
     SamplerError,
 )
+from analogrig_emulator.machine.compiler import PatchedProgram, load_program
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
 from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
@@ -60,6 +66,8 @@ __all__ = [
     "FRONT",
     "IDEAL",
     "LAMP_DELAY_S",
+    "MULTIPLIERS",
+    "MULTIPLIER_GRADES",
     "NOMINAL",
     "OP_AMP_GRADES",
     "PROGRAMS",
@@ -81,21 +89,27 @@ __all__ = [
     "Dielectric",
     "DiodeLimiter",
     "Edges",
+    "Element",
     "EmulatorError",
     "Engine",
     "EngineError",
     "Excitation",
     "ExcitationError",
     "ForceLaw",
+    "Function",
     "Grade",
     "Mass",
     "Mode",
     "ModeError",
+    "Multiplier",
+    "MultiplierGrade",
+    "MultiplierModel",
     "NoisySuspension",
     "OpAmp",
     "OpAmpGrade",
     "OpAmpModel",
     "Parameter",
+    "PatchedProgram",
     "PiecewiseLinear",
     "Pot",
     "PotError",
@@ -103,6 +117,7 @@ __all__ = [
     "PotModel",
     "PotTurn",
     "Program",
+    "ProgramError",
     "Repeat",
     "RepeatedPlay",
     "Resistor",
@@ -119,9 +134,11 @@ __all__ = [
     "TwoMassProgram",
     "VoltageSource",
     "acquired",
+    "ahead_ticks",
     "drawn_levels",
     "drawn_offsets_v",
     "is_repeatable",
+    "load_program",
     "piecewise_linear",
     "preset",
     "probes_per_sample",

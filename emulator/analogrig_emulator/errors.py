@@ -3,6 +3,7 @@
 * EmulatorError
   x CircuitError      invalid netlist: duplicate name, bad value, floating node, singular matrix
   x PotError          a setting beyond the track of a pot
+  x ProgramError      a program file that is malformed, or that no patch on the machine can solve
   x ExcitationError   invalid generator setting
   x ModeError         request that the mode of the machine does not allow
   x SamplerError      invalid card description or voltage
@@ -26,6 +27,10 @@ class CircuitError(EmulatorError):
 
 class PotError(EmulatorError):
     """A coefficient or a dial beyond the track; the message names the pot and the value."""
+
+
+class ProgramError(EmulatorError):
+    """Invalid program file; the message names the file, the place and the cure."""
 
 
 class ExcitationError(EmulatorError):

@@ -34,6 +34,19 @@ ELSEWHERE = {
 }
 """Branches on a line with such a word cannot both be taken there, or in one build."""
 
+OWN_BUILDS = ("test_est_builds.py", "test_est_users.py")
+"""They compile the core for themselves, without counters."""
+RATES = (
+    "test_changed_parameter_is_named_in_time_and_its_extent_told",
+    "test_report_comes_within_twice_the_isolation_bound_on_average",
+    "test_change_that_two_others_at_once_look_like_for_long",
+    "test_two_changes_at_once_are_not_taken_for_one",
+    "test_random_plants_are_isolated_as_well",
+    "test_false_alarms_are_rarer_than_promised",
+)
+"""Tests that repeat a trial hundreds of times for a rate: the others have to reach every line without them."""
+KEPT = " and ".join(f"not {name}" for name in RATES)
+
 
 @dataclass
 class Coverage:
@@ -63,9 +76,9 @@ def measured(pytest_arguments: tuple[str, ...] = ()) -> Coverage:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         tests = sorted(str(path) for path in (ROOT / "tests" / "estimator_c").glob("test_est_*.py"))
-        slow = ("test_fuzz.py", "test_est_builds.py")  # builds of their own
-        chosen = [path for path in tests if not path.endswith(slow)]
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *pytest_arguments]
+        chosen = [path for path in tests if not path.endswith(OWN_BUILDS)]
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-k", KEPT]
+        command += pytest_arguments
         environment = os.environ | {"EST_COVERAGE": str(folder)}
         subprocess.run([*command, *chosen], cwd=ROOT, env=environment, check=True, stdout=subprocess.DEVNULL)
         return _read(folder)

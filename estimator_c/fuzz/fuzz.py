@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 ESTIMATOR = Path(__file__).parents[1]
@@ -28,14 +30,18 @@ _FLAGS = ("-std=c99", *_SANITIZED, "-ffp-contract=off", "-DEST_NC_MAX=2U", *_INC
 
 
 def build(target: str, folder: Path) -> Path:
-    """The program of a target, in ``folder``.
+    """The program of a target, in ``folder``, where the next target finds the C that they share compiled.
 
     :raises subprocess.CalledProcessError: it does not compile.
     """
-    program = folder / target
-    parts = [path for part in PARTS for path in sorted(part.glob("*.c"))]
+    program, objects = folder / target, folder / "objects"
+    if not objects.is_dir():
+        parts = [path for part in PARTS for path in sorted(part.glob("*.c"))]
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            subprocess.run(["clang", *_FLAGS, "-c", *map(str, parts)], cwd=scratch, check=True)
+            shutil.copytree(scratch, objects)
     line = [HERE / "fuzz_line.c", *sorted(LOOP.glob("*_line.c"))] if target in LINES else []
-    sources = [HERE / f"{target}.c", *line, *parts]
+    sources = [HERE / f"{target}.c", *line, *objects.glob("*.o")]
     subprocess.run(["clang", *_FLAGS, *map(str, sources), "-o", str(program)], check=True)
     return program
 
@@ -55,6 +61,7 @@ def main() -> int:
     """Fuzz every target in the folder that is the first argument."""
     folder, seconds = Path(sys.argv[1]).resolve(), int(os.environ["FUZZ_S"])
     folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder / "objects", ignore_errors=True)  # of the C as it was
     for target in LONGEST_INPUT:
         tried, log = fuzz(build(target, folder), seconds)
         if not tried:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import json
 import math
 import re
@@ -23,7 +24,7 @@ from analogrig_emulator import EmulatorError
 
 T = TypeVar("T")
 
-Kind = Literal["scenarios", "rigs", "devices", "campaigns"]
+Kind = Literal["scenarios", "rigs", "devices", "campaigns", "programs"]
 
 MAX_FILE_BYTES = 1_000_000
 
@@ -215,8 +216,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
     :raises ConfigurationError: unknown or lacking key, wrong type, or a value that ``cls`` refuses by ValueError.
     """
-    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls)) if field.init}
-    hints = typing.get_type_hints(cls)
+    fields, hints = _fields(typing.cast(Any, cls))
     for key in table:
         if key not in fields:
             raise ConfigurationError(f"{where}: unknown key {_quote(key)} (known: {', '.join(fields)})")
@@ -230,6 +230,12 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     except (ValueError, ArithmeticError, ConfigurationError, EmulatorError) as error:
         table_name = where.rpartition(": ")[2]
         raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
+
+
+@functools.cache
+def _fields(cls: type[Any]) -> tuple[dict[str, dataclasses.Field[Any]], dict[str, Any]]:
+    """Fields of a dataclass that a table may set, and the types of all its fields, by name."""
+    return {field.name: field for field in dataclasses.fields(cls) if field.init}, typing.get_type_hints(cls)
 
 
 def convert(hint: Any, value: Any, where: str) -> Any:

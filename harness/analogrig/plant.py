@@ -7,6 +7,7 @@ the samples of a run.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -133,7 +134,7 @@ class SampledPlant:
     @classmethod
     def from_plant(cls, plant: Plant, period_s: float) -> SampledPlant:
         """Discretise with ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
-        return cls.from_plants([plant], period_s)[0]
+        return _sampled(plant, period_s)
 
     @classmethod
     def from_plants(cls, plants: Sequence[Plant], period_s: float) -> list[SampledPlant]:
@@ -150,6 +151,12 @@ class SampledPlant:
         xx, xv, vx, vv = self.transition
         xf, vf = self.response
         return (xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n)
+
+
+@functools.lru_cache(maxsize=64)
+def _sampled(plant: Plant, period_s: float) -> SampledPlant:
+    """Discretised plant; the trials of a campaign ask for the same few."""
+    return SampledPlant.from_plants([plant], period_s)[0]
 
 
 def discretise(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:

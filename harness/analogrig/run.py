@@ -7,6 +7,7 @@ The file is an uncompressed ``.npz``: the arrays under their own names, and ``he
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -218,10 +219,10 @@ class Run:
         """Number of samples that were played."""
         return len(self.codes)
 
-    @property
+    @functools.cached_property
     def datasheet(self) -> Datasheet:
         """Data sheet of the device."""
-        return Datasheet.recorded(self.conditions.dut)
+        return _datasheet_of(self.conditions.dut)
 
     @property
     def missing(self) -> NDArray[np.bool_]:
@@ -480,3 +481,14 @@ def _parse_conditions(header: Any, path: Path) -> Conditions:
         return config.build(Conditions, table, f"{path}: the header of the recording")
     except ConfigurationError as error:
         raise RecordingError(str(error)) from error
+
+
+_datasheet: tuple[Mapping[str, Any], Datasheet] | None = None
+"""Last data sheet, and the description that it is from: consecutive runs of a device share their description."""
+
+
+def _datasheet_of(dut: Mapping[str, Any]) -> Datasheet:
+    global _datasheet  # noqa: PLW0603 - a cache of one entry
+    if _datasheet is None or _datasheet[0] is not dut:
+        _datasheet = dut, Datasheet.recorded(dut)
+    return _datasheet[1]

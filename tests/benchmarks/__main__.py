@@ -23,6 +23,7 @@ from typing import Any
 from . import (
     bench_adapters,
     bench_calibration,
+    bench_campaign,
     bench_certificates,
     bench_detection,
     bench_detectors,
@@ -53,6 +54,7 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "trials": bench_trials.figures,
     "certificates": bench_certificates.figures,
     "calibration": bench_calibration.figures,
+    "campaign": bench_campaign.figures,
     "self-test": bench_self_test.figures,
     "onset": bench_onset.figures,
     "properties": bench_properties.figures,
@@ -60,7 +62,7 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "reality": bench_reality.figures_of,
 }
 
-OPTIONED = {"reality", "statistics"}
+OPTIONED = {"campaign", "reality", "statistics"}
 """Benchmarks that take options."""
 
 

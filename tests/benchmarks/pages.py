@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_certificates, bench_detectors, bench_reality
+from . import bench_campaign, bench_certificates, bench_detectors, bench_reality
 
 FOLDER = Path("harness/docs/evidence")
 
@@ -21,6 +21,7 @@ TITLES: Mapping[str, str] = {
     "trials": "Closed-loop trials and certificates",
     "certificates": "Error probabilities of certificates",
     "calibration": "Calibration of drawn rigs",
+    "campaign": "Campaigns of many trials",
     "self-test": "Self-test of drawn rigs",
     "onset": "Dating of changes",
     "properties": "False failures of the shipped properties",
@@ -33,6 +34,7 @@ CROSSED = {"certificates", "detectors", "reality"}
 """Benchmarks whose figures are named ROW: COLUMN, and whose page is a table of these."""
 
 NOTES: Mapping[str, str] = {
+    "campaign": bench_campaign.NOTE,
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
     "reality": bench_reality.NOTE,

@@ -23,6 +23,7 @@ from analogrig_emulator import (
     OpAmp,
     Pot,
     PotTurn,
+    RepeatedPlay,
     Resistor,
     SuspensionComputer,
     Switch,
@@ -30,6 +31,7 @@ from analogrig_emulator import (
     piecewise_linear,
 )
 from analogrig_emulator.circuit.nodal import Nodal, analyse
+from analogrig_emulator.engine import engine as engine_module
 
 Volts = NDArray[np.float64]
 
@@ -144,6 +146,22 @@ def test_return_to_an_earlier_circuit_is_that_circuit(others: int) -> None:
     fresh.run(1, EDGES)
     engine.state = fresh.state = engine.state
     assert engine.run(5).tobytes() == fresh.run(5).tobytes()
+
+
+@pytest.mark.parametrize("program", ["front", "bump-stop", "two-mass"])
+def test_other_offsets_have_the_bits_of_a_new_engine(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference gets no engine that was used before, and builds every mode."""
+    computer = SuspensionComputer(program)
+    jumps = [PotTurn(150, {f"{next(iter(computer.dials))}_dial": 0.3})]
+    repeated = RepeatedPlay(computer, 300, jumps)
+    for number, seed in enumerate((1, 2, 1)):
+        offsets_v = np.random.default_rng(seed).uniform(-3e-3, 3e-3, computer.program.amplifiers)
+        monkeypatch.setattr(engine_module, "_idle", {})
+        new = RepeatedPlay(computer, 300, jumps)
+        assert repeated.play(LOUD, offsets_v).volts.tobytes() == new.play(LOUD, offsets_v).volts.tobytes()
+        built, built_anew = repeated._engine.counts.modes_built, new._engine.counts.modes_built
+        assert built_anew > 0
+        assert built < built_anew or number == 0
 
 
 def test_engine_that_is_used_again_begins_at_rest() -> None:

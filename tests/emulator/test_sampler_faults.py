@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig_emulator import (
     CARDS,
+    TICKS_PER_SAMPLE,
     Card,
     Excitation,
     PotTurn,
@@ -44,12 +45,19 @@ class Wave:
         self.channels = channels
 
     def play(
-        self, excitation: Excitation, samples: int, tweaks: Sequence[PotTurn] = (), block_samples: int = 256
+        self,
+        excitation: Excitation,
+        samples: int,
+        tweaks: Sequence[PotTurn] = (),
+        block_samples: int = 256,
+        ahead_ticks: int = 0,
     ) -> Iterator[Volts]:
         del excitation, tweaks
-        times = np.arange(samples) / self.sample_rate_hz * 1e6
+        instants = [0, ahead_ticks] if ahead_ticks else [0]
+        ticks = np.arange(samples)[:, None] * TICKS_PER_SAMPLE + np.repeat(instants, self.channels)
+        times = ticks / TICKS_PER_SAMPLE / self.sample_rate_hz * 1e6
         for first in range(0, samples, block_samples):
-            yield np.tile(times[first : first + block_samples, None], self.channels)
+            yield times[first : first + block_samples]
 
 
 def times_us(card: Card, samples: int, block_samples: int = 7, seed: int = 1) -> Volts:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,15 @@ UNCHECKED = "-DEST_WITH_CHECKS=0"
 MINIMAL = {"refresh_n": 0, "stuck_n": 0, "idle_n": 0, "edge_instants": LOCKED}
 FREE = {"na": 2, "nb": 3, "nk": 0, "nc": 0, "offset": 1}
 CARD = {"na": 2, "nb": 2, "nk": 1, "nc": 0, "offset": 0}
+
+
+Build = Callable[..., Estimator]
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
+    """The driver with options, compiled once."""
+    return functools.cache(lambda *options: Estimator(compile_driver(tmp_path_factory.mktemp("build"), *options)))
 
 
 def fixed(shape: dict[str, int]) -> tuple[str, ...]:
@@ -38,18 +49,18 @@ def fixed(shape: dict[str, int]) -> tuple[str, ...]:
     ids=["size", "fixed", "fixed minimal", "minimal", "least", "no extended least squares", "another compiler"],
 )
 def test_builds_agree_to_the_bit(
-    estimator: Estimator, tmp_path: Path, options: tuple[str, ...], settings: dict[str, int], shape: dict[str, int]
+    estimator: Estimator, build: Build, options: tuple[str, ...], settings: dict[str, int], shape: dict[str, int]
 ) -> None:
     expanded = [option for name in options for option in (fixed(shape) if name == "fixed" else (name,))]
-    other = Estimator(compile_driver(tmp_path, *expanded))
+    other = build(*expanded)
     changes = [(0, FRONT), (500, (115.0, 3021.0, 18000.0))]
     edges = np.arange(10.0, 900.0, 50.0)
     u, y = suspension(changes, edges + (edges - 300.0) * 2e-5, 900, 1.0, 2)
     valid = np.arange(900) % 211 != 57
     results = []
-    for build in (estimator, other):
-        assert build.init(**(shape | settings))
-        results.append(build.run(u, y - 410.0, valid))
+    for each in (estimator, other):
+        assert each.init(**(shape | settings))
+        results.append(each.run(u, y - 410.0, valid))
     assert len(results[0].alarms)
     for field in ("theta", "innovation", "statistic", "status"):
         assert getattr(results[0], field).tobytes() == getattr(results[1], field).tobytes()
@@ -68,30 +79,30 @@ def test_builds_agree_to_the_bit(
     ids=["another shape", "edges", "another trigger", "random walk", "watch"],
 )
 def test_build_refuses_what_it_was_made_without(
-    tmp_path: Path, options: tuple[str, ...], settings: dict[str, int]
+    build: Build, options: tuple[str, ...], settings: dict[str, int]
 ) -> None:
-    build = Estimator(compile_driver(tmp_path, *options))
+    driver = build(*options)
     base = MINIMAL if options == WITHOUT else CARD
-    assert build.init(**base)
-    assert not build.init(**settings)
+    assert driver.init(**base)
+    assert not driver.init(**settings)
 
 
 @pytest.mark.parametrize(("option", "accepts"), [((), False), ((UNCHECKED,), True)], ids=["checks", "unchecked"])
 def test_build_without_checks_takes_the_configuration_at_its_word(
-    tmp_path: Path, option: tuple[str, ...], *, accepts: bool
+    build: Build, option: tuple[str, ...], *, accepts: bool
 ) -> None:
-    assert Estimator(compile_driver(tmp_path, *option)).init(forgetting=2.0) == accepts
+    assert build(*option).init(forgetting=2.0) == accepts
 
 
 @pytest.mark.parametrize("orders", [("-DEST_NB_MAX=1U", "-DEST_NK_MAX=0U"), fixed({**CARD, "nb": 1, "nk": 0})])
-def test_build_with_room_for_one_input_sees_edges_where_they_are(tmp_path: Path, orders: tuple[str, ...]) -> None:
-    build = Estimator(compile_driver(tmp_path, "-DEST_WITH_EDGES=0", *orders))
-    assert build.init(na=2, nb=1, nk=0, offset=0, edge_instants=LOCKED, stuck_n=4, refresh_n=0)
+def test_build_with_room_for_one_input_sees_edges_where_they_are(build: Build, orders: tuple[str, ...]) -> None:
+    driver = build("-DEST_WITH_EDGES=0", *orders)
+    assert driver.init(na=2, nb=1, nk=0, offset=0, edge_instants=LOCKED, stuck_n=4, refresh_n=0)
     u, y = np.full(40, 1000.0), np.full(40, 1500.0)
-    assert build.run(u, y).counters["stuck"] == 0, "u never moves"
+    assert driver.run(u, y).counters["stuck"] == 0, "u never moves"
     u[20:] = 3000.0
-    assert build.init(na=2, nb=1, nk=0, offset=0, edge_instants=LOCKED, stuck_n=4, refresh_n=0)
-    assert build.run(u, y).counters["stuck"] == 17
+    assert driver.init(na=2, nb=1, nk=0, offset=0, edge_instants=LOCKED, stuck_n=4, refresh_n=0)
+    assert driver.run(u, y).counters["stuck"] == 17
 
 
 def room(most: int) -> tuple[str, ...]:

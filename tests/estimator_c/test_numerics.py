@@ -30,23 +30,23 @@ def excited(edges_n: int, samples: int, seed: int) -> tuple[Codes, Codes]:
     return suspension([(0, FRONT)], np.linspace(10.0, 50.0 * edges_n - 40.0, edges_n), samples, 1.0, seed)
 
 
-@pytest.mark.parametrize(
-    ("quiet_n", "noise_lsb"), [(10_000_000, 0.0), (2_000_000, 1.0)], ids=["silent", "1 LSB of noise"]
-)
-def test_millions_of_samples_without_excitation_do_no_harm(
-    estimator: Estimator, quiet_n: int, noise_lsb: float
-) -> None:
+QUIET_N = 2_000_000
+"""The weight halves 88,000 times: what grows by 0.1 % each time is beyond float32 by then, as exp(88) is."""
+
+
+@pytest.mark.parametrize("noise_lsb", [0.0, 1.0], ids=["silent", "1 LSB of noise"])
+def test_millions_of_samples_without_excitation_do_no_harm(estimator: Estimator, noise_lsb: float) -> None:
     """The driver asks est_invariants_hold() after every sample: theta finite, every d positive and finite."""
     rng = np.random.default_rng(1)
     assert estimator.init(forgetting=0.97, noise_estimated=0, ceiling=20.0)
     estimator.run(*excited(6, 400, seed=4))
-    for _ in range(quiet_n // BLOCK_N):
+    for _ in range(QUIET_N // BLOCK_N):
         y = REST_CODES + np.round(rng.normal(0.0, 1.0, BLOCK_N) * noise_lsb)
         quiet = estimator.run(np.zeros(BLOCK_N), y)
         assert np.isfinite(quiet.innovation).all()
         assert np.isfinite(quiet.variance).all()
         assert len(quiet.alarms) == 0
-    assert quiet.counters["updated"] == quiet_n + 400
+    assert quiet.counters["updated"] == QUIET_N + 400
     returned = estimator.run(*excited(6, 300, seed=3))
     assert returned.theta[10 + 30 :, :2] == pytest.approx(np.tile(A_FRONT, (260, 1)), abs=0.02)
     assert len(returned.alarms) == 0

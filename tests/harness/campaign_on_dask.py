@@ -14,9 +14,10 @@ from pathlib import Path
 def main(spec: str, out: str) -> None:
     from distributed import LocalCluster
 
-    from analogrig.campaigns.conduct import Tally, conduct
+    from analogrig.campaigns.conduct import conduct
     from analogrig.campaigns.plan import Plan
     from analogrig.campaigns.spec import CampaignSpec
+    from analogrig.campaigns.tally import Tally
     from analogrig.campaigns.workers import Dask
 
     with LocalCluster(  # type: ignore[no-untyped-call]  # Dask is annotated in part

@@ -295,13 +295,17 @@ def steps(exchange: ExchangeKind, link: LinkKind = "serial") -> dict[Direction, 
 
 
 def everywhere(
-    link: LinkKind, kind: str, exchange: ExchangeKind, stride: int = 1
+    link: LinkKind, kind: str, exchange: ExchangeKind, stride: int = 1, ends: int = 2
 ) -> Iterator[tuple[str, Direction, Case]]:
-    """A fault at every frame, or at every so many from each step's first: the step, the direction, the run."""
+    """A fault at every frame, or at every so many from each step's first: the step, the direction, the run.
+
+    :param ends: so many frames at either end of a step are among them; of the samples, two.
+    """
     for direction, names in steps(exchange, link).items():
         for step in STEPS:
             numbers = [number for number, name in enumerate(names) if name == step]
-            for number in {*numbers[:2], *numbers[::stride], *numbers[-2:]}:
+            n = 2 if step == "samples" else ends
+            for number in {*numbers[:n], *numbers[::stride], *numbers[-n:]}:
                 fault = WireFault(kind, direction, number)
                 first_seq = 250 if number % 2 else 0  # which wraps around in the handshake
                 yield step, direction, Case(WireFaults((fault,), seed=number), exchange, link, first_seq)
@@ -322,13 +326,15 @@ def documented(link: LinkKind) -> dict[tuple[str, Direction], dict[str, set[str]
     return table
 
 
-def outcomes_everywhere(link: LinkKind, kind: str, exchange: ExchangeKind, stride: int = 1) -> Counter[str]:
-    """Play a fault everywhere; how often each outcome came.
+def outcomes_everywhere(
+    link: LinkKind, kind: str, exchange: ExchangeKind, stride: int = 1, ends: int = 2
+) -> Counter[str]:
+    """Play a fault where ``everywhere`` has it; how often each outcome came.
 
     :raises AssertionError: one is not documented, or ``play`` did.
     """
     counted: Counter[str] = Counter()
-    for step, direction, case in everywhere(link, kind, exchange, stride):
+    for step, direction, case in everywhere(link, kind, exchange, stride, ends):
         played = play(case)
         assert played.outcome in documented(link)[kind, direction][step], (
             f"{step}: {case}: {played.outcome}: {played.why}"

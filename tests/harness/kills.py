@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from analogrig.campaigns.results import Results
+from analogrig.campaigns.store import Store
 from analogrig.config import read_toml
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
@@ -77,11 +78,15 @@ def check_run(now: Path, before: Path) -> None:
 
 def check_campaign(now: Path, before: Path) -> None:
     """No results, or all of them; never the older page without results."""
-    results, page = now / "out.json", now / "out.html"
+    results, page = now / "out.sqlite", now / "out.html"
+    is_ended = False
     if results.exists():
+        with Store.read(results) as store:
+            is_ended = store.is_ended
+    if is_ended:
         Results.load(results)  # which has every trial of the plan; under load some may be inconclusive
     elif page.exists():
-        assert not (now / "out.json.journal").exists(), "the page of an older campaign beside the journal of this one"
+        assert not results.exists(), "the page of an older campaign beside the store of this one"
         assert page.read_bytes() == (before / "out.html").read_bytes(), "a page without results"
     if page.exists():
         assert page.read_bytes().rstrip().endswith(b"</html>"), "half a page"
@@ -102,7 +107,7 @@ def check_nothing(_: Path, __: Path) -> None:
 
 CASES = {
     "run": Case(("run", "--dut", "host", "--out", "out"), check_run),
-    "campaign": Case(("campaign", "spec.toml", "--out", "out.json", "--workers", "2"), check_campaign),
+    "campaign": Case(("campaign", "spec.toml", "--out", "out.sqlite", "--workers", "2"), check_campaign),
     "certify": Case(
         ("certify", "--far", "2e-3", "--confidence", "0.9", "--dut", "host", "--workers", "2"), check_nothing
     ),
@@ -120,14 +125,13 @@ def prepared(folder: Path) -> Path:
     (folder / "twin.toml").write_text("# of an earlier calibration\n")
     for words in (
         ("run", "--dut", "inproc", "--seed", "7", "--out", "out"),
-        ("campaign", "spec.toml", "--out", "out.json", "--workers", "1"),
+        ("campaign", "spec.toml", "--out", "out.sqlite", "--workers", "1"),
     ):
         command = [sys.executable, "-m", "analogrig.cli", *words]
         subprocess.run(command, cwd=folder, stdout=subprocess.DEVNULL, timeout=LONG_S, check=False)
     outcome = json.loads((folder / "out" / "verdict.json").read_text())["outcome"]
     assert outcome == "passed", outcome
-    (folder / "out.json").unlink()
-    (folder / "out.json.identity").unlink()
+    (folder / "out.sqlite").unlink()
     return folder
 
 

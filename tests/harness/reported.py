@@ -45,7 +45,9 @@ def reported_run() -> Run:
     codes[:, 2:] = rng.integers(1000, 3000, (SAMPLES, 2))
     statistic = rng.exponential(1.0, SAMPLES).astype(np.float32)
     statistic[[FALSE_ALARM, NOTICED]] = 900.0
-    return replace(run, codes=codes, statistic=statistic)
+    innovation = rng.normal(size=SAMPLES).astype(np.float32)
+    innovation[:5] = 500.0  # before convergence
+    return replace(run, codes=codes, statistic=statistic, innovation=innovation)
 
 
 def reported_verdict(run: Run) -> Verdict:

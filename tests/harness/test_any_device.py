@@ -139,7 +139,7 @@ def test_page_shows_what_there_is(run: Run, ours: Run, tmp_path: Path) -> None:
         data = json.loads(page.split('<script type="application/json" id="run">')[1].split("</script>", maxsplit=1)[0])
         return {column["name"] for column in data["columns"]}
 
-    assert columns(whole) - columns(alarms) == {"M", "B", "K", "statistic"}
+    assert columns(whole) - columns(alarms) == {"M", "B", "K", "innovation", "statistic"}
 
 
 def test_device_without_settings_refuses_them_by_name() -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,17 @@ from scipy import stats
 
 from analogrig.bench import Bench
 from analogrig.campaigns.certificate import Certificate, Question, certify
-from analogrig.campaigns.comparison import Difference, adjust_by_holm, compare, load, match, permutation_p, sign_flip_p
+from analogrig.campaigns.comparison import (
+    Difference,
+    Observation,
+    Recorded,
+    adjust_by_holm,
+    compare,
+    compare_sides,
+    load,
+    permutation_p,
+    sign_flip_p,
+)
 from analogrig.campaigns.plan import rig_table
 from analogrig.campaigns.plays import Count
 from analogrig.campaigns.rows import Row
@@ -356,14 +366,21 @@ def test_sides_without_a_seed_in_common_are_compared_as_groups() -> None:
     assert found.identical == (0, 0)
 
 
+def recorded(path: Path) -> Sequence[Observation]:
+    """Trials of a folder of recordings."""
+    side = load(path)
+    assert isinstance(side, Recorded)
+    return side.trials
+
+
 def test_recordings_of_one_name_that_played_something_else_are_not_paired(tmp_path: Path) -> None:
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=700, name="drawn")
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for factor in (0.7, 0.9):
             drawn = dataclasses.replace(scenario, tweaks=(PotChange(400, stiffness_n_per_m=24500.0 * factor),))
             Bench(rig, dut).play(drawn, 0).save(tmp_path / "both" / str(factor) / "run.npz")
-    assert len(dict(load(tmp_path / "both").trials)) == 2
-    found = compare(load(tmp_path / "both" / "0.7").trials, load(tmp_path / "both" / "0.9").trials)
+    assert len(dict(recorded(tmp_path / "both"))) == 2
+    found = compare(recorded(tmp_path / "both" / "0.7"), recorded(tmp_path / "both" / "0.9"))
     assert found.identical == (0, 0)
 
 
@@ -391,7 +408,7 @@ def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.Captu
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for seed in range(2):
             Bench(rig, dut).play(scenario, seed).save(tmp_path / "a" / str(seed) / "run.npz")
-    played = [key for key, _ in load(tmp_path / "a").trials]
+    played = [key for key, _ in recorded(tmp_path / "a")]
     assert [key[2] for key in played] == [0, 1]
     assert played[0][:2] == played[1][:2]
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "0" / "run.npz"), "--json"]) == 0
@@ -421,7 +438,7 @@ def campaign(tmp_path: Path, name: str, *changes: tuple[str, str]) -> str:
         assert spec.count(old) == 1
         spec = spec.replace(old, new)
     (tmp_path / f"{name}.toml").write_text(spec)
-    out = str(tmp_path / f"{name}.json")
+    out = str(tmp_path / f"{name}.sqlite")
     assert main(["campaign", str(tmp_path / f"{name}.toml"), "--out", out, "--workers", "1"]) in (0, 1)
     return out
 
@@ -478,7 +495,7 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
     keen, calm = own_devices
     a = campaign(tmp_path, "a", ("DEVICES", f"{keen!r}, {calm!r}"))
     b = campaign(tmp_path, "b", ("DEVICES", f"{calm!r}, {keen!r}"))
-    found = compare(*match(load(Path(a)), load(Path(b))))
+    found = compare_sides(load(Path(a)), load(Path(b)))
     assert found.identical == (48, 48)
     assert not any(each.shown for each in found.differences)
 

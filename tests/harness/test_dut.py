@@ -823,3 +823,16 @@ def test_library_is_not_read_as_a_description(stranger: Path) -> None:
         ):
             describe(name)
     unnamed.rename(stranger)
+
+
+@pytest.mark.parametrize("samples", [0, 1, 3, 700])
+def test_codes_as_they_lie_in_a_block_give_the_bits_of_numbers(samples: int) -> None:
+    codes = np.random.default_rng(5).integers(200, 3800, (samples, 4)).astype(np.uint16)
+    valid = np.random.default_rng(6).uniform(size=samples) > 0.1
+    numbers = codes.astype(np.float32)
+    expected = Estimator().run(numbers[:, 0], numbers[:, 1], valid)
+    backwards = np.ascontiguousarray(codes[::-1])[::-1]
+    for u, y in ((codes[:, 0], codes[:, 1]), (codes[:, 0].copy(), codes[:, 1]), (backwards[:, 0], backwards[:, 1])):
+        steps = Estimator().run(u, y, valid)
+        for name in ("theta", "innovation", "statistic", "status", "alarms"):
+            assert getattr(steps, name).tobytes() == getattr(expected, name).tobytes()

@@ -25,6 +25,12 @@ from tests.harness.fault_runs import (
 )
 from tests.harness.firmware import needs_firmware
 
+TALKED_OVER = {("serial", "sample"), ("can", "sample"), ("can-fd", "block")}
+"""Of the ways of a link that on which every step has its second frame and its last but one tried.
+
+Only the samples go otherwise on the others: handshake, configuration, start and stop are the same conversation.
+"""
+
 
 def test_every_fault_is_documented() -> None:
     for link, faulty in FAULTY.items():
@@ -34,8 +40,9 @@ def test_every_fault_is_documented() -> None:
 @pytest.mark.parametrize(("link", "exchange"), WAYS)
 def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchange: ExchangeKind) -> None:
     stride = 20 if link == "serial" else 100
+    ends = 2 if (link, exchange) in TALKED_OVER else 1
     for kind in FAULTY[link].KINDS:
-        assert outcomes_everywhere(link, kind, exchange, stride).total() > 20
+        assert outcomes_everywhere(link, kind, exchange, stride, ends).total() > 15
 
 
 @pytest.mark.parametrize("first", range(0, 1000, 500))

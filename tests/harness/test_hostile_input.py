@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analogrig.campaigns.conduct import journal_of
-from analogrig.campaigns.journal import Journal
+from analogrig.campaigns.conduct import conduct
 from analogrig.campaigns.plan import Plan
-from analogrig.campaigns.plays import play_chunk
 from analogrig.campaigns.spec import CampaignSpec
+from analogrig.campaigns.store import Store
+from analogrig.campaigns.workers import Processes
 from analogrig.catalogue import Change
 from analogrig.cli import main
-from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.errors import ConfigurationError
 from analogrig.recordings.files import CapturedFrames
+from analogrig.reporting.campaign import as_json
 from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, counter_text, number_of, one_line
 
@@ -356,50 +357,10 @@ def planned(tmp_path: Path) -> Plan:
     return Plan.of(CampaignSpec.load(str(tmp_path / "spec.toml")))
 
 
-@pytest.mark.parametrize(
-    "forge",
-    [
-        lambda rows: {"chunk": [7, 0], "rows": rows},
-        lambda rows: {"chunk": [0, -1], "rows": rows},
-        lambda rows: {"chunk": [0], "rows": rows},
-        lambda rows: {"chunk": [0, "x"], "rows": rows},
-        lambda _: {"chunk": [0, 0], "rows": []},
-        lambda rows: {"chunk": [0, 0], "rows": [{**row, "seed": row["seed"] + 1} for row in rows]},
-        lambda rows: {"chunk": [0, 0], "rows": [{**rows[0], "errors": [1e400, 1, 1]}, rows[1]]},
-    ],
-)
-def test_forged_line_of_a_journal_is_refused(
-    tmp_path: Path, forge: Callable[[list[Any]], object], capsys: pytest.CaptureFixture[str]
-) -> None:
-    plan, out = planned(tmp_path), tmp_path / "out.json"
-    with Journal(journal_of(out), plan):
-        pass
-    text = json.dumps(forge(play_chunk(plan.as_json(), (0, 0)))).encode()
-    append(journal_of(out), text)
-    argv = ["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]
-    assert f"{journal_of(out)}: a line that no campaign writes" in refused(argv, capsys)
-    with pytest.raises(RecordingError):
-        Journal(journal_of(out), plan)
-
-
-def append(path: Path, text: bytes) -> None:
-    path.write_bytes(path.read_bytes() + b"%08x %s\n" % (zlib.crc32(text), text))
-
-
-@pytest.mark.parametrize("text", [b"not JSON", b"[" * 100_000])
-def test_line_of_a_journal_that_is_no_json_counts_as_damaged(tmp_path: Path, text: bytes) -> None:
-    plan, out = planned(tmp_path), tmp_path / "out.json"
-    with Journal(journal_of(out), plan):
-        pass
-    append(journal_of(out), text)
-    with Journal(journal_of(out), plan) as journal:
-        assert not journal.rows
-
-
 def test_too_few_open_files_for_workers_is_one_line(tmp_path: Path) -> None:
     planned(tmp_path)
     ran = command(
-        "campaign", str(tmp_path / "spec.toml"), "--workers", "2", "--out", str(tmp_path / "o.json"), files=16
+        "campaign", str(tmp_path / "spec.toml"), "--workers", "2", "--out", str(tmp_path / "o.sqlite"), files=16
     )
     assert ran.returncode == 2
     assert ran.stderr.startswith("analogrig: only 16 files may be open at once, and workers need ")
@@ -443,11 +404,12 @@ def test_scheduler_that_dies_is_one_line_and_the_campaign_goes_on_from_there(
     tmp_path: Path, cluster: tuple[str, subprocess.Popen[bytes]], end: signal.Signals
 ) -> None:
     address, scheduler = cluster
-    spec, out = tmp_path / "spec.toml", tmp_path / "out.json"
-    spec.write_text("trials = 2000\nchunk = 2\nsamples = 300\n")
+    spec, out = tmp_path / "spec.toml", tmp_path / "out.sqlite"
+    spec.write_text("trials = 4000\nsamples = 300\n")
     argv = [sys.executable, "-m", "analogrig.cli", "campaign", str(spec), "--out", str(out)]
     with subprocess.Popen([*argv, "--cluster", address], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as campaign:
-        until(lambda: journal_of(out).exists() and journal_of(out).read_bytes().count(b"\n") > 3, campaign, scheduler)
+        log = out.with_name("out.sqlite-wal")
+        until(lambda: log.exists() and log.stat().st_size > 20_000, campaign, scheduler)
         os.kill(scheduler.pid, end)
         _, stderr = campaign.communicate(timeout=300)
     assert campaign.returncode == 3, stderr
@@ -456,9 +418,12 @@ def test_scheduler_that_dies_is_one_line_and_the_campaign_goes_on_from_there(
     )
     assert stderr.decode().startswith(said)
     assert stderr.count(b"\n") == 1
-    kept = journal_of(out).read_bytes().count(b"\n")
-    with Journal(journal_of(out), Plan.of(CampaignSpec.load(str(spec)))) as journal:
-        assert len(journal.rows) == kept - 1
+    plan = Plan.of(CampaignSpec.load(str(spec)))
+    with Store.read(out) as store:
+        kept = sum(part.trials for part, _ in store.parts(plan))
+    assert 0 < kept < 4000
+    resumed, whole = (conduct(plan, Processes(2), path) for path in (out, tmp_path / "whole.sqlite"))
+    assert as_json(resumed) == as_json(whole)
 
 
 # --------------------------------------------------------------------------------------------------------------- words

@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from analogrig import identity as identity_module
-from analogrig.campaigns.builds import load_commands
+from analogrig.campaigns.results import Results
 from analogrig.cli import main
 from analogrig.config import fixtures
 from analogrig.devices.library import LIBRARY
@@ -195,21 +195,18 @@ def test_campaign_is_the_same_whoever_played_it_and_says_who(
 
     with monkeypatch.context() as patched:
         patched.setattr("analogrig.campaigns.workers.ThisProcess.play", interrupted)
-        assert main([*words, "one.json"]) == 130
-    for name in ("one.json", "two.json"):
+        assert main([*words, "one.sqlite"]) == 130
+    for name in ("one.sqlite", "two.sqlite"):
         assert main([*words, name]) in (0, 3)
         told = json.loads(capsys.readouterr().out)
-        sessions = load_commands(Path(f"{name}.identity"))
+        sessions = Results.load(Path(name)).played_by
         assert told["played_by"] == [each.as_table() for each in sessions]
-        assert len(sessions) == {"one.json": 2, "two.json": 1}[name]
+        assert len(sessions) == {"one.sqlite": 2, "two.sqlite": 1}[name]
         assert sessions[-1].command.endswith(name)
         assert sessions[-1].devices == (DeviceFile.of("inproc", LIBRARY),)
         page = Path(name).with_suffix(".html").read_text()
         assert page.count(sessions[-1].command) == len(sessions)
     assert Path("one.json").read_bytes() == Path("two.json").read_bytes()
-    Path("two.json.identity").write_text("mine")
-    assert main([*words, "two.json"]) == 2
-    assert "two.json.identity: is no file of identities of a campaign: remove it" in capsys.readouterr().err
 
 
 def test_other_commands_say_it_with_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

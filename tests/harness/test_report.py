@@ -15,6 +15,7 @@ from tests.harness.reported import (
     CLIPPED,
     FALSE_ALARM,
     NOTICED,
+    PERIOD_S,
     PLANTS,
     SAID,
     SAMPLES,
@@ -73,6 +74,11 @@ def test_statistic_in_the_page_is_that_of_the_run(run: Run, read: Page) -> None:
     assert read.data()["ceiling"] == 11.5
 
 
+def test_innovation_and_time_in_the_page_are_those_of_the_run(run: Run, read: Page) -> None:
+    np.testing.assert_array_equal(read.columns()["innovation"], run.innovation.astype(float))
+    assert read.data()["period_s"] == pytest.approx(PERIOD_S)
+
+
 def test_page_knows_which_samples_were_clipped_and_on_which_channel(read: Page) -> None:
     columns = read.columns()
     assert np.flatnonzero(columns["missing"]).tolist() == list(range(SAMPLES))[CLIPPED]
@@ -96,6 +102,7 @@ def test_marks_are_those_of_the_run(read: Page) -> None:
         ["1200", "K 24500 → 18000 N/m", "3", "2", "1.50", "✓ detected"],
         ["1500", "M 115 → 30 kg", "–", "4", "–", "✗ MISSED"],
         ["1200", "K", "K", "0.750", "+2.1%", "17", "9", "-1", "✓ right"],
+        ["1500", "M", "nothing", "–", "–", "–", "–", "–", "no diagnosis"],
         [str(FALSE_ALARM), "12"],
         ["0–1199", "113.85", "115", "-1.00%", "3021", "3021", "+0.00%", "24745", "24500", "+1.00%"],
         ["1200–1799", "–", "115", "–", "–", "3021", "–", "–", "18000", "–"],

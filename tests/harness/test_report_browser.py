@@ -17,8 +17,8 @@ from tests.harness.long_runs import long_run
 from tests.harness.reported import NOTICED, empty_run, reported_run, reported_verdict
 from tests.harness.runs import with_fault
 
-PLOTS = 6
-FORCE, MASS, STIFFNESS, STATISTIC = 0, 2, 4, 5
+PLOTS = 7
+FORCE, MASS, STIFFNESS, INNOVATION, STATISTIC = 0, 2, 4, 5, 6
 
 LONG = 300_000
 """Samples of a run whose plots show minima and maxima of 12 samples."""
@@ -89,6 +89,33 @@ def test_button_shows_the_whole_run_again(opened: Watched) -> None:
     assert opened.images() == whole
 
 
+def test_drag_with_shift_wheel_and_keys_move_every_plot_within_the_run(opened: Watched) -> None:
+    opened.page.get_by_role("button", name="1200", exact=True).click()
+    opened.page.keyboard.down("Shift")
+    opened.drag(MASS, 0.5, 0.75)
+    opened.page.keyboard.up("Shift")
+    assert _shown(opened) == (1130, 1250)
+    opened.point_at(STATISTIC, 0.5)
+    opened.page.mouse.wheel(_width(opened) / 2, 0)
+    assert _shown(opened) == (1190, 1310)
+    opened.page.locator("figure.plot").nth(INNOVATION).focus()
+    for key, expected in (("ArrowLeft", (1160, 1280)), ("Home", (0, 120)), ("ArrowLeft", (0, 120)), ("0", (0, 1799))):
+        opened.page.keyboard.press(key)
+        assert _shown(opened) == expected
+    opened.page.keyboard.press("+")
+    assert _shown(opened) == (180, 1619)
+    opened.page.keyboard.press("End")
+    opened.page.keyboard.press("-")
+    assert _shown(opened) == (180, 1799)
+
+
+def test_pointer_reads_the_innovation_in_codes(opened: Watched, run: Run) -> None:
+    opened.page.get_by_role("button", name="1200", exact=True).click()
+    opened.point_at(INNOVATION, 0.5)
+    sample, innovation = opened.values(INNOVATION)
+    assert _number(innovation, "codes") == pytest.approx(float(run.innovation[int(sample.replace(",", ""))]), abs=1e-4)
+
+
 def test_row_of_a_change_takes_all_plots_there(opened: Watched) -> None:
     opened.page.get_by_role("button", name="1200", exact=True).click()
     opened.point_at(MASS, 0.0)
@@ -116,7 +143,7 @@ def test_transients_are_hidden_until_asked_for(opened: Watched) -> None:
     every.check()
     wild = opened.images()
     changed = [plot for plot in range(PLOTS) if wild[plot] != calm[plot]]
-    assert changed == [2, 3, 4, STATISTIC]
+    assert changed == [2, 3, 4, INNOVATION, STATISTIC]
     every.uncheck()
     assert opened.images() == calm
 
@@ -214,6 +241,22 @@ def test_run_that_converged_nowhere_is_drawn(browser: Browser, run: Run, tmp_pat
 def _open(browser: Browser, run: Run, verdict: Verdict, folder: Path) -> Watched:
     write_report(run, verdict, folder / "report.html")
     return Watched(browser, folder / "report.html")
+
+
+def _shown(watched: Watched) -> object:
+    """First and last sample that all plots show, to a pixel."""
+    ends = set()
+    for fraction in (0.0, 0.999):
+        watched.point_at(MASS, fraction)
+        (sample,) = {watched.values(plot)[0] for plot in range(PLOTS)}
+        ends.add(int(sample.replace(",", "")))
+    return pytest.approx((min(ends), max(ends)), abs=2)
+
+
+def _width(watched: Watched) -> float:
+    box = watched.page.locator(".u-over").nth(MASS).bounding_box()
+    assert box is not None
+    return box["width"]
 
 
 def _number(text: str, unit: str) -> float:

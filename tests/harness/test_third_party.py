@@ -118,7 +118,7 @@ def test_kinds_of_another_package_play_in_pytest_and_in_campaigns(site: Path, fo
     done = run(site, folder, "pytest", "-q", "-p", "no:cacheprovider", "--hil-rig", "flat", "--hil-dut", "jump")
     assert "1 passed" in done.stdout, done.stdout
     done = run(
-        site, folder, "analogrig.cli", "campaign", "campaign.toml", "--workers", "2", "--out", "out.json", "--json"
+        site, folder, "analogrig.cli", "campaign", "campaign.toml", "--workers", "2", "--out", "out.sqlite", "--json"
     )
     assert done.stderr == ""
     assert [cell["missed"] for cell in json.loads(done.stdout)["cells"]] == [0, 2]

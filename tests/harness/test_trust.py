@@ -19,6 +19,7 @@ import select
 import shlex
 import shutil
 import socket
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -30,10 +31,9 @@ from typing import Any, Protocol, get_args
 import pytest
 
 from analogrig import config
-from analogrig.campaigns.conduct import journal_of
-from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.spec import CampaignSpec
+from analogrig.campaigns.store import Store
 from analogrig.cli import main
 from analogrig.devices.opening import open_dut, reopen_dut
 from analogrig.devices.registry import KINDS, describe, from_table, named_things
@@ -344,7 +344,7 @@ def recorded_scenario(bait: Bait, recorded: Path) -> str:
 def campaign_of(bait: Bait, name: str) -> list[str]:
     spec = f'scenario = "healthy"\nsamples = 700\ntrials = 1\ndevices = ["{name}"]\n'
     device_file(bait)
-    return ["campaign", written("campaign.toml", spec), "--workers", "1", "--out", "build/campaign.json"]
+    return ["campaign", written("campaign.toml", spec), "--workers", "1", "--out", "build/campaign.sqlite"]
 
 
 def certify(*words: str) -> list[str]:
@@ -385,7 +385,7 @@ def scenario_on(bait: Bait) -> str:
 def campaign_on(bait: Bait) -> list[str]:
     rig_file(bait)
     spec = 'scenario = "healthy"\nsamples = 700\ntrials = 1\nrigs = ["rig.toml"]\ndevices = ["host"]\n'
-    return ["campaign", written("campaign.toml", spec), "--workers", "1", "--out", "build/campaign.json"]
+    return ["campaign", written("campaign.toml", spec), "--workers", "1", "--out", "build/campaign.sqlite"]
 
 
 def here(bait: Bait) -> str:
@@ -695,21 +695,23 @@ def test_worker_plays_on_the_rig_that_was_checked_whatever_its_file_says_by_then
         assert rig.description()["instrument"] == f"redpitaya://{checked.allow}"
 
 
-def test_results_and_journal_of_a_campaign_open_nothing(
-    folder: Path, library: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_store_of_a_campaign_opens_nothing(folder: Path, library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bait = a_library(folder, monkeypatch, library)
     argv = campaign_of(bait, "inproc")
     assert main(argv) == 0
-    results = Path("build/campaign.json")
-    results.write_text(re.sub(r'"kind": ?"inproc"', '"kind":"inproc","library":"theirs/evil.so"', results.read_text()))
+    results = Path("build/campaign.sqlite")
+    with contextlib.closing(sqlite3.connect(results)) as file:
+        (text,) = file.execute("SELECT plan FROM campaign").fetchone()
+        forged_text = re.sub(r'"kind": ?"inproc"', '"kind":"inproc","library":"theirs/evil.so"', text)
+        assert forged_text != text
+        file.execute("UPDATE campaign SET plan = ?", (forged_text,))
+        file.commit()
     main(["compare", str(results), str(results)])
     main(argv)
     results.unlink()
     plan = Plan.of(CampaignSpec.load(argv[1]))
     forged = dataclasses.replace(plan, devices=({**plan.devices[0], "library": "theirs/evil.so"},))
-    with Journal(journal_of(results), forged):
-        pass
+    Store.write(results, forged).close()
     assert main(argv) == REFUSED
     assert not bait.witness.happened()
 

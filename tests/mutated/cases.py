@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import random
@@ -32,8 +33,9 @@ class Seeds:
     logs: dict[str, bytes]
     """By their suffix."""
     dbc: bytes
-    results: bytes
-    journal: bytes
+    ended: bytes
+    """Store of a campaign."""
+    begun: bytes
 
     @classmethod
     def made(cls, folder: Path) -> Seeds:
@@ -48,8 +50,10 @@ class Seeds:
             _play("run", "--scenario", str(SCENARIO), *device, "--out", str(folder / suffix))
             logs[suffix] = (folder / suffix / f"can.{suffix}").read_bytes()
         logs["trc"] = _as_trc(folder / "log" / "can.log")
-        results, journal = _campaign(folder)
-        return cls((run, recordings.with_header(run, _of_a_real_rig), *whole), logs, DBC.read_bytes(), results, journal)
+        ended, open_store = _campaign(folder)
+        return cls(
+            (run, recordings.with_header(run, _of_a_real_rig), *whole), logs, DBC.read_bytes(), ended, open_store
+        )
 
 
 def _play(*argv: str) -> None:
@@ -77,21 +81,17 @@ def _as_trc(log: Path) -> bytes:
 
 
 def _campaign(folder: Path) -> tuple[bytes, bytes]:
-    """Results, and the journal from which they came."""
-    from analogrig.campaigns.conduct import journal_of
-    from analogrig.campaigns.journal import Journal
-    from analogrig.campaigns.plan import Plan
-    from analogrig.campaigns.results import Results
-    from analogrig.campaigns.spec import CampaignSpec
+    """Store of a campaign that has ended, and of one that has not."""
+    import sqlite3
 
-    spec, out = folder / "campaign.toml", folder / "campaign.json"
+    spec, out = folder / "campaign.toml", folder / "campaign.sqlite"
     spec.write_text(descriptions.toml(descriptions.CAMPAIGN))
     _play("campaign", str(spec), "--workers", "1", "--out", str(out))
-    plan = Plan.of(CampaignSpec.load(str(spec)))
-    with Journal(journal_of(out), plan) as journal:
-        for chunk, rows in zip(plan.chunks(), Results.load(out).rows, strict=False):
-            journal.add(chunk, list(rows))
-    return out.read_bytes(), journal_of(out).read_bytes()
+    whole = out.read_bytes()
+    with contextlib.closing(sqlite3.connect(out)) as file:
+        file.execute("DELETE FROM cells")
+        file.commit()
+    return whole, out.read_bytes()
 
 
 class Cases:
@@ -195,8 +195,8 @@ class Cases:
                 *[("device", descriptions.DEVICE, ("run", "--scenario", str(SCENARIO), "--dut", path, *out))] * 2,
                 ("device", descriptions.CAN_DEVICE, ("run", "--scenario", str(SCENARIO), "--dut", path, *out)),
                 *[("campaign", descriptions.CAMPAIGN, campaign)] * 2,
-                ("journal", None, campaign),
-                ("results", None, campaign),
+                ("begun store", None, campaign),
+                ("ended store", None, campaign),
             )
         )
         if table is None:
@@ -206,15 +206,14 @@ class Cases:
         return Case(kind, argv, what, asks_much)
 
     def _results(self, folder: Path) -> tuple[str, str]:
-        return ("--out", str(folder / "out.json"))
+        return ("--out", str(folder / "out.sqlite"))
 
     def _kept(self, kind: str, rng: random.Random, folder: Path, argv: tuple[str, ...]) -> Case:
         """What a campaign finds that was left by another."""
         (folder / "file.toml").write_text(descriptions.toml(descriptions.CAMPAIGN))
-        whole = self._seeds.journal if kind == "journal" else self._seeds.results
-        name = "out.json.journal" if kind == "journal" else "out.json"
-        changed, what = campaign_files.mutated(whole, kind, rng)
-        (folder / name).write_bytes(changed)
+        whole = self._seeds.begun if kind == "begun store" else self._seeds.ended
+        changed, what = campaign_files.mutated(whole, rng, folder / "forged.sqlite")
+        (folder / "out.sqlite").write_bytes(changed)
         return Case(kind, argv, what)
 
     def _log(self, rng: random.Random, folder: Path) -> Case:

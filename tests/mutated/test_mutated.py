@@ -1,4 +1,4 @@
-"""A sample of the soak that ``make hostile`` is."""
+"""A sample of the soak that ``make hostile`` is: what one in fifty cases shows is found with a probability of 97 %."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_mutated_files_end_in_one_line_in_time_and_in_little_memory() -> None:
     """In a process of its own, which forks and so must have no threads."""
-    counts = {"--recordings": "110", "--files": "90", "--logs": "50", "--keys": "60"}
+    counts = {"--recordings": "65", "--files": "50", "--logs": "30", "--keys": "30"}
     command = [sys.executable, "-m", "tests.mutated", *(word for pair in counts.items() for word in pair)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ran = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)

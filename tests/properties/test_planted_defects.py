@@ -1,6 +1,6 @@
 """The harness can fail: a planted defect is found by the shipped property that is to find it.
 
-Every fourth one here; `make defects` tries all.
+Every sixth one here; `make defects` tries all.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def test_there_are_twenty_defects_and_each_has_its_row_in_the_readme() -> None:
     assert [name for name in names if f"| {name} | " not in rows] == []
 
 
-@pytest.mark.parametrize("defect", defects()[::4], ids=lambda defect: defect.name.replace(" ", "-"))
+@pytest.mark.parametrize("defect", defects()[::6], ids=lambda defect: defect.name.replace(" ", "-"))
 def test_planted_defect_is_found(defect: Defect, tmp_path: Path) -> None:
     found = tried(planted(defect, tmp_path), defect.property, tmp_path, shrunk=False)
     assert found.failed, found.output

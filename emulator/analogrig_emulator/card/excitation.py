@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.errors import ExcitationError
 
@@ -121,39 +122,32 @@ class Excitation:
         last = math.ceil(stop_tick / period) + 1
         if start_tick <= 0:
             first = -2
-        ticks, levels_v = self._prbs(first, last, period) if self.shape == "prbs" else self._cycle(first, last, period)
-        return _level_changes(max(start_tick, 0), stop_tick, ticks, levels_v)
+        periods, levels_v = self._prbs(first, last) if self.shape == "prbs" else self._cycle(first, last)
+        periods *= period
+        ticks = np.empty(periods.size, np.int64)
+        grid = TICKS_PER_SAMPLE if self.clock == "card" else 1
+        addresses = [array.ctypes.data for array in (periods, levels_v, ticks)]
+        count = library.load().engine_edges(periods.size, grid, max(start_tick, 0), stop_tick, *addresses)
+        return Edges(ticks[:count], levels_v[:count])
 
-    def _cycle(self, first: int, last: int, period: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        starts: NDArray[np.float64] = np.arange(first, last + 1, dtype=np.float64) - self.phase
-        ticks = self._instants(np.stack((starts, starts + self.duty), axis=1).ravel(), period)
-        return ticks, np.tile((self.high_v, self.low_v), last + 1 - first)
+    def _cycle(self, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Ideal instants in periods, and levels."""
+        periods, levels_v = np.empty((last + 1 - first, 2)), np.empty((last + 1 - first, 2))
+        np.subtract(np.arange(first, last + 1), self.phase, out=periods[:, 0])
+        np.add(periods[:, 0], self.duty, out=periods[:, 1])
+        levels_v[:] = self.high_v, self.low_v
+        return periods.ravel(), levels_v.ravel()
 
-    def _prbs(self, first: int, last: int, period: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _prbs(self, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         bits = _sequence(self.register_length)
         index = np.arange(first, last + 1)
         high = bits[(index + self.seed) % bits.size]
-        return self._instants(index.astype(np.float64) - self.phase, period), np.where(high, self.high_v, self.low_v)
-
-    def _instants(self, periods: NDArray[np.float64], period: float) -> NDArray[np.int64]:
-        ticks = np.rint(periods * period).astype(np.int64)
-        if self.clock == "card":
-            ticks = -(-ticks // TICKS_PER_SAMPLE) * TICKS_PER_SAMPLE
-        return ticks
+        levels_v: NDArray[np.float64] = np.where(high, self.high_v, self.low_v)
+        return index.astype(np.float64) - self.phase, levels_v
 
     def _require(self, field: str, holds: object, what: str) -> None:
         if not holds:
             raise ExcitationError(f"excitation: {field} {getattr(self, field)!r} {what}")
-
-
-def _level_changes(start_tick: int, stop_tick: int, ticks: NDArray[np.int64], levels_v: NDArray[np.float64]) -> Edges:
-    """Edges within the range that change the level. Those before tick 0 become one edge at tick 0."""
-    ticks = np.maximum(ticks, 0)
-    lasts = np.append(ticks[1:] != ticks[:-1], True)
-    ticks, levels_v = ticks[lasts], levels_v[lasts]
-    changes = np.append(True, levels_v[1:] != levels_v[:-1])
-    kept = changes & (ticks >= start_tick) & (ticks < stop_tick)
-    return Edges(ticks[kept], levels_v[kept])
 
 
 @functools.lru_cache(maxsize=4)

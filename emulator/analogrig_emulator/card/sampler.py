@@ -117,6 +117,14 @@ class Card:
         """The voltages at the centres of the codes: (n, channels)."""
         return np.asarray(self.low_v + codes * self.lsb_v)
 
+    @functools.cached_property
+    def analogue(self) -> NDArray[np.float64]:
+        """Gain, droop in V, low end in V, LSB in V, noise in LSB and offset in LSB: (6, channels)."""
+        droop_v = self.droop_v_per_s / self.throughput_hz * np.arange(self.channels)
+        gain, offset_lsb = 1.0 + self.per_channel("gain_error"), self.per_channel("offset_lsb")
+        return np.stack((gain, droop_v, self.low_v, self.lsb_v, np.array(self.noise_lsb), offset_lsb))
+
+    @functools.cached_property
     def levels(self) -> NDArray[np.float64] | None:
         """Transition levels from level 0 on, missing codes of zero width: (2^bits,); None for an ideal converter."""
         if not self.levels_lsb and not self.missing_codes:
@@ -181,15 +189,8 @@ class Sampler:
     def __init__(self, card: Card, rng: np.random.Generator) -> None:
         self.card = card
         self._rng = rng
-        self._low_v = card.low_v
-        self._lsb_v = card.lsb_v
-        self._noise_lsb = np.array(card.noise_lsb)
-        self._gain = 1.0 + card.per_channel("gain_error")
-        self._offset_lsb = card.per_channel("offset_lsb")
-        self._droop_v = card.droop_v_per_s / card.throughput_hz * np.arange(card.channels)
         self._residual = math.exp(-card.acquisition)
         self._held_v: NDArray[np.float64] | None = None
-        self._levels = card.levels()
 
     def sample(
         self, volts: NDArray[np.float64], normals: NDArray[np.float64] | None = None
@@ -210,50 +211,36 @@ class Sampler:
         """
         if volts.ndim != 2 or volts.shape[1] != self.card.channels:
             raise SamplerError(f"the card has {self.card.channels} channels, got volts of shape {volts.shape}")
-        if not np.isfinite(volts).all():
+        volts = np.ascontiguousarray(volts, np.float64)
+        normals = self._rng.standard_normal(volts.shape) if normals is None else np.ascontiguousarray(normals)
+        seen_lsb, held_v = np.empty_like(volts), self._held_before(volts)
+        held = None if held_v is None else held_v.ctypes.data
+        converted = (self.card.analogue.ctypes.data, self._residual, volts.ctypes.data, normals.ctypes.data, held)
+        if not library.load().engine_see(*volts.shape, *converted, seen_lsb.ctypes.data):
             sample, channel = np.argwhere(~np.isfinite(volts))[0]
             volt = volts[sample, channel]
             raise SamplerError(
                 f"sample {sample} of the block, channel {channel}: the voltage must be finite, got {volt}"
             )
-        noise = (self._rng.standard_normal(volts.shape) if normals is None else normals) * self._noise_lsb
-        noise += self._offset_lsb
-        seen = self._acquired(volts) * self._gain
-        seen -= self._droop_v
-        seen -= self._low_v
-        seen /= self._lsb_v
-        seen += noise
-        return seen
+        self._held_v = held_v
+        return seen_lsb
 
     def convert(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Codes and clipping flags, as from sample(), of converter inputs (n, channels) in LSB."""
-        unlimited = seen_lsb + 0.5
-        np.floor(unlimited, out=unlimited)
-        limited = np.clip(unlimited, 0, (1 << self.card.bits) - 1)
-        codes = limited.astype(np.uint16) if self._levels is None else _approximate_successively(seen_lsb, self._levels)
-        codes = (codes | np.uint16(self.card.stuck_high)) & ~np.uint16(self.card.stuck_low)
-        return codes, limited != unlimited
+        seen_lsb = np.ascontiguousarray(seen_lsb, np.float64)
+        codes, clipped = np.empty(seen_lsb.shape, np.uint16), np.empty(seen_lsb.shape, np.bool_)
+        card = self.card
+        levels = None if card.levels is None else card.levels.ctypes.data
+        converter = (card.bits, levels, card.stuck_high, card.stuck_low)
+        addresses = [array.ctypes.data for array in (seen_lsb, codes, clipped)]
+        library.load().engine_convert(seen_lsb.size, *converter, *addresses)
+        return codes, clipped
 
-    def _acquired(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Held voltages (n, channels): each step from sample to sample lacks exp(-acquisition)."""
+    def _held_before(self, volts: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Copy of the held voltages (channels,), from which each step lacks exp(-acquisition); None if it is whole."""
         if self._residual == 0.0 or not len(volts):
-            return volts
-        volts = np.ascontiguousarray(volts, np.float64)
-        if self._held_v is None:
-            self._held_v = volts[0].copy()
-        held_v = np.empty_like(volts)
-        addresses = [array.ctypes.data for array in (volts, self._held_v, held_v)]
-        library.load().engine_hold(*volts.shape, self._residual, *addresses)
-        return held_v
-
-
-def _approximate_successively(seen_lsb: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Codes by successive approximation: from the highest bit down, keep a bit if the input reaches its level."""
-    seen_lsb = np.ascontiguousarray(seen_lsb, np.float64)
-    codes = np.empty(seen_lsb.shape, np.uint16)
-    addresses = [array.ctypes.data for array in (levels, seen_lsb, codes)]
-    library.load().engine_approximate(seen_lsb.size, levels.size.bit_length() - 1, *addresses)
-    return codes
+            return self._held_v
+        return (volts[0] if self._held_v is None else self._held_v).copy()
 
 
 def drawn_levels(bits: int, rng: np.random.Generator, inl_lsb: float, *, monotonic: bool = True) -> tuple[float, ...]:

@@ -13,49 +13,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Real
-from typing import Any, ClassVar, Never, TypeAlias, TypeVar
+from typing import Any, Never, TypeAlias, TypeVar
 
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier, breakpoint_fault
 from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.part import GROUND, CircuitPart
 from analogrig_emulator.circuit.pot import check_dial
 from analogrig_emulator.errors import CircuitError
-
-GROUND = "0"
 
 _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Common part of all elements: name, and the constraints on the fields."""
-
-    positive: ClassVar[tuple[str, ...]] = ()
-    finite: ClassVar[tuple[str, ...]] = ()
-    """Fields that must be finite numbers if given."""
-
-    name: str
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        raise NotImplementedError
-
-    @property
-    def bonds(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of nodes between which the element determines the voltage."""
-        raise NotImplementedError
-
-    @property
-    def spans(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of nodes that must not be the same."""
-        return self.bonds
-
-    @property
-    def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
-        """Bonds whose voltage does not depend on the current."""
-        return ()
-
-
-@dataclass(frozen=True)
-class _TwoEnded(_Part):
+class _TwoEnded(CircuitPart):
     a: str
     b: str
 
@@ -91,7 +61,7 @@ class Capacitor(_TwoEnded):
 
 
 @dataclass(frozen=True)
-class Pot(_Part):
+class Pot(CircuitPart):
     """A track of track_ohm from top to bottom; dial 0 puts the wiper at the bottom, 1 at the top."""
 
     positive = ("track_ohm",)
@@ -112,7 +82,7 @@ class Pot(_Part):
 
 
 @dataclass(frozen=True)
-class OpAmp(_Part):
+class OpAmp(CircuitPart):
     """An op-amp; its state, if the model has one, is the voltage behind the output resistance."""
 
     plus: str
@@ -137,7 +107,7 @@ class OpAmp(_Part):
 
 
 @dataclass(frozen=True)
-class _Source(_Part):
+class _Source(CircuitPart):
     plus: str
     minus: str = GROUND
 
@@ -233,9 +203,23 @@ class Switch(_TwoEnded):
         return self.on_ohm if closed else self.off_ohm
 
 
-Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch
+Element: TypeAlias = (
+    Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch | Multiplier | Function
+)
 _T = TypeVar("_T")
-_E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, CurrentSource, DiodeLimiter, Switch)
+_E = TypeVar(
+    "_E",
+    Resistor,
+    Capacitor,
+    Pot,
+    OpAmp,
+    VoltageSource,
+    CurrentSource,
+    DiodeLimiter,
+    Switch,
+    Multiplier,
+    Function,
+)
 
 _LEAST = 1e-100
 """Least ohms and farads: no reciprocal of them, nor of an end stop's part of a track, overflows."""
@@ -435,6 +419,10 @@ def _check_element(element: Element) -> None:
         check_dial(element.dial, element.name)
     if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
         raise element_error(element, f"on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
+    if isinstance(element, Multiplier) and element.scale_v == 0:
+        raise element_error(element, "scale_v must not be 0")
+    if isinstance(element, Function) and (fault := breakpoint_fault(element.breakpoints)):
+        raise element_error(element, fault)
 
 
 def _check_value(element: Element, field: str) -> None:
@@ -508,6 +496,9 @@ def _check_feedback(elements: tuple[Element, ...]) -> None:
     for amp in elements:
         if isinstance(amp, OpAmp):
             for node in {amp.plus, amp.minus} - {GROUND}:
+                acts.setdefault(node, []).append(amp.out)
+        elif isinstance(amp, Multiplier | Function):
+            for node in amp.nodes[:-1]:
                 acts.setdefault(node, []).append(amp.out)
     for amp in elements:
         if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reachable(amp.out, acts):

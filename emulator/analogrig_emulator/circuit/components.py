@@ -6,6 +6,7 @@
     C               leakage resistance across it; dielectric absorption as series R-C branches across it
     op-amp          offset voltage and its drift, bandwidth and slew of the specimen; bias current through its input
                     resistance (as a voltage source behind it), input capacitance
+    multiplier      scale error, offsets and non-linearity of the specimen
     pot             wiper resistance, and resistance beyond the end stops
 
 Engine and SPICE deck see ordinary elements only. Every draw comes from the seed and the element's name: adding an
@@ -24,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     CurrentSource,
     DiodeLimiter,
@@ -36,7 +36,9 @@ from analogrig_emulator.circuit.circuit import (
     VoltageSource,
     unknown_kind_error,
 )
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotModel
 from analogrig_emulator.errors import CircuitError
 
@@ -51,6 +53,12 @@ class _Draw:
     """Index of each quantity among the numbers drawn for an element."""
 
     TOLERANCE, TEMPERATURE, AGEING, OFFSET, OFFSET_DRIFT, BANDWIDTH, SLEW, BIAS = range(_DRAWS)
+
+
+class _MultiplierDraw:
+    """Index of each quantity among the numbers drawn for a multiplier."""
+
+    GAIN, X_OFFSET, Y_OFFSET, Z_OFFSET, X_NONLINEARITY, Y_NONLINEARITY = range(6)
 
 
 def _require(owner: object, field_name: str, holds: object, what: str) -> None:
@@ -202,6 +210,56 @@ OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
 
 
 @dataclass(frozen=True)
+class MultiplierGrade:
+    """Spread of multiplier specimens about the netlist's model; each field is uniform within +- and adds to it.
+
+    gain_error, x_nonlinearity, y_nonlinearity: fractions; x_offset_v, y_offset_v, z_offset_v: V, as in MultiplierModel.
+    Raises CircuitError naming the field.
+    """
+
+    gain_error: float = 0.0
+    x_offset_v: float = 0.0
+    y_offset_v: float = 0.0
+    z_offset_v: float = 0.0
+    x_nonlinearity: float = 0.0
+    y_nonlinearity: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("gain_error", "x_nonlinearity", "y_nonlinearity"):
+            _require(self, name, 0 <= getattr(self, name) < 1, "must be at least 0 and less than 1")
+        for name in ("x_offset_v", "y_offset_v", "z_offset_v"):
+            _require(self, name, 0 <= getattr(self, name) < math.inf, "must be finite and not negative")
+
+    def specimen(self, model: MultiplierModel, draws: NDArray[np.float64]) -> MultiplierModel:
+        """Model of one specimen, from numbers within +-1."""
+        return replace(
+            model,
+            gain_error=model.gain_error + self.gain_error * float(draws[_MultiplierDraw.GAIN]),
+            x_offset_v=model.x_offset_v + self.x_offset_v * float(draws[_MultiplierDraw.X_OFFSET]),
+            y_offset_v=model.y_offset_v + self.y_offset_v * float(draws[_MultiplierDraw.Y_OFFSET]),
+            z_offset_v=model.z_offset_v + self.z_offset_v * float(draws[_MultiplierDraw.Z_OFFSET]),
+            x_nonlinearity=model.x_nonlinearity + self.x_nonlinearity * float(draws[_MultiplierDraw.X_NONLINEARITY]),
+            y_nonlinearity=model.y_nonlinearity + self.y_nonlinearity * float(draws[_MultiplierDraw.Y_NONLINEARITY]),
+        )
+
+
+MULTIPLIER_GRADES: Mapping[str, MultiplierGrade] = MappingProxyType(
+    {
+        "ideal": MultiplierGrade(),
+        "ad633": MultiplierGrade(
+            gain_error=2.5e-3,
+            x_offset_v=5e-3,
+            y_offset_v=5e-3,
+            z_offset_v=5e-3,
+            x_nonlinearity=4e-3,
+            y_nonlinearity=1e-3,
+        ),
+    }
+)
+"""Grades for the models of the same name in nonlinear.py; typical values of the data sheet."""
+
+
+@dataclass(frozen=True)
 class PotGrade:
     """Coefficient pots: grade of the track, resistances of wiper and ends, and windings.
 
@@ -239,6 +297,7 @@ class Components:
     dielectric: Dielectric = field(default_factory=Dielectric)
     op_amps: OpAmpGrade = field(default_factory=OpAmpGrade)
     pots: PotGrade = field(default_factory=PotGrade)
+    multipliers: MultiplierGrade = field(default_factory=MultiplierGrade)
     given: Mapping[str, float] = field(default_factory=dict)
     given_bandwidth: Mapping[str, float] = field(default_factory=dict)
     given_slew: Mapping[str, float] = field(default_factory=dict)
@@ -279,6 +338,7 @@ class Components:
             capacitors=self.capacitors.without_draws(),
             op_amps=replace(self.op_amps, offset_v=0.0, offset_v_per_k=0.0, bandwidth=0.0, slew=0.0, bias_spread=0.0),
             pots=replace(self.pots, track=self.pots.track.without_draws(), windings=0),
+            multipliers=MultiplierGrade(),
         )
 
     def _check_given(self, elements: Sequence[Element]) -> None:
@@ -300,7 +360,7 @@ class Components:
 
     @property
     def _kinds(self) -> tuple[object, ...]:
-        return self.resistors, self.capacitors, self.dielectric, self.op_amps, self.pots
+        return self.resistors, self.capacitors, self.dielectric, self.op_amps, self.pots, self.multipliers
 
     def _parts(self, element: Element) -> Iterator[Element]:
         draws = self._draws(element.name)
@@ -317,7 +377,9 @@ class Components:
             case OpAmp():
                 yield replace(element, model=self._specimen(element, draws))
                 yield from self._inputs(element, draws)
-            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch():
+            case Multiplier():
+                yield replace(element, model=self.multipliers.specimen(element.model, draws))
+            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch() | Function():
                 yield element
             case _:
                 raise unknown_kind_error(element)

@@ -1,13 +1,14 @@
 """Piecewise-linear state space of a circuit (engine/system.py), by modified nodal analysis.
 
-x: the voltage of every capacitor, then the voltage behind the output resistance of every op-amp that has a pole
-(netlist order each).
-u: the voltage sources that are inputs. v: every node voltage. phi: one Kink per element of w: for each op-amp its slew
-limit, then its clamp; then, for each diode limiter, the voltage beyond its threshold.
+x: the voltage of every capacitor, then the voltage behind the output resistance of every op-amp that has a pole, then
+that of every multiplier with a bandwidth (netlist order each).
+u: the voltage sources that are inputs, then the product of every multiplier. v: every node voltage. phi: one Kink per
+element of w: for each op-amp and multiplier its slew limit, then its clamp; for each diode limiter the voltage beyond
+its threshold; for each function generator the bends of its input; last the two arguments of every product.
 
 With x and u held, the circuit is resistive. Capacitors become voltage sources x, op-amp poles voltage sources x
 behind their output resistance. Kirchhoff's current law at every node, and one equation per branch whose current is
-unknown, give one linear system with right-hand side columns [x | u | 1 | phi of the limiters]; its solution is
+unknown, give one linear system with right-hand side columns [x | u | 1 | phi of limiters and bends]; its solution is
 [L M n R] and the branch currents, and A, B, c, G follow from it: a capacitor's dx/dt is its current over its
 capacitance, an op-amp's is its law (opamp.py). Only elementwise arithmetic and engine_solve are used, no BLAS,
 so a circuit has the same bits on every machine.
@@ -18,13 +19,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     Circuit,
     CurrentSource,
@@ -36,7 +36,9 @@ from analogrig_emulator.circuit.circuit import (
     VoltageSource,
     element_error,
 )
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
 from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import Kink, Matrix, PiecewiseLinear, solve_in_place
@@ -113,31 +115,42 @@ class Nodal:
         self._inputs = circuit.inputs
         amps = circuit.of(OpAmp)
         self._poles = tuple(amp for amp in amps if amp.model.has_state)
+        self._multipliers = circuit.of(Multiplier)
+        self._functions = circuit.of(Function)
+        followers = tuple(part for part in self._multipliers if part.model.has_state)
         branches = [element.name for element in self._capacitors] + [
             source.name for source in circuit.of(VoltageSource)
         ]
-        branches += [amp.name for amp in amps if not (amp.model.has_state and amp.model.rout_ohm > 0)]
+        outputs: tuple[OpAmp | Multiplier, ...] = (*amps, *self._multipliers)
+        branches += [part.name for part in outputs if not (part.model.has_state and part.model.rout_ohm > 0)]
+        branches += [function.name for function in self._functions]
 
         self._nodes = circuit.nodes
         self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
         # Ground has the last row and column, which are left out of the solution.
         self._row = {node: i for i, node in enumerate(self._nodes)} | {GROUND: len(self._unknowns)}
         self._branch = {name: len(self._nodes) + i for i, name in enumerate(branches)}
-        holders: list[Capacitor | OpAmp] = [*self._capacitors, *self._poles]
+        holders: list[Capacitor | OpAmp | Multiplier] = [*self._capacitors, *self._poles, *followers]
         self._state = {element.name: i for i, element in enumerate(holders)}
-        self._columns = len(self._state) + len(self._inputs) + 1
-        self._kinks = tuple(replace(kink, element=amp.name) for amp in self._poles for kink in _kinks(amp))
+        self._columns = len(self._state) + len(self._inputs) + len(self._multipliers) + 1
+        limited: tuple[OpAmp | Multiplier, ...] = (*self._poles, *followers)
+        self._kinks = tuple(replace(kink, element=part.name) for part in limited for kink in _kinks(part))
+        first_source = len(self._kinks)
         self._kinks += tuple(
             replace(Kink.deadzone(-math.inf, limiter.threshold_v), element=limiter.name) for limiter in self._limiters
         )
+        self._kinks += tuple(kink for function in self._functions for kink in function.kinks)
+        self._sources = slice(first_source, len(self._kinks))
+        self._kinks += tuple(Kink.none(part.name) for part in self._multipliers for _ in "xy")
         self._check_size()
 
         size = len(self._unknowns) + 1
         self._left = np.zeros((size, size))
-        self._right = np.zeros((size, self._columns + len(self._limiters)))
+        self._right = np.zeros((size, self._columns + self._sources.stop - first_source))
         ends = [(switch.a, switch.b) for switch in self._switches]
         self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
-        self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
+        parts = _Parts(self._capacitors, self._poles, self._multipliers, self._limiters, self._functions)
+        self._laws = _Laws.of(self._row, self._branch, parts, len(self._state) + len(self._inputs))
         self._enter(circuit)
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
@@ -180,6 +193,7 @@ class Nodal:
             w_phi=w_phi,
             lmn=voltages[:, : self._columns],
             v_phi=self._spread(voltages),
+            products=tuple(part.product for part in self._multipliers),
         )
 
     def with_trim(
@@ -226,8 +240,9 @@ class Nodal:
     def _check_size(self) -> None:
         sizes = (
             ("states", len(self._state), library.MAX_STATES),
-            ("inputs", len(self._inputs), library.MAX_INPUTS),
-            ("slew limits, clamps and diode limiters", len(self._kinks), library.MAX_KINKS),
+            ("multipliers", len(self._multipliers), library.MAX_PRODUCTS),
+            ("inputs and multipliers", len(self._inputs) + len(self._multipliers), library.MAX_INPUTS),
+            ("limits, diode limiters, bends and inputs of multipliers", len(self._kinks), library.MAX_KINKS),
             ("nodes and branches", len(self._unknowns), library.MAX_UNKNOWNS),
         )
         for what, count, limit in sizes:
@@ -255,6 +270,16 @@ class Nodal:
             self._conductance(self._left, limiter.a, limiter.b, 1.0 / limiter.off_ohm)
             self._right[self._row[limiter.a], self._columns + i] -= limiter.excess_siemens
             self._right[self._row[limiter.b], self._columns + i] += limiter.excess_siemens
+        for i, part in enumerate(self._multipliers):
+            self._enter_multiplier(part, len(self._state) + len(self._inputs) + i)
+        bend = self._columns + len(self._limiters)
+        for function in self._functions:
+            slope, volts = function.line
+            row = self._voltage_branch(function.name, function.out, GROUND)
+            self._left[row, self._row[function.x]] -= slope
+            self._right[row, self._columns - 1] = volts
+            self._right[row, bend : bend + len(function.kinks)] = 1.0
+            bend += len(function.kinks)
 
     def _drive(self, source: VoltageSource | CurrentSource) -> tuple[int, float]:
         """Column of the right-hand side that drives a source, and its factor."""
@@ -313,12 +338,27 @@ class Nodal:
             self._left[row, self._row[amp.plus]] -= 1.0
             self._left[row, self._row[amp.minus]] += 1.0
             self._right[row, self._columns - 1] = model.vos_v
-        elif model.rout_ohm > 0:
-            self._conductance(self._left, amp.out, GROUND, 1.0 / model.rout_ohm)
-            self._right[out, self._state[amp.name]] += 1.0 / model.rout_ohm
         else:
-            row = self._voltage_branch(amp.name, amp.out, GROUND)
-            self._right[row, self._state[amp.name]] = 1.0
+            self._enter_output(amp)
+
+    def _enter_output(self, part: OpAmp | Multiplier) -> None:
+        """Enter the state of an element behind its output resistance."""
+        if part.model.rout_ohm > 0:
+            self._conductance(self._left, part.out, GROUND, 1.0 / part.model.rout_ohm)
+            self._right[self._row[part.out], self._state[part.name]] += 1.0 / part.model.rout_ohm
+        else:
+            row = self._voltage_branch(part.name, part.out, GROUND)
+            self._right[row, self._state[part.name]] = 1.0
+
+    def _enter_multiplier(self, part: Multiplier, product: int) -> None:
+        if part.model.has_state:
+            self._enter_output(part)
+        else:
+            row = self._voltage_branch(part.name, part.out, GROUND)
+            if part.model.rout_ohm > 0:
+                self._left[row, row] -= part.model.rout_ohm
+            self._right[row, product] = 1.0
+            self._right[row, self._columns - 1] = part.model.z_offset_v
 
     # ---- reading the solution
 
@@ -353,13 +393,13 @@ class Nodal:
         slopes = drives[:states]
         slopes[laws.drive_of_kink[laws.slews]] = 0.0
         g = laws.g.copy()
-        g[:, g.shape[1] - len(self._limiters) :] = slopes[:, self._columns :]
+        g[:, self._sources] = slopes[:, self._columns :]
         return slopes[:, : self._columns], g, w[:, : self._columns], self._spread(w)
 
     def _spread(self, solution: Matrix) -> Matrix:
-        """The columns of the limiters' phi at the places of their kinks: (rows, kinks)."""
+        """The columns of phi of limiters and bends at the places of their kinks: (rows, kinks)."""
         spread = np.zeros((solution.shape[0], len(self._kinks)))
-        spread[:, len(self._kinks) - len(self._limiters) :] = solution[:, self._columns :]
+        spread[:, self._sources] = solution[:, self._columns :]
         return spread
 
 
@@ -391,12 +431,24 @@ _STAMP = np.array((1.0, 1.0, -1.0, -1.0))
 """Signs of a conductance at its four places: both diagonal ones, then both off-diagonal ones."""
 
 
+class _Parts(NamedTuple):
+    """Elements with laws."""
+
+    capacitors: Sequence[Capacitor]
+    poles: Sequence[OpAmp]
+    multipliers: Sequence[Multiplier]
+    limiters: Sequence[DiodeLimiter]
+    functions: Sequence[Function]
+
+
 @dataclass(frozen=True)
 class _Laws:
-    """Laws of capacitors (by current), op-amps and limiters (by voltages), as arrays.
+    """Laws of capacitors (by current), and of op-amps, multipliers, limiters and bends (by voltages), as arrays.
 
-    A drive is (solution[plus] - solution[minus] + offset) gain / capacity, less the leak. drive_of_kink: drive of each
-    kink, in the order of _kinks(); slews, clamps: indices of the kinks of each kind. g: G without the limiters.
+    A drive is (solution[plus] - solution[minus] + offset) gain / capacity, less the leak. The drives of multipliers
+    hold their products besides: fed gives their rows, products the columns. drive_of_kink: drive of each kink, in the
+    order of _kinks(); slews, clamps: indices of the kinks of each kind. g: G without limiters and bends. holders: rows
+    with a leak; poles: those of the op-amps.
     """
 
     plus: NDArray[np.intp]
@@ -405,6 +457,9 @@ class _Laws:
     gain: Matrix
     capacity: Matrix
     poles: NDArray[np.intp]
+    holders: NDArray[np.intp]
+    fed: NDArray[np.intp]
+    products: NDArray[np.intp]
     leak: Matrix
     drive_of_kink: NDArray[np.intp]
     slews: NDArray[np.intp]
@@ -412,49 +467,59 @@ class _Laws:
     g: Matrix
 
     @classmethod
-    def of(
-        cls,
-        row: Mapping[str, int],
-        branch: Mapping[str, int],
-        capacitors: Sequence[Capacitor],
-        poles: Sequence[OpAmp],
-        limiters: Sequence[DiodeLimiter],
-    ) -> _Laws:
+    def of(cls, row: Mapping[str, int], branch: Mapping[str, int], parts: _Parts, first_product: int) -> _Laws:
         """Laws of a circuit with numbered nodes (row) and branches."""
+        capacitors, poles, multipliers, limiters, functions = parts
+        followers = [part for part in multipliers if part.model.has_state]
+        bent = [function for function in functions for _ in function.kinks]
         ends = [(branch[capacitor.name], row[GROUND]) for capacitor in capacitors]
         ends += [(row[amp.plus], row[amp.minus]) for amp in poles]
+        ends += [(row[GROUND], row[GROUND])] * len(followers)
         ends += [(row[limiter.a], row[limiter.b]) for limiter in limiters]
+        ends += [(row[function.x], row[GROUND]) for function in bent]
+        ends += [(row[node], row[GROUND]) for part in multipliers for node in (part.x, part.y)]
         plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
-        first, states = len(capacitors), len(capacitors) + len(poles)
+        limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
+        first, states = len(capacitors), len(capacitors) + len(limited)
         kinds = [
-            (i, slews) for i, amp in enumerate(poles, first) for slews in (True, False) if _limits(amp, slews=slews)
+            (i, slews) for i, part in enumerate(limited, first) for slews in (True, False) if _limits(part, slews=slews)
         ]
         ones, zeros = np.ones(len(capacitors)), np.zeros(len(capacitors))
-        tail = np.ones(len(limiters))
+        tail = np.ones(len(ends) - states)
+        offsets_v = np.zeros(tail.size)
+        offsets_v[tail.size - 2 * len(multipliers) :] = [
+            volts for part in multipliers for volts in (part.model.x_offset_v, part.model.y_offset_v)
+        ]
+        rates = [part.model.gain_rate for part in limited]
+        z_offsets_v = [part.model.z_offset_v for part in followers]
         laws = cls(
             plus=plus,
             minus=minus,
-            offset=np.concatenate((zeros, [amp.model.vos_v for amp in poles], 0.0 * tail)),
-            gain=np.concatenate((ones, [amp.model.gain_rate for amp in poles], tail)).reshape(-1, 1),
-            capacity=np.concatenate(([c.farad for c in capacitors], np.ones(len(poles)), tail)).reshape(-1, 1),
-            poles=np.arange(first, states),
-            leak=np.array([amp.model.leak_rate for amp in poles]),
-            drive_of_kink=np.array([i for i, _ in kinds] + list(range(states, states + len(limiters))), np.intp),
+            offset=np.concatenate((zeros, [amp.model.vos_v for amp in poles], z_offsets_v, offsets_v)),
+            gain=np.concatenate((ones, rates, tail)).reshape(-1, 1),
+            capacity=np.concatenate(([c.farad for c in capacitors], np.ones(len(limited)), tail)).reshape(-1, 1),
+            poles=np.arange(first, first + len(poles)),
+            holders=np.arange(first, states),
+            fed=np.arange(first + len(poles), states),
+            products=first_product + np.array([i for i, p in enumerate(multipliers) if p.model.has_state], np.intp),
+            leak=np.array([part.model.leak_rate for part in limited]),
+            drive_of_kink=np.array([*(i for i, _ in kinds), *range(states, len(ends))], np.intp),
             slews=np.array([kink for kink, (_, slews) in enumerate(kinds) if slews], np.intp),
             clamps=np.array([kink for kink, (_, slews) in enumerate(kinds) if not slews], np.intp),
-            g=np.zeros((states, len(kinds) + len(limiters))),
+            g=np.zeros((states, len(kinds) + tail.size)),
         )
         laws.g[laws.drive_of_kink[laws.slews], laws.slews] = 1.0
         laws.g[laws.drive_of_kink[laws.clamps], laws.clamps] = -CLAMP_RATE
         return laws
 
     def drives(self, solution: Matrix, constant: int) -> Matrix:
-        """A row for each capacitor (V/s), op-amp with a pole (V/s, before any limit) and limiter (V)."""
+        """A row for each capacitor (V/s), op-amp and multiplier with a pole (V/s, before any limit), and w (V)."""
         drives: Matrix = solution[self.plus] - solution[self.minus]
         drives[:, constant] += self.offset
+        drives[self.fed, self.products] += 1.0
         drives *= self.gain
         drives /= self.capacity
-        drives[self.poles, self.poles] -= self.leak
+        drives[self.holders, self.holders] -= self.leak
         return drives
 
     def slopes(self, solution: Matrix) -> Matrix:
@@ -462,15 +527,15 @@ class _Laws:
         return np.asarray((solution[self.plus] - solution[self.minus]) * self.gain / self.capacity)
 
 
-def _limits(amp: OpAmp, *, slews: bool) -> bool:
-    return amp.model.slews if slews else amp.model.clamps
+def _limits(part: OpAmp | Multiplier, *, slews: bool) -> bool:
+    return part.model.slews if slews else part.model.clamps
 
 
-def _kinks(amp: OpAmp) -> list[Kink]:
+def _kinks(part: OpAmp | Multiplier) -> list[Kink]:
     """The slew limit, then the clamp."""
     kinks = []
-    if amp.model.slews:
-        kinks.append(Kink.clip(amp.model.slew_v_per_s))
-    if amp.model.clamps:
-        kinks.append(Kink.deadzone(*amp.model.swing_v))
+    if part.model.slews:
+        kinks.append(Kink.clip(part.model.slew_v_per_s))
+    if part.model.clamps:
+        kinks.append(Kink.deadzone(*part.model.swing_v))
     return kinks

@@ -32,6 +32,7 @@ from analogrig_emulator.circuit.circuit import (
     VoltageSource,
 )
 from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
 from analogrig_emulator.circuit.pot import END_FRACTION, PotTurn
 from analogrig_emulator.engine.engine import Engine
@@ -79,6 +80,23 @@ Blower wiper bottom I = v(wiper, bottom) / (max(v(dial), {END_FRACTION!r}) * {{t
 .subckt diode_limiter a b threshold=0 on=1 off=1g
 Roff a b {off}
 Bon a b I = (1 / {on} - 1 / {off}) * max(0, v(a, b) - {threshold})
+.ends""",
+        # x1, x3 and y1, y3: linear and cubic coefficients of both factors. Node inner is the product, state follows it.
+        "multiplier": f"""\
+.subckt multiplier x y out x1=0.1 x3=0 y1=1 y3=0 vx=0 vy=0 vz=0 rate=6e6 slew=1e99 swing_low=-1e99 swing_high=1e99
++ rout=0
+Bproduct inner 0 V = ((v(x) + {{vx}}) * ({{x1}} + {{x3}} * (v(x) + {{vx}}) * (v(x) + {{vx}})))
++ * ((v(y) + {{vy}}) * ({{y1}} + {{y3}} * (v(y) + {{vy}}) * (v(y) + {{vy}}))) + {{vz}}
+Cstate state 0 1e-10
+Bstate 0 state I = 1e-10 * (max(-{{slew}}, min({{slew}}, {{rate}} * (v(inner) - v(state))))
++ - {CLAMP_RATE!r} * (max(0, v(state) - {{swing_high}}) + min(0, v(state) - {{swing_low}})))
+Eout behind 0 state 0 1
+Rout behind out {{max(rout, 1e-4)}}
+.ends""",
+        "multiplier_without_pole": """\
+.subckt multiplier_without_pole x y out x1=0.1 x3=0 y1=1 y3=0 vx=0 vy=0 vz=0
+Bproduct out 0 V = ((v(x) + {vx}) * ({x1} + {x3} * (v(x) + {vx}) * (v(x) + {vx})))
++ * ((v(y) + {vy}) * ({y1} + {y3} * (v(y) + {vy}) * (v(y) + {vy}))) + {vz}
 .ends""",
         "switch": """\
 .subckt switch a b on=1 off=1g closed=1
@@ -179,6 +197,7 @@ class _DeckWriter:
             if change.ramp_n:
                 raise CircuitError(f"pots {', '.join(change.values)}: a deck turns pots at once; ramp_n must be 0")
         amps = [amp.name for amp in circuit.of(OpAmp) if amp.model.has_state]
+        amps += [multiplier.name for multiplier in circuit.of(Multiplier) if multiplier.model.has_state]
         _known("state", self._deck.initial_v, [*(capacitor.name for capacitor in circuit.of(Capacitor)), *amps])
         _known("node", nodes or (), circuit.nodes)
         for node in circuit.nodes:
@@ -215,6 +234,8 @@ class _DeckWriter:
                 yield from self._source(card, element)
             case Pot(name=name) if turns := [turn for turn in self._deck.turns if name in turn.values]:
                 yield from self._turned_pot(card, element, turns)
+            case Function():
+                yield from _straight_pieces(card, element)
             case _:
                 subcircuit, values = _instance_of(element)
                 yield self._instance(subcircuit, card, element.nodes, **values)
@@ -238,7 +259,7 @@ class _DeckWriter:
         return " ".join([card, *nodes, subcircuit, *(f"{name}={_number(value)}" for name, value in values.items())])
 
     def _initial_conditions(self) -> Iterator[str]:
-        for amp in self._circuit.of(OpAmp):
+        for amp in (*self._circuit.of(OpAmp), *self._circuit.of(Multiplier)):
             if amp.name in self._deck.initial_v:
                 yield f".ic v({_card('X', amp.name)}.state)={_number(self._deck.initial_v[amp.name])}"
 
@@ -259,6 +280,8 @@ _LETTERS: Mapping[type, str] = {
     OpAmp: "X",
     DiodeLimiter: "X",
     Switch: "X",
+    Multiplier: "X",
+    Function: "B",
 }
 
 
@@ -302,7 +325,20 @@ def _number(value: float) -> str:
     return repr(float(value))
 
 
-def _instance_of(element: OpAmp | Pot | DiodeLimiter | Switch) -> tuple[str, dict[str, float]]:
+def _straight_pieces(card: str, function: Function) -> Iterator[str]:
+    """Behavioural source of a function: its middle line, and the excess beyond each bend."""
+    slope, volts = function.line
+    x = f"v({function.x})"
+    yield f"{card} {function.out} 0 V = {_number(slope)} * {x} + {_number(volts)}"
+    for kink in function.kinks:
+        below, _, above = kink.slopes
+        if math.isfinite(kink.lower):
+            yield f"+ + {_number(below)} * min(0, {x} - {_number(kink.lower)})"
+        if math.isfinite(kink.upper):
+            yield f"+ + {_number(above)} * max(0, {x} - {_number(kink.upper)})"
+
+
+def _instance_of(element: OpAmp | Pot | DiodeLimiter | Switch | Multiplier) -> tuple[str, dict[str, float]]:
     """Return the subcircuit of an element and its parameters; its nodes are the element's, in their order."""
     match element:
         case OpAmp(model=model) if not model.has_state:
@@ -326,8 +362,23 @@ def _instance_of(element: OpAmp | Pot | DiodeLimiter | Switch) -> tuple[str, dic
                 "on": element.on_ohm,
                 "off": element.off_ohm,
             }
+        case Multiplier():
+            return _multiplier_instance(element)
         case Switch():
             return "switch", {"on": element.on_ohm, "off": element.off_ohm, "closed": float(element.closed)}
+
+
+def _multiplier_instance(element: Multiplier) -> tuple[str, dict[str, float]]:
+    model, product = element.model, element.product
+    _, x1, _, x3 = (*product.x, 0.0, 0.0)[:4]
+    _, y1, _, y3 = (*product.y, 0.0, 0.0)[:4]
+    law = {"x1": x1, "x3": x3, "y1": y1, "y3": y3}
+    law |= {"vx": model.x_offset_v, "vy": model.y_offset_v, "vz": model.z_offset_v}
+    if not model.has_state:
+        return "multiplier_without_pole", law
+    low, high = model.swing_v
+    limits = {"slew": model.slew_v_per_s, "swing_low": low, "swing_high": high, "rout": model.rout_ohm}
+    return "multiplier", _finite(**law, rate=model.gain_rate, **limits)
 
 
 def _finite(**values: float) -> dict[str, float]:

@@ -1,41 +1,122 @@
-/// The steps of a data-acquisition card that depend on the sample before or on a table.
+/// Edges of the generator, and the steps of a data-acquisition card.
 
 #include "engine.h"
 
-void engine_hold(int64_t samples, int channels, double residual, const double* volts, double* held, double* out) {
-    for (int64_t k = 0; k < samples; k++, volts += channels, out += channels) {
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <string.h>
+
+static bool is_same(double one, double other) { return one <= other && one >= other; }
+
+int64_t engine_edges(
+    int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick) {
+    int64_t edges = 0, first = 0;
+    for (int64_t i = 0; i < count; i++) {
+        const int64_t ideal = (int64_t)rint(instant[i]), at = ideal < 0 ? 0 : (ideal + grid - 1) / grid * grid;
+        if (edges > 0 && at != tick[edges - 1]) {
+            edges -= edges > 1 && is_same(level[edges - 1], level[edges - 2]) ? 1 : 0;
+        } else if (edges > 0) {
+            edges--;
+        }
+        tick[edges]  = at;
+        level[edges] = level[i];
+        edges++;
+    }
+    edges -= edges > 1 && is_same(level[edges - 1], level[edges - 2]) ? 1 : 0;
+    while (edges > 0 && tick[edges - 1] >= stop) {
+        edges--;
+    }
+    while (first < edges && tick[first] < start) {
+        first++;
+    }
+    memmove(tick, &tick[first], (size_t)(edges - first) * sizeof tick[0]);
+    memmove(level, &level[first], (size_t)(edges - first) * sizeof level[0]);
+    return edges - first;
+}
+
+/// engine_see() for a number of channels that the compiler may know.
+static inline double see(int64_t       samples,
+                         int           channels,
+                         const double* card,
+                         double        residual,
+                         const double* volts,
+                         const double* normal,
+                         double*       held,
+                         double*       seen) {
+    const double *gain = card, *droop = &gain[channels], *low = &droop[channels], *lsb = &low[channels];
+    const double *noise = &lsb[channels], *offset = &noise[channels];
+    double        excess = 0.0;
+    for (int64_t k = 0; k < samples; k++, volts += channels, normal += channels, seen += channels) {
         for (int i = 0; i < channels; i++) {
-            held[i] = volts[i] + residual * (held[i] - volts[i]);
-            out[i]  = held[i];
+            const double volt = held == NULL ? volts[i] : volts[i] + residual * (held[i] - volts[i]);
+            if (held != NULL) {
+                held[i] = volt;
+            }
+            seen[i] = (volt * gain[i] - droop[i] - low[i]) / lsb[i] + (normal[i] * noise[i] + offset[i]);
+            excess += volts[i] - volts[i];
         }
     }
+    return excess;
 }
 
-void engine_approximate(int64_t count, int bits, const double* levels, const double* seen, uint16_t* codes) {
+int engine_see(int64_t       samples,
+               int           channels,
+               const double* card,
+               double        residual,
+               const double* volts,
+               const double* normal,
+               double*       held,
+               double*       seen) {
+    const double excess = channels == 4 && held == NULL
+                              ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
+                              : see(samples, channels, card, residual, volts, normal, held, seen);
+    return isnan(excess) ? 0 : 1;
+}
+
+/// Code by successive approximation: from the highest bit down, keep a bit if the input reaches the level of the code.
+static unsigned approximate(int bits, const double* levels, double seen) {
+    unsigned code = 0;
+    for (unsigned bit = 1U << bits >> 1; bit > 0U; bit >>= 1) {
+        code |= seen >= levels[code | bit] ? bit : 0U;
+    }
+    return code;
+}
+
+void engine_convert(int64_t       count,
+                    int           bits,
+                    const double* levels,
+                    unsigned      stuck_high,
+                    unsigned      stuck_low,
+                    const double* seen,
+                    uint16_t*     codes,
+                    uint8_t*      clipped) {
+    const double end = (double)(1U << bits), last = end - 1.0;
     for (int64_t k = 0; k < count; k++) {
-        unsigned code = 0;
-        for (unsigned bit = 1U << bits >> 1; bit > 0U; bit >>= 1) {
-            code |= seen[k] >= levels[code | bit] ? bit : 0U;
-        }
-        codes[k] = (uint16_t)code;
+        const double   above   = seen[k] + 0.5;
+        const double   limited = above < 0.0 ? 0.0 : above > last ? last : above;
+        const unsigned code    = levels == NULL ? (unsigned)(int)limited : approximate(bits, levels, seen[k]);
+        codes[k]               = (uint16_t)((code | stuck_high) & ~stuck_low);
+        clipped[k]             = (uint8_t)(above < 0.0) | (uint8_t)(above >= end);
     }
 }
 
-void engine_interpolate(int64_t       samples,
-                        int           channels,
-                        int64_t       stride,
-                        const double* before,
-                        const double* probes,
-                        const double* late,
-                        double*       out) {
-    for (int64_t sample = 0; sample < samples; sample++, probes += stride * channels) {
+void engine_take(int64_t        samples,
+                 int            channels,
+                 int64_t        stride,
+                 const int64_t* row,
+                 double         ahead,
+                 const double*  before,
+                 const double*  probes,
+                 const double*  late,
+                 double*        out) {
+    const int64_t width = 2 * (int64_t)channels;
+    for (int64_t sample = 0; sample < samples; sample++, probes += stride * width) {
         for (int channel = 0; channel < channels; channel++, late++, out++) {
-            int64_t row = (int64_t)*late;
-            row -= (double)row > *late ? 1 : 0;
-            const double part  = *late - (double)row;
-            const double early = row < 0 ? before[channel] : probes[row * channels + channel];
-            *out               = part > 0.0 ? early + part * (probes[(row + 1) * channels + channel] - early) : early;
+            const double* const now   = &probes[row[channel] * width + channel];
+            const double* const early = row[channel] == 0 ? &before[channel] : now - width;
+            *out                      = *now + *late * (*late < 0.0 ? *now - *early : (now[channels] - *now) / ahead);
         }
-        before = &probes[(stride - 1) * channels];
+        before = &probes[(stride - 1) * width];
     }
 }

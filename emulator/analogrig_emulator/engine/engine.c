@@ -7,9 +7,10 @@
 
 static bool is_within(int value, int low, int high) { return value >= low && value <= high; }
 
-engine_t*
-engine_new(int states, int inputs, int kinks, int outputs, double sample_period_s, int64_t events_per_sample) {
+engine_t* engine_new(
+    int states, int inputs, int products, int kinks, int outputs, double sample_period_s, int64_t events_per_sample) {
     if (!is_within(states, 0, ENGINE_MAX_STATES) || !is_within(inputs, 0, ENGINE_MAX_INPUTS) ||
+        !is_within(products, 0, ENGINE_MAX_PRODUCTS) || products > inputs || 2 * products > kinks ||
         !is_within(kinks, 0, ENGINE_MAX_KINKS) || !is_within(outputs, 0, ENGINE_MAX_OUTPUTS) ||
         !(sample_period_s > 0.0)) {
         return NULL;
@@ -21,11 +22,13 @@ engine_new(int states, int inputs, int kinks, int outputs, double sample_period_
     self->kernels           = kernels_find();
     self->states            = states;
     self->inputs            = inputs;
+    self->products          = products;
     self->kinks             = kinks;
     self->outputs           = outputs;
     self->columns           = states + inputs + 1;
     self->tick_s            = sample_period_s / (double)ENGINE_TICKS_PER_SAMPLE;
     self->events_per_sample = events_per_sample;
+    products_plan(self);
     engine_restart(self);
     return self;
 }
@@ -35,6 +38,7 @@ void engine_restart(engine_t* const self) {
     self->now        = 0;
     self->counts     = (engine_counts_t){ 0 };
     self->is_slow    = false;
+    self->ahead      = 0;
     self->w          = self->arguments[0];
     self->w_before   = self->arguments[1];
     self->w_there    = self->arguments[2];
@@ -58,6 +62,7 @@ void engine_free(engine_t* const self) {
         for (int k = 0; k < MODES; k++) {
             free(self->circuits[i]->store[k].block);
             free(self->circuits[i]->store[k].slow.block);
+            products_free(self->circuits[i]->store[k].collocation);
         }
         free(self->circuits[i]->block);
         free(self->circuits[i]);
@@ -69,13 +74,13 @@ void engine_free(engine_t* const self) {
 
 /// Number of elements of each array of engine_system_t.
 typedef struct {
-    size_t abc, g, cde, w_phi, lmn, y_phi, kinks;
+    size_t abc, g, cde, w_phi, lmn, y_phi, kinks, products;
 } sizes_t;
 
 static sizes_t sizes_of(const engine_t* const self) {
     const size_t n = (size_t)self->states, q = (size_t)self->kinks, p = (size_t)self->outputs;
     const size_t columns = (size_t)self->columns;
-    return (sizes_t){ n * columns, n * q, q * columns, q * q, p * columns, p * q, q };
+    return (sizes_t){ n * columns, n * q, q * columns, q * q, p * columns, p * q, q, (size_t)self->products };
 }
 
 static bool is_equal(size_t count, size_t size, const void* one, const void* other) {
@@ -89,6 +94,29 @@ static bool holds(const engine_t* const self, const circuit_t* circuit, const en
            is_equal(sizes.cde, sizeof(double), circuit->cde, system->cde) &&
            is_equal(sizes.w_phi, sizeof(double), circuit->w_phi, system->w_phi) &&
            is_equal(sizes.lmn, sizeof(double), circuit->lmn, system->lmn) &&
+           is_equal(sizes.y_phi, sizeof(double), circuit->y_phi, system->y_phi) &&
+           is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks) &&
+           is_equal(sizes.products, sizeof(engine_product_t), circuit->products, system->products);
+}
+
+/// True if two matrices agree in all columns but the last.
+static bool is_equal_but_last(int rows, int columns, const double* one, const double* other) {
+    bool equal = true;
+    for (int i = 0; i < rows && equal; i++) {
+        equal = is_equal((size_t)columns - 1U, sizeof(double), &one[i * columns], &other[i * columns]);
+    }
+    return equal;
+}
+
+/// True if a circuit differs from the one kept in its constants alone, as by the offsets of amplifiers.
+static bool is_variant(const engine_t* const self, const circuit_t* circuit, const engine_system_t* system) {
+    const sizes_t sizes = sizes_of(self);
+    return circuit->is_set && self->products == 0 &&
+           is_equal_but_last(self->states, self->columns, circuit->abc, system->abc) &&
+           is_equal(sizes.g, sizeof(double), circuit->g, system->g) &&
+           is_equal_but_last(self->kinks, self->columns, circuit->cde, system->cde) &&
+           is_equal(sizes.w_phi, sizeof(double), circuit->w_phi, system->w_phi) &&
+           is_equal_but_last(self->outputs, self->columns, circuit->lmn, system->lmn) &&
            is_equal(sizes.y_phi, sizeof(double), circuit->y_phi, system->y_phi) &&
            is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks);
 }
@@ -108,7 +136,8 @@ static circuit_t* new_circuit(const engine_t* const self) {
     const size_t     matrices  = sizes.abc + sizes.g + sizes.cde + sizes.w_phi + sizes.lmn + sizes.y_phi;
     circuit_t* const circuit   = calloc(1, sizeof *circuit);
     if (circuit != NULL) {
-        circuit->block = malloc((matrices + of_panels) * sizeof(double) + sizes.kinks * sizeof(engine_kink_t) + 1U);
+        circuit->block = malloc((matrices + of_panels) * sizeof(double) + sizes.kinks * sizeof(engine_kink_t) +
+                                sizes.products * sizeof(engine_product_t) + 1U);
     }
     if (circuit == NULL || circuit->block == NULL) {
         free(circuit);
@@ -124,6 +153,7 @@ static circuit_t* new_circuit(const engine_t* const self) {
     circuit->cde_panels = carve(&free_part, of_kinks);
     circuit->lmn_panels = carve(&free_part, of_panels - of_kinks);
     circuit->kink       = (engine_kink_t*)(void*)free_part;
+    circuit->products   = (engine_product_t*)(void*)&circuit->kink[sizes.kinks];
     return circuit;
 }
 
@@ -131,6 +161,21 @@ static void copy(size_t count, size_t size, const void* from, void* to) {
     if (count > 0U) {
         memcpy(to, from, count * size);
     }
+}
+
+static void pack_circuit(const engine_t* const self, circuit_t* circuit) {
+    panels_pack(self->kinks, self->columns, self->columns, circuit->cde, circuit->cde_panels);
+    panels_pack(self->outputs, self->columns, self->columns, circuit->lmn, circuit->lmn_panels);
+}
+
+/// Give the constants of a variant to a circuit.
+static void retune(const engine_t* const self, const engine_system_t* system, circuit_t* circuit) {
+    const sizes_t sizes = sizes_of(self);
+    copy(sizes.abc, sizeof(double), system->abc, circuit->abc);
+    copy(sizes.cde, sizeof(double), system->cde, circuit->cde);
+    copy(sizes.lmn, sizeof(double), system->lmn, circuit->lmn);
+    pack_circuit(self, circuit);
+    circuit->tuning++;
 }
 
 /// Put a circuit in the place of the one set longest ago, and make it the present one.
@@ -152,14 +197,26 @@ static engine_status_t keep_circuit(engine_t* const self, const engine_system_t*
     copy(sizes.lmn, sizeof(double), system->lmn, circuit->lmn);
     copy(sizes.y_phi, sizeof(double), system->y_phi, circuit->y_phi);
     copy(sizes.kinks, sizeof(engine_kink_t), system->kinks, circuit->kink);
+    copy(sizes.products, sizeof(engine_product_t), system->products, circuit->products);
     circuit->stored = 0;
     circuit->oldest = 0;
     self->circuit   = circuit;
+    products_set_laws(self, circuit->products);
     kinks_list_feeding(self);
     circuit->is_set = kinks_are_unique(self);
-    panels_pack(self->kinks, self->columns, self->columns, circuit->cde, circuit->cde_panels);
-    panels_pack(self->outputs, self->columns, self->columns, circuit->lmn, circuit->lmn_panels);
+    pack_circuit(self, circuit);
     return circuit->is_set ? ENGINE_OK : ENGINE_NOT_UNIQUE;
+}
+
+/// The kept circuit that fits; NULL if there is none.
+static circuit_t* find_circuit(const engine_t* const  self,
+                               const engine_system_t* system,
+                               bool (*fits)(const engine_t*, const circuit_t*, const engine_system_t*)) {
+    int place = 0;
+    while (place < CIRCUITS && self->circuits[place] != NULL && !fits(self, self->circuits[place], system)) {
+        place++;
+    }
+    return place < CIRCUITS ? self->circuits[place] : NULL;
 }
 
 engine_status_t engine_set_system(engine_t* const self, const engine_system_t* system) {
@@ -170,12 +227,14 @@ engine_status_t engine_set_system(engine_t* const self, const engine_system_t* s
     if (self->has_system) {
         quiet_leave(self);
     }
-    int place = 0;
-    while (place < CIRCUITS && self->circuits[place] != NULL && !holds(self, self->circuits[place], system)) {
-        place++;
+    circuit_t*       equal   = find_circuit(self, system, holds);
+    circuit_t* const variant = equal == NULL ? find_circuit(self, system, is_variant) : NULL;
+    if (variant != NULL) {
+        retune(self, system, variant);
+        equal = variant;
     }
-    if (place < CIRCUITS && self->circuits[place] != NULL) {
-        self->circuit = self->circuits[place];
+    if (equal != NULL) {
+        self->circuit = equal;
     } else {
         status = keep_circuit(self, system);
     }
@@ -208,6 +267,9 @@ engine_status_t engine_set_state(engine_t* const self, const double* x) {
 
 static engine_status_t advance(engine_t* const self, int64_t tick) {
     engine_status_t status = ENGINE_OK;
+    if (self->products > 0) {
+        return products_advance(self, tick);
+    }
     while (status == ENGINE_OK && self->now < tick) {
         if (!quiet_advance(self, tick)) {
             status = events_advance(self, tick);
@@ -219,7 +281,7 @@ static engine_status_t advance(engine_t* const self, int64_t tick) {
 /// Advance to the instant of an edge and apply it. An edge to the present level is ignored: it must not change how the
 /// steps are cut.
 static engine_status_t take_edge(engine_t* const self, int64_t tick, int32_t input, double level) {
-    if (tick < self->now || input < 0 || input >= self->inputs) {
+    if (tick < self->now || input < 0 || input >= self->inputs - self->products) {
         return ENGINE_EDGE;
     }
     const int    column = self->states + (int)input;
@@ -245,30 +307,49 @@ static bool is_finite(const engine_t* const self) {
 }
 
 static void record_sample(const engine_t* const self, double* y) {
-    double  padded[PADDED(ENGINE_MAX_OUTPUTS)];
-    double* out = self->outputs % PANEL == 0 ? y : padded;
+    const int length = self->is_slow ? row_length(self) : self->outputs;
+    double    padded[PADDED(2 * ENGINE_MAX_OUTPUTS)];
+    double*   out = length % PANEL == 0 ? y : padded;
     if (self->is_slow) {
         quiet_read(self, out);
     } else {
         self->kernels->multiply(self->outputs, self->columns, self->y_panels, self->z, out);
     }
     if (out != y) {
-        memcpy(y, padded, (size_t)self->outputs * sizeof y[0]);
+        memcpy(y, padded, (size_t)length * sizeof y[0]);
     }
+}
+
+/// Record y of engine_look_ahead(), unless record_sample() has. A copy advances, whose modes are those of the original.
+static engine_status_t record_ahead(const engine_t* const self, double* y) {
+    if (self->is_slow && self->clear >= self->now + self->ahead) {
+        return ENGINE_OK;
+    }
+    engine_t copy                = *self;
+    copy.w                       = &copy.arguments[0][self->w - self->arguments[0]];
+    copy.w_before                = &copy.arguments[0][self->w_before - self->arguments[0]];
+    copy.w_there                 = &copy.arguments[0][self->w_there - self->arguments[0]];
+    self->mode->is_pinned        = true;
+    const engine_status_t status = advance(&copy, self->now + self->ahead);
+    self->mode->is_pinned        = false;
+    quiet_leave(&copy);
+    record_sample(&copy, y);
+    return status;
 }
 
 /// Record the samples of a quiet stretch that come before a tick. Return their number.
 static int64_t run_quiet(engine_t* const self, int64_t before, double* y) {
     const bool    quiet   = self->is_slow && self->clear == NO_END;
     const int64_t samples = quiet ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
+    const int     row     = row_length(self);
     int64_t       k       = 0;
     while (k < samples) {
-        if (self->slow_age == LEAP - 1 && self->outputs % PANEL == 0 && samples - k >= LEAP) {
-            quiet_leap(self, &y[k * self->outputs]);
+        if (self->slow_age == LEAP - 1 && row % PANEL == 0 && samples - k >= LEAP) {
+            quiet_leap(self, &y[k * row]);
             k += LEAP;
         } else {
             quiet_step(self);
-            record_sample(self, &y[k * self->outputs]);
+            record_sample(self, &y[k * row]);
             k++;
         }
     }
@@ -301,9 +382,10 @@ engine_status_t engine_run(engine_t*      self,
         }
         if (status == ENGINE_OK) {
             record_sample(self, y);
-            y += self->outputs;
+            status = self->ahead > 0 ? record_ahead(self, &y[self->outputs]) : ENGINE_OK;
+            y += row_length(self);
             self->counts.samples++;
-            y += self->outputs * run_quiet(self, edge < edges && tick[edge] <= until ? tick[edge] : until + 1, y);
+            y += row_length(self) * run_quiet(self, edge < edges && tick[edge] <= until ? tick[edge] : until + 1, y);
         }
     }
     if (status == ENGINE_OK && edge < edges) {
@@ -331,7 +413,7 @@ engine_status_t engine_play(engine_t*              self,
         status = engine_set_system(self, &circuit[turn]);
         if (status == ENGINE_OK && recorded * ENGINE_TICKS_PER_SAMPLE <= until[turn]) {
             status = engine_run(self, until[turn], taken - first, &tick[first], &input[first], &level[first], y);
-            y += (self->counts.samples - recorded) * self->outputs;
+            y += (self->counts.samples - recorded) * row_length(self);
         }
     }
     return status == ENGINE_OK && taken < edges ? ENGINE_EDGE : status;
@@ -352,5 +434,7 @@ void engine_get_overdue(const engine_t* const self, int64_t* tick) {
         tick[k] = mode_overdue_tick(self, k);
     }
 }
+
+void engine_look_ahead(engine_t* const self, int64_t ticks) { self->ahead = ticks; }
 
 void engine_get_counts(const engine_t* const self, engine_counts_t* counts) { *counts = self->counts; }

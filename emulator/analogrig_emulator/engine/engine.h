@@ -13,10 +13,15 @@
 /// is found by Newton's method. Soon after it the fast states follow the slow ones, which alone are then stepped. Where a
 /// Lyapunov function proves that no event comes before the next edge, w is looked at no more.
 ///
+/// The last elements of u may be products: functions of two elements of w each, its arguments. Between events a circuit with
+/// products is affine but for them. It is stepped by exponential collocation: the products are polynomials through the
+/// Lobatto nodes of a step, and all else follows exactly.
+///
 /// The library is C99 with malloc, libm and the vectors of GCC and clang, for the host: not for interrupts and not for the
 /// device. One engine must not be used by two threads at once; different engines may. Results depend on the inputs alone,
 /// not on how a run is cut into calls, on the compiler's options or on the processor. RAM: 10 kB an engine, 40 kB a
 /// circuit; for each of up to 64 modes 45 kB with seven states, and 40 kB once it has been without events for a sample period.
+/// With products, a mode takes some 12 kB for each length of step in use instead.
 ///
 /// Rows of [A B c], [C D e] and [L M n] are stored side by side: (states + inputs + 1) columns, row-major.
 ///
@@ -28,10 +33,12 @@
 #include <stdint.h>
 
 #define ENGINE_MAX_STATES 32
-#define ENGINE_MAX_INPUTS 8
-#define ENGINE_MAX_KINKS 64
+#define ENGINE_MAX_INPUTS 24
+#define ENGINE_MAX_PRODUCTS 16
+#define ENGINE_MAX_KINKS 128
 #define ENGINE_MAX_OUTPUTS 256
 #define ENGINE_MAX_UNKNOWNS 256
+#define ENGINE_MAX_FACTOR_TERMS 16
 #define ENGINE_LEVELS 23
 #define ENGINE_TICKS_PER_SAMPLE (INT64_C(1) << (ENGINE_LEVELS - 1))
 
@@ -45,7 +52,7 @@ typedef enum {
     ENGINE_NOT_FINITE = 4,  ///< the state is no longer finite
     ENGINE_EDGE      = 5,  ///< an edge is out of order, in the past, beyond the run, or of an input that does not exist
     ENGINE_NO_SYSTEM = 6,  ///< no circuit was set, or the last one was refused
-    ENGINE_NOT_UNIQUE = 7,  ///< w = r + P phi(w) has no solution, or several, for some r
+    ENGINE_NOT_UNIQUE = 7,  ///< w = r + P phi(w) has no solution, or several, for some r; or products feed one another
 } engine_status_t;
 
 /// One kink: phi(w) = slope[p] w + intercept[p], with p = 0 below lower, 1 between, 2 above upper.
@@ -56,15 +63,24 @@ typedef struct {
     double intercept[3];
 } engine_kink_t;
 
-/// A circuit, as arrays of the caller. They are copied.
+/// One product: the value at p of the polynomial with coefficients x, in order of powers, times that of y at q. Its arguments
+/// p and q are two elements of w without limits.
 typedef struct {
-    const double*        abc;    ///< states rows
-    const double*        g;      ///< states x kinks
-    const double*        cde;    ///< kinks rows
-    const double*        w_phi;  ///< P, kinks x kinks
-    const double*        lmn;    ///< outputs rows
-    const double*        y_phi;  ///< R, outputs x kinks
-    const engine_kink_t* kinks;
+    double x[ENGINE_MAX_FACTOR_TERMS];
+    double y[ENGINE_MAX_FACTOR_TERMS];
+} engine_product_t;
+
+/// A circuit, as arrays of the caller. They are copied. The arguments of the products are the last elements of w, in their
+/// order.
+typedef struct {
+    const double*           abc;    ///< states rows
+    const double*           g;      ///< states x kinks
+    const double*           cde;    ///< kinks rows
+    const double*           w_phi;  ///< P, kinks x kinks
+    const double*           lmn;    ///< outputs rows
+    const double*           y_phi;  ///< R, outputs x kinks
+    const engine_kink_t*    kinks;
+    const engine_product_t* products;
 } engine_system_t;
 
 /// Counters since engine_new() or engine_restart().
@@ -76,9 +92,11 @@ typedef struct {
     int64_t modes_built;  ///< ladders computed; exceeds the number of modes if the store is too small
 } engine_counts_t;
 
-/// Return a new engine at rest before its first sample: x = 0, u = 0. NULL iff a size is out of range, the sample period is
-/// not positive, or memory is short. Cost: one calloc.
-engine_t* engine_new(int states, int inputs, int kinks, int outputs, double sample_period_s, int64_t events_per_sample);
+/// Return a new engine at rest before its first sample: x = 0, u = 0. products: number of inputs, the last ones, that are
+/// products; kinks: elements of w, the arguments of products among them. NULL iff a size is out of range, the sample period
+/// is not positive, or memory is short. Cost: one calloc.
+engine_t* engine_new(
+    int states, int inputs, int products, int kinks, int outputs, double sample_period_s, int64_t events_per_sample);
 
 /// Free the engine. NULL is allowed.
 void engine_free(engine_t* self);
@@ -87,7 +105,9 @@ void engine_free(engine_t* self);
 void engine_restart(engine_t* self);
 
 /// Set or replace the circuit; to be called before engine_run(). x and u keep their values. A circuit equal to the present
-/// one to the bit changes nothing. The last 8 circuits are kept, with the matrices of their modes.
+/// one to the bit changes nothing. The last 8 circuits are kept, with the matrices of their modes. One
+/// that differs from these in its constants alone, as by the offsets of amplifiers, replaces that circuit at a small part of
+/// the cost.
 ///
 /// Fails with ENGINE_NOT_UNIQUE, or as engine_run() where it enters the mode. Without a circuit, engine_run() then fails.
 /// Cost: a comparison with those kept; for a new one a copy, one determinant for each combination of pieces of the kinks that
@@ -136,6 +156,11 @@ void engine_watch(engine_t* self, int64_t patience);
 /// For each kink, write the first tick since engine_watch() at which it had been outside for that long; -1 if there is none.
 void engine_get_overdue(const engine_t* self, int64_t* tick);
 
+/// From now on record y once more `ticks` after each sample, at most one sample period: a row then holds both. To be called
+/// before the first sample. Edges and circuits after the sample are not foreseen, and the samples do not change.
+/// Cost: a longer product a sample, and a copy of the engine where it does not step slow states.
+void engine_look_ahead(engine_t* self, int64_t ticks);
+
 /// Copy the counters.
 void engine_get_counts(const engine_t* self, engine_counts_t* counts);
 
@@ -169,22 +194,48 @@ void engine_noise_add(int                   n,
                       double*               x,
                       double*               volts);
 
-/// For each sample of `channels` voltages, record in out what a sample-and-hold has acquired: the step from the voltage held
-/// before lacks the part `residual`. held: the voltages held before, then those of the last sample.
-void engine_hold(int64_t samples, int channels, double residual, const double* volts, double* held, double* out);
+/// Round the instants of `count` edges to ticks, and up to a multiple of grid; those before tick 0 move there. Of edges at one
+/// tick keep the last, and of those only the ones that change the level. Write the edges from tick start to stop - 1 to tick and
+/// level, and return their number. instant: rising; level: the level after each instant, overwritten.
+int64_t engine_edges(
+    int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick);
 
-/// Convert by successive approximation: from the highest bit down, keep a bit if the input reaches the level of the code.
-/// levels: 2^bits transitions, that of code 0 unused; bits is at most 16.
-void engine_approximate(int64_t count, int bits, const double* levels, const double* seen, uint16_t* codes);
+/// Record in seen the input of a card's converter in LSB, for `samples` rows of `channels` voltages. Return 1 iff all are finite.
+/// card: rows of `channels` numbers: gain, droop [V], lower end of the range [V], LSB [V], noise [LSB] and offset [LSB].
+/// normal: standard normal numbers, one for each voltage. held: voltages held before, then those of the last sample: the step
+/// from sample to sample lacks the part `residual`. NULL: it lacks nothing.
+int engine_see(int64_t       samples,
+               int           channels,
+               const double* card,
+               double        residual,
+               const double* volts,
+               const double* normal,
+               double*       held,
+               double*       seen);
 
-/// For each sample and channel, record in out the voltage `late` probes after the first of the `stride` probes of that sample,
-/// on the straight line between two probes. before: the probe before the first one. late: at least -1, at most stride - 1.
-void engine_interpolate(int64_t       samples,
-                        int           channels,
-                        int64_t       stride,
-                        const double* before,
-                        const double* probes,
-                        const double* late,
-                        double*       out);
+/// Convert `count` inputs in LSB to codes of `bits` bits, at most 16. clipped: 1 where the input is beyond the end codes.
+/// levels: 2^bits transitions, that of code 0 unused, for successive approximation; NULL: the ideal ones.
+/// stuck_high, stuck_low: masks of stuck bits.
+void engine_convert(int64_t       count,
+                    int           bits,
+                    const double* levels,
+                    unsigned      stuck_high,
+                    unsigned      stuck_low,
+                    const double* seen,
+                    uint16_t*     codes,
+                    uint8_t*      clipped);
+
+/// For each sample and channel, record in out the voltage `late` sample periods after row[channel] of the `stride` rows of that
+/// sample. A row has the voltages at its instant, and those `ahead` sample periods later. Between these, and between a row and
+/// the one before, voltages are taken from a straight line. before: the row before the first one.
+void engine_take(int64_t        samples,
+                 int            channels,
+                 int64_t        stride,
+                 const int64_t* row,
+                 double         ahead,
+                 const double*  before,
+                 const double*  probes,
+                 const double*  late,
+                 double*        out);
 
 #endif  // ENGINE_H

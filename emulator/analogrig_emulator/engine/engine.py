@@ -27,7 +27,8 @@ _REASONS = {
     4: "the state is no longer finite: the circuit is unstable",
     5: "the edges are out of order, before the last sample recorded, or beyond the last sample of the run",
     6: "no circuit was set, or the last one was refused",
-    7: "limiters and amplifiers feed one another so that there is no unique solution: is there positive feedback?",
+    7: "limiters, amplifiers and multipliers feed one another so that there is no unique solution: "
+    "is there positive feedback, or a loop of ideal elements?",
 }
 
 
@@ -49,8 +50,9 @@ class EngineCounts:
 class Engine:
     """Solver of one circuit. It starts at rest (x = 0, u = 0), before its first sample.
 
-    system: circuit; outputs: nodes to record; events_per_sample: most mode changes within a sample period, beyond which
-    EngineError is raised.
+    system: circuit; outputs: nodes to record; events_per_sample: most mode changes within a sample period, or
+    EngineError is raised. ahead_ticks: if not 0, the voltages so many ticks after each sample follow in its row, as
+    they would be without edges and changes after the sample.
     """
 
     def __init__(
@@ -59,8 +61,10 @@ class Engine:
         outputs: Sequence[str],
         sample_rate_hz: float = 20e3,
         events_per_sample: int = 10_000,
+        ahead_ticks: int = 0,
     ) -> None:
         self._outputs = tuple(outputs)
+        self._ahead_ticks = ahead_ticks
         self._names = (system.states, system.inputs)
         self._library = library.load()
         if not 0 < sample_rate_hz < math.inf:
@@ -69,12 +73,18 @@ class Engine:
             raise EngineError(
                 f"{len(self._outputs)} nodes are to be recorded; the engine takes at most {library.MAX_OUTPUTS}"
             )
-        sizes = (len(system.states), len(system.inputs), len(system.kinks), len(self._outputs))
+        inputs, products = len(system.inputs) + len(system.products), len(system.products)
+        sizes = (len(system.states), inputs, products, len(system.kinks), len(self._outputs))
         kind = (self._library, (*sizes, 1.0 / sample_rate_hz, events_per_sample))
         self._handle = _take(kind)
         if not self._handle:
-            raise EngineError("cannot make an engine for {} states, {} inputs, {} kinks, {} outputs".format(*sizes))
+            raise EngineError(
+                "cannot make an engine for {} states, {} inputs ({} of them products), {} kinks, {} outputs".format(
+                    *sizes
+                )
+            )
         weakref.finalize(self, _release, kind, self._handle)
+        self._library.engine_look_ahead(self._handle, ahead_ticks)
         self._kinks = len(system.kinks)
         self._recorded = 0
         self._now_tick = -1
@@ -134,7 +144,7 @@ class Engine:
     def _allocate(self, samples: int) -> NDArray[np.float64]:
         if samples < 0:
             raise EngineError(f"cannot record {samples} samples")
-        return np.empty((samples, len(self._outputs)))
+        return np.empty((samples, len(self._outputs) * (2 if self._ahead_ticks else 1)))
 
     def _advance_clock(self, samples: int) -> None:
         self._recorded += samples
@@ -205,6 +215,7 @@ class Engine:
         Raises EngineError.
         """
         self._library.engine_restart(self._handle)
+        self._library.engine_look_ahead(self._handle, self._ahead_ticks)
         self._library.engine_watch(self._handle, schedule.patience_ticks)
         self._recorded, self._now_tick = 0, -1
         volts = self._allocate(schedule.samples)
@@ -255,13 +266,15 @@ class Engine:
         trains = [(self._names[1].index(name), train) for name, train in edges.items() if train.ticks.size]
         if not trains:
             return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
+        if len(trains) == 1:
+            ((i, train),) = trains
+            inputs = np.full(train.ticks.size, i, np.int32)
+            return np.ascontiguousarray(train.ticks, np.int64), inputs, np.ascontiguousarray(train.levels_v, np.float64)
         ticks = np.concatenate([train.ticks for _, train in trains], dtype=np.int64)
         levels_v = np.concatenate([train.levels_v for _, train in trains], dtype=np.float64)
         inputs = np.repeat(np.array([i for i, _ in trains], np.int32), [train.ticks.size for _, train in trains])
-        if len(trains) > 1:
-            order = np.lexsort((inputs, ticks))
-            ticks, inputs, levels_v = ticks[order], inputs[order], levels_v[order]
-        return ticks, inputs, levels_v
+        order = np.lexsort((inputs, ticks))
+        return ticks[order], inputs[order], levels_v[order]
 
     def _check(self, status: int) -> None:
         if status:

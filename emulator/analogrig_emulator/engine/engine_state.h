@@ -6,6 +6,7 @@
 ///     modes.c     the mode in which the circuit is, and the store of modes
 ///     kinks.c     arguments w of the kinks, and the circuit with the kinks substituted
 ///     ladder.c    matrix exponentials
+///     products.c  steps of a circuit with products
 ///     matrices.c  panels, products, linear equations
 ///     kernels.c   inner loops, from lanes.h
 ///     noise.c     noise of a linear circuit, independent of the rest
@@ -64,6 +65,7 @@ typedef struct {
     double* block;
     int     rank;
     int     least_level;
+    int64_t ahead;    // that of the engine for which y was built
     bool    certain;  // s comes to rest, and energy bounds how far w strays until then
     int     row[ENGINE_MAX_STATES];
     double* change;  // of s in one sample period
@@ -75,29 +77,39 @@ typedef struct {
     double* state;   // x
     double* first;   // s 2^least_level ticks after an event, over the z of that event
     double* w;
-    double* y;       // y now and after 1, 2, ... LEAP - 1 sample periods
+    double* y;       // the row of a sample now and after 1, 2, ... LEAP - 1 sample periods
     double* rest;    // s at rest
     double* rest_w;  // w at rest
     double* energy;  // Q: e'Q e never grows, with e the distance of s from rest
     double* reach;   // (w - rest_w)^2 <= reach e'Q e, for each kink
 } slow_t;
 
+/// Nodes of a step of a circuit with products, beyond its beginning; and all of them.
+#define NODES 4
+#define ORDER (NODES + 1)
+
+/// Matrices of a mode of a circuit with products, for steps of each level.
+typedef struct collocation collocation_t;
+
 /// A mode and its matrices, in one block. base: level of the shortest step, of h = 2^base ticks. |A h| is so small that
 /// TERMS terms give the exponential of any part of h, unless `stiff`: then base is 0.
 typedef struct {
-    unsigned char piece[ENGINE_MAX_KINKS];
-    int           base;
-    bool          stiff;
-    double*       block;
-    int           capacity;  // of the block
-    int           top;       // the highest level computed so far
-    double*       ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels base .. top, states only
-    double*       looks;     // panelled w over the z of 2^level ticks before, for the same levels
-    double*       change;    // the matrix of level `top`, row-major
-    double*       terms;     // ([A B c] h)^k / k! for k = 1 .. TERMS, as series_pack() stores them
-    double*       readings;  // panelled w and y over z; used if phi feeds one of them
-    slow_t        slow;
-    bool          has_slow;
+    unsigned char  piece[ENGINE_MAX_KINKS];
+    int            base;
+    bool           stiff;
+    double*        block;
+    int            capacity;  // of the block
+    int            top;       // the highest level computed so far
+    double*        ladder;    // panelled matrices exp([A B c] 2^level ticks) - I for levels base .. top, states only
+    double*        looks;     // panelled w over the z of 2^level ticks before, for the same levels
+    double*        change;    // the matrix of level `top`, row-major
+    double*        terms;     // ([A B c] h)^k / k! for k = 1 .. TERMS, as series_pack() stores them
+    double*        readings;  // panelled w and y over z; used if phi feeds one of them
+    slow_t         slow;
+    bool           has_slow;
+    int64_t        tuning;       // that of its circuit when it was built
+    bool           is_pinned;    // another engine uses it: it must stay
+    collocation_t* collocation;  // of a circuit with products, else NULL
 } mode_t;
 
 /// The end of a step with respect to the bounds of the present mode. A step inside all bounds is CLEAR if w could not have
@@ -105,17 +117,26 @@ typedef struct {
 /// at the speed of the step before. At the top of a peak the first alone may be zero.
 typedef enum { CLEAR, NEAR, CROSSED } judgement_t;
 
+/// A product, and the degrees of its factors.
+typedef struct {
+    engine_product_t factors;
+    int              x_degree, y_degree;
+} law_t;
+
 /// A circuit and its modes. Arrays as in engine_system_t, in one block.
 typedef struct {
-    bool           is_set;  // it has a unique solution
-    double*        block;
-    double *       abc, *g, *cde, *w_phi, *lmn, *y_phi;
-    engine_kink_t* kink;
-    double *       cde_panels, *lmn_panels;
-    bool           feeds;                                     // phi feeds some w or y
-    int            coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
-    mode_t         store[MODES];
-    int            stored, oldest;
+    bool              is_set;  // it has a unique solution
+    double*           block;
+    double *          abc, *g, *cde, *w_phi, *lmn, *y_phi;
+    engine_kink_t*    kink;
+    engine_product_t* products;
+    law_t             law[ENGINE_MAX_PRODUCTS];
+    double *          cde_panels, *lmn_panels;
+    bool              feeds;                                     // phi feeds some w or y
+    int               coupled[ENGINE_MAX_KINKS], coupled_count;  // the kinks that feed a w
+    mode_t            store[MODES];
+    int               stored, oldest;
+    int64_t           tuning;  // how often the constants have changed
 } circuit_t;
 
 /// The inner loops. Memory must not overlap.
@@ -144,7 +165,7 @@ typedef struct {
 struct engine {
     const kernels_t* kernels;
 
-    int     states, inputs, kinks, outputs, columns;
+    int     states, inputs, products, kinks, outputs, columns;  // inputs: products included
     double  tick_s;
     int64_t events_per_sample;
 
@@ -157,9 +178,9 @@ struct engine {
     double  z[PADDED(MAX_COLUMNS)];  // [x u 1] now; without x in a stretch of slow states
     int64_t origin;                  // tick of the last event, edge or new circuit
     double  origin_z[PADDED(MAX_COLUMNS)];
-    int64_t clear;                   // no event comes up to this tick; NO_END in a quiet stretch and at its end
-    int64_t stride;                  // ticks from w_before to w; 0 if w has a kink between
-    int     look;                    // level of the next look from the origin; above TOP_LEVEL if there is none
+    int64_t clear;   // no event comes up to this tick; NO_END in a quiet stretch and at its end
+    int64_t stride;  // ticks from w_before to w; 0 if w has a kink between
+    int look;  // level of the next look from the origin, above TOP_LEVEL if there is none; with products, of the next step
     double *w, *w_before, *w_there;  // arguments of the kinks: at `clear`, a stride earlier, at the end of a step
     double  arguments[3][PADDED(ENGINE_MAX_KINKS)];
     int64_t events_left;
@@ -174,6 +195,10 @@ struct engine {
     bool          has_limit;                        // rest and energy_limit are those of the present mode and inputs
     double        rest[PADDED(ENGINE_MAX_STATES)];  // of the slow states
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
+
+    int64_t ahead;                                 // ticks; see engine_look_ahead()
+    double  weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes
+    double  moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the products in the last step
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER
@@ -205,6 +230,9 @@ static inline double kink_lower_bound(const engine_kink_t* kink, unsigned char p
 static inline double kink_upper_bound(const engine_kink_t* kink, unsigned char piece) {
     return piece == PIECE_LOW ? kink->lower : piece == PIECE_MIDDLE ? kink->upper : (double)INFINITY;
 }
+
+/// Numbers in the row of a sample.
+static inline int row_length(const engine_t* self) { return self->ahead > 0 ? 2 * self->outputs : self->outputs; }
 
 static inline void copy_z(const engine_t* self, const double* from, double* to) {
     for (int j = 0; j < self->columns; j++) {
@@ -253,6 +281,10 @@ engine_status_t ladder_plan(const engine_t* self, const double* a, int* base, bo
 /// Compute the terms of the present mode, and its lowest level. Overwrites a.
 void ladder_build(engine_t* self, double* a);
 
+/// Compute the last column of the terms and levels of the present mode anew, for other constants. It must not be stiff.
+/// Overwrites a. The bits are those of ladder_build() and ladder_reach().
+void ladder_retune(engine_t* self, double* a);
+
 /// Compute the levels of the present mode up to this one.
 void ladder_reach(engine_t* self, int level);
 
@@ -286,6 +318,27 @@ engine_status_t mode_enter(engine_t* self);
 /// First tick at which a kink had been outside its middle piece for `patience` ticks; NEVER if there is none by now.
 int64_t mode_overdue_tick(const engine_t* self, int kink);
 
+// ---------------------------------------------        PRODUCTS        ---------------------------------------------
+
+/// Set what depends on the nodes alone.
+void products_plan(engine_t* self);
+
+/// Set the laws of the present circuit.
+void products_set_laws(const engine_t* self, const engine_product_t* products);
+
+/// Compute the matrices of the present mode from its map [A B c]: those of its lowest level, the others as they are needed.
+engine_status_t products_build(engine_t* self, const double* a);
+
+/// Free the matrices of a mode. NULL is allowed.
+void products_free(collocation_t* matrices);
+
+/// Set w and the products in z from the state and the other inputs. Fails like kinks_solve(), and with ENGINE_NOT_UNIQUE if
+/// the products feed one another.
+engine_status_t products_solve(engine_t* self);
+
+/// Advance to a tick, and enter the modes on the way.
+engine_status_t products_advance(engine_t* self, int64_t tick);
+
 // ---------------------------------------------         STEPS          ---------------------------------------------
 
 /// Advance to a tick, or to an event before it, and enter the mode beyond.
@@ -312,8 +365,8 @@ void quiet_step(engine_t* self);
 /// Advance by LEAP samples and record them, with the bits of LEAP single steps.
 void quiet_leap(engine_t* self, double* y);
 
-/// y of the present sample in a stretch of slow states. y needs room for whole panels.
-void quiet_read(const engine_t* self, double* y);
+/// Row of the present sample in a stretch of slow states. It needs room for whole panels.
+void quiet_read(const engine_t* self, double* row);
 
 /// x in a stretch of slow states.
 void quiet_get_state(const engine_t* self, double* x);

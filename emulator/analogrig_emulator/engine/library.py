@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
+from ctypes import POINTER, c_double, c_int, c_int64, c_uint, c_void_p
 from pathlib import Path
 
 from analogrig_emulator.errors import EngineError
 
 # The limits of engine/engine.h.
 MAX_STATES = 32
-MAX_INPUTS = 8
-MAX_KINKS = 64
+MAX_INPUTS = 24
+MAX_PRODUCTS = 16
+MAX_KINKS = 128
 MAX_OUTPUTS = 256
 MAX_UNKNOWNS = 256
+MAX_FACTOR_TERMS = 16
 
 _HERE = Path(__file__).parents[1]
 _BUILD = "make setup"
@@ -29,7 +31,7 @@ class Counts(ctypes.Structure):
 class System(ctypes.Structure):
     """The C type engine_system_t."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks"))
+    _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks", "products"))
 
 
 class Noise(ctypes.Structure):
@@ -39,7 +41,7 @@ class Noise(ctypes.Structure):
 
 
 _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
-    ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_double, c_int64)),
+    ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_int, c_double, c_int64)),
     ("engine_free", None, (c_void_p,)),
     ("engine_restart", None, (c_void_p,)),
     ("engine_set_system", c_int, (c_void_p, POINTER(System))),
@@ -47,15 +49,17 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_set_state", c_int, (c_void_p, c_void_p)),
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
     ("engine_play", c_int, (c_void_p, c_int64, POINTER(System), c_void_p, c_int64, *(c_void_p,) * 4)),
+    ("engine_look_ahead", None, (c_void_p, c_int64)),
     ("engine_watch", None, (c_void_p, c_int64)),
     ("engine_get_overdue", None, (c_void_p, c_void_p)),
     ("engine_get_counts", None, (c_void_p, POINTER(Counts))),
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
     ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
     ("engine_noise_add", None, (c_int, c_int, c_int64, POINTER(Noise), *(c_void_p,) * 4)),
-    ("engine_hold", None, (c_int64, c_int, c_double, *(c_void_p,) * 3)),
-    ("engine_interpolate", None, (c_int64, c_int, c_int64, *(c_void_p,) * 4)),
-    ("engine_approximate", None, (c_int64, c_int, *(c_void_p,) * 3)),
+    ("engine_take", None, (c_int64, c_int, c_int64, c_void_p, c_double, *(c_void_p,) * 4)),
+    ("engine_edges", c_int64, (*(c_int64,) * 4, *(c_void_p,) * 3)),
+    ("engine_see", c_int, (c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),
+    ("engine_convert", None, (c_int64, c_int, c_void_p, c_uint, c_uint, *(c_void_p,) * 3)),
 )
 
 

@@ -57,9 +57,30 @@ static void point_readings(engine_t* const self) {
     }
 }
 
+/// Adapt the present mode to the constants of its circuit, which have changed since it was built.
+static void retune_mode(engine_t* const self) {
+    mode_t* const mode = self->mode;
+    double        a[MAX_ELEMENTS];
+    kinks_build_map(self, mode->piece, a);
+    if (self->circuit->feeds) {
+        kinks_build_readings(self, mode->piece, mode->readings);
+    }
+    point_readings(self);
+    if (mode->stiff) {
+        ladder_build(self, a);
+    } else {
+        ladder_retune(self, a);
+    }
+    mode->has_slow = false;
+    mode->tuning   = self->circuit->tuning;
+}
+
 /// Build the present mode in the place of the oldest of the store.
 static engine_status_t build_mode(engine_t* const self) {
-    double        a[MAX_ELEMENTS];
+    double a[MAX_ELEMENTS];
+    if (self->circuit->store[self->circuit->oldest].is_pinned) {
+        self->circuit->oldest = (self->circuit->oldest + 1) % MODES;
+    }
     mode_t* const mode = &self->circuit->store[self->circuit->oldest];
     kinks_build_map(self, self->piece, a);
     const engine_status_t status = ladder_plan(self, a, &mode->base, &mode->stiff);
@@ -68,6 +89,7 @@ static engine_status_t build_mode(engine_t* const self) {
     }
     memcpy(mode->piece, self->piece, (size_t)self->kinks);
     mode->has_slow        = false;
+    mode->tuning          = self->circuit->tuning;
     self->circuit->oldest = (self->circuit->oldest + 1) % MODES;
     self->circuit->stored = self->circuit->stored < MODES ? self->circuit->stored + 1 : MODES;
     self->mode            = mode;
@@ -76,12 +98,15 @@ static engine_status_t build_mode(engine_t* const self) {
         kinks_build_readings(self, mode->piece, mode->readings);
     }
     point_readings(self);
+    if (self->products > 0) {
+        return products_build(self, a);
+    }
     ladder_build(self, a);
     return ENGINE_OK;
 }
 
 engine_status_t mode_enter(engine_t* const self) {
-    engine_status_t status = kinks_solve(self);
+    engine_status_t status = self->products > 0 ? products_solve(self) : kinks_solve(self);
     if (status != ENGINE_OK) {
         return status;
     }
@@ -94,6 +119,8 @@ engine_status_t mode_enter(engine_t* const self) {
     self->mode = find_mode(self);
     if (self->mode == NULL) {
         status = build_mode(self);
+    } else if (self->mode->tuning != self->circuit->tuning) {
+        retune_mode(self);
     }
     if (status != ENGINE_OK) {
         return status;

@@ -402,14 +402,64 @@ static bool choose_slow(const engine_t* const self, slow_t* slow, const double* 
     return true;
 }
 
+static int width_of(const engine_t* const self, const slow_t* slow) {
+    return slow->rank + self->columns - self->states;
+}
+
+/// Advance slow states by a number of ticks, at most one sample period.
+static void move_slow(const engine_t* const self, const slow_t* slow, int64_t ticks, double* z) {
+    const int     width = width_of(self, slow), rows = PADDED(slow->rank), elements = PANEL_ELEMENTS(slow->rank, width);
+    const int64_t rest = ticks & ((INT64_C(1) << slow->base) - 1);
+    for (int level = slow->base; ticks >> level != 0; level++) {
+        if ((ticks >> level & 1) != 0) {
+            self->kernels->advance(slow->rank, width, &slow->ladder[(level - slow->base) * elements], z);
+        }
+    }
+    if (rest != 0) {
+        const double part = (double)rest / (double)(INT64_C(1) << slow->base);
+        double       terms[TERMS * PADDED(ENGINE_MAX_STATES)];
+        self->kernels->multiply(slow->count * rows, width, slow->terms, z, terms);
+        series_sum(self->kernels, slow->rank, slow->count, terms, part, z);
+    }
+}
+
+/// Change of s over [s u 1] in a number of ticks.
+static void find_change(const engine_t* const self, const slow_t* slow, int64_t ticks, double* change) {
+    const int width = width_of(self, slow);
+    for (int j = 0; j < width; j++) {
+        double z[MAX_COLUMNS] = { 0.0 };
+        z[j]                  = 1.0;
+        move_slow(self, slow, ticks, z);
+        for (int i = 0; i < slow->rank; i++) {
+            change[i * width + j] = z[i] - (i == j ? 1.0 : 0.0);
+        }
+    }
+}
+
+/// Pack the rows of the present sample and of the next ones over [s u 1]. change: that of s in one sample period.
+static void pack_rows(const engine_t* const self, slow_t* slow, const double* map, const double* change) {
+    const int p = self->outputs, columns = self->columns, width = width_of(self, slow), row = row_length(self);
+    double    y[ENGINE_MAX_OUTPUTS * MAX_COLUMNS], rows[2 * ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
+    double    ahead[ENGINE_MAX_STATES * MAX_COLUMNS];
+    panels_unpack(p, columns, columns, self->y_panels, y);
+    restrict_to_slow(self, slow->rank, p, y, columns, map, rows);
+    find_change(self, slow, self->ahead, ahead);
+    for (int i = 0; i < LEAP; i++) {
+        if (self->ahead > 0) {
+            advance_rows(slow->rank, width, p, ahead, rows, &rows[p * width]);
+        }
+        panels_pack(row, width, width, rows, &slow->y[i * PANEL_ELEMENTS(row, width)]);
+        advance_rows(slow->rank, width, p, change, rows, y);
+        memcpy(rows, y, (size_t)(p * width) * sizeof y[0]);
+    }
+}
+
 /// Build the slow part of the present mode.
 static void build_slow(engine_t* const self, slow_t* slow) {
-    const int n = self->states, q = self->kinks, p = self->outputs, columns = self->columns;
+    const int n = self->states, q = self->kinks, columns = self->columns;
     double    f[ENGINE_MAX_STATES * MAX_COLUMNS], map[ENGINE_MAX_STATES * MAX_COLUMNS];
     double    change[ENGINE_MAX_STATES * MAX_COLUMNS];
-    double    rows[ENGINE_MAX_OUTPUTS * MAX_COLUMNS], y[ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
-    double    later[ENGINE_MAX_OUTPUTS * MAX_COLUMNS];
-    double    w[ENGINE_MAX_KINKS * MAX_COLUMNS];
+    double    rows[ENGINE_MAX_KINKS * MAX_COLUMNS], w[ENGINE_MAX_KINKS * MAX_COLUMNS];
     ladder_reach(self, TOP_LEVEL);
     const int top = (TOP_LEVEL - self->mode->base) * PANEL_ELEMENTS(n, columns);
     panels_unpack(n, columns, columns, &self->mode->ladder[top], f);
@@ -425,17 +475,13 @@ static void build_slow(engine_t* const self, slow_t* slow) {
     restrict_slow_rows(self, slow, f, columns, map, change);
     panels_pack(rank, width, width, change, slow->change);
     panels_pack(n, width, width, map, slow->state);
-    panels_unpack(p, columns, columns, self->y_panels, rows);
-    restrict_to_slow(self, rank, p, rows, columns, map, y);
-    for (int i = 0; i < LEAP; i++) {
-        panels_pack(p, width, width, y, &slow->y[i * PANEL_ELEMENTS(p, width)]);
-        advance_rows(rank, width, p, change, y, later);
-        memcpy(y, later, (size_t)(p * width) * sizeof y[0]);
-    }
     panels_unpack(q, columns, columns, self->w_panels, rows);
     restrict_to_slow(self, rank, q, rows, columns, map, w);
     panels_pack(q, width, width, w, slow->w);
     slow->certain = certify_slow(self, slow, map, w, change);
+    if (slow->certain) {
+        pack_rows(self, slow, map, change);
+    }
     for (int i = 0; i < LEAP_DOUBLINGS; i++) {
         double_change(rank, width, change);
     }
@@ -446,7 +492,7 @@ static void build_slow(engine_t* const self, slow_t* slow) {
 static bool allocate(const engine_t* const self, slow_t* slow) {
     const int n = self->states, columns = self->columns, constants = columns - n;
     const int of_states = PANEL_ELEMENTS(n, columns), of_kinks = PANEL_ELEMENTS(self->kinks, columns);
-    const int of_outputs = LEAP * PANEL_ELEMENTS(self->outputs, columns);
+    const int of_outputs = LEAP * PANEL_ELEMENTS(2 * self->outputs, columns);
     const int of_rest = PANEL_ELEMENTS(n, constants), of_rest_w = PANEL_ELEMENTS(self->kinks, constants);
     const int count = (ENGINE_LEVELS + TERMS + 4) * of_states + of_kinks + of_outputs + of_rest + of_rest_w + n * n;
     if (slow->block == NULL) {
@@ -471,10 +517,11 @@ static bool allocate(const engine_t* const self, slow_t* slow) {
 /// steps all states.
 static const slow_t* find_slow(engine_t* const self) {
     slow_t* slow = &self->mode->slow;
-    if (!self->mode->has_slow) {
+    if (!self->mode->has_slow || slow->ahead != self->ahead) {
         if (!allocate(self, slow)) {
             return NULL;
         }
+        slow->ahead = self->ahead;
         build_slow(self, slow);
         self->mode->has_slow = true;
     }
@@ -528,27 +575,6 @@ static void certify(engine_t* const self, const slow_t* slow) {
 }
 
 // ---------------------------------------------       STRETCHES        ---------------------------------------------
-
-static int width_of(const engine_t* const self, const slow_t* slow) {
-    return slow->rank + self->columns - self->states;
-}
-
-/// Advance slow states by a number of ticks, at most one sample period.
-static void move_slow(const engine_t* const self, const slow_t* slow, int64_t ticks, double* z) {
-    const int     width = width_of(self, slow), rows = PADDED(slow->rank), elements = PANEL_ELEMENTS(slow->rank, width);
-    const int64_t rest = ticks & ((INT64_C(1) << slow->base) - 1);
-    for (int level = slow->base; ticks >> level != 0; level++) {
-        if ((ticks >> level & 1) != 0) {
-            self->kernels->advance(slow->rank, width, &slow->ladder[(level - slow->base) * elements], z);
-        }
-    }
-    if (rest != 0) {
-        const double part = (double)rest / (double)(INT64_C(1) << slow->base);
-        double       terms[TERMS * PADDED(ENGINE_MAX_STATES)];
-        self->kernels->multiply(slow->count * rows, width, slow->terms, z, terms);
-        series_sum(self->kernels, slow->rank, slow->count, terms, part, z);
-    }
-}
 
 /// Begin a stretch at the present sample, with the slow states in slow_z.
 static void begin(engine_t* const self, const slow_t* slow) {
@@ -625,16 +651,15 @@ void quiet_leap(engine_t* const self, double* y) {
     const slow_t* slow  = &self->mode->slow;
     const int     width = width_of(self, slow);
     self->kernels->advance(slow->rank, width, slow->leap, self->slow_z);
-    self->kernels->multiply(LEAP * self->outputs, width, slow->y, self->slow_z, y);
+    self->kernels->multiply(LEAP * row_length(self), width, slow->y, self->slow_z, y);
     self->now += LEAP * ENGINE_TICKS_PER_SAMPLE;
     self->counts.quiet += LEAP;
 }
 
-void quiet_read(const engine_t* const self, double* y) {
+void quiet_read(const engine_t* const self, double* row) {
     const slow_t* slow  = &self->mode->slow;
-    const int     width = width_of(self, slow);
-    self->kernels->multiply(self->outputs, width, &slow->y[self->slow_age * PANEL_ELEMENTS(self->outputs, width)],
-                            self->slow_z, y);
+    const int     width = width_of(self, slow), length = row_length(self);
+    self->kernels->multiply(length, width, &slow->y[self->slow_age * PANEL_ELEMENTS(length, width)], self->slow_z, row);
 }
 
 /// x a number of ticks later.

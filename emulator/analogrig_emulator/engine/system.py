@@ -2,7 +2,8 @@
 
     dx/dt = A x + B u + c + G phi(w),   w = C x + D u + e + P phi(w),   v = L x + M u + n + R phi(w)
 
-x: states, u: inputs, v: node voltages, phi: one Kink per element of w.
+x: states, u: inputs and, after them, products of two elements of w each; v: node voltages, phi: one Kink per element of
+w.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ Matrix = NDArray[np.float64]
 
 _PIECE_SLACK = 1e-9
 """Relative excess over a kink's bound that may be rounding."""
+
+_REST_PASSES = 200
+_REST_V = 1e-12
 
 
 def is_integer(number: object) -> bool:
@@ -93,6 +97,11 @@ class Kink:
         """Excess of w over lower..upper, 0 within."""
         return cls(lower, upper, (1.0, 0.0, 1.0))
 
+    @classmethod
+    def none(cls, element: str = "") -> Kink:
+        """No kink: an argument of a product."""
+        return cls(-math.inf, math.inf, (0.0, 0.0, 0.0), element)
+
     @property
     def intercepts(self) -> tuple[float, float, float]:
         """Constant terms of the pieces, such that they meet; 0 for a piece that an infinite bound removes."""
@@ -108,6 +117,27 @@ class Kink:
             if math.isfinite(bound) and w < bound + (slack if now <= piece else -slack):
                 return piece
         return 2 if math.isfinite(self.upper) else 1
+
+
+@dataclass(frozen=True)
+class Product:
+    """Product of two polynomials, each of one element of w: coefficients x and y in order of powers."""
+
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    element: str = ""
+    """Name of the element that multiplies."""
+
+    def at(self, p: float, q: float) -> float:
+        """Value at two arguments."""
+        return _polynomial(self.x, p) * _polynomial(self.y, q)
+
+
+def _polynomial(coefficients: tuple[float, ...], at: float) -> float:
+    value = 0.0
+    for coefficient in reversed(coefficients):
+        value = value * at + coefficient
+    return value
 
 
 class Rest(NamedTuple):
@@ -128,7 +158,8 @@ class Layout(NamedTuple):
     def of(cls, system: PiecewiseLinear, outputs: tuple[str, ...]) -> Layout:
         rows = system.rows(outputs)
         arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
-        parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
+        tables = (_kink_table(system.kinks), _product_table(system.products))
+        parts = [array.ravel() for array in (*arrays, *tables)]
         block = np.concatenate(parts)
         starts = tuple(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
         return cls._placed(block, starts)
@@ -153,15 +184,25 @@ def _kink_table(kinks: tuple[Kink, ...]) -> Matrix:
     return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)
 
 
+@functools.lru_cache(maxsize=64)
+def _product_table(products: tuple[Product, ...]) -> Matrix:
+    """Rows of engine_product_t: (products, 2 MAX_FACTOR_TERMS)."""
+    table = np.zeros((len(products), 2, library.MAX_FACTOR_TERMS))
+    for row, product in zip(table, products, strict=True):
+        row[0, : len(product.x)], row[1, : len(product.y)] = product.x, product.y
+    return table
+
+
 @dataclass(frozen=True)
 class PiecewiseLinear:
     """The state space of a circuit, in the form of the module docstring.
 
-    Columns of abc, cde and lmn: states, inputs, constant.
+    Columns of abc, cde and lmn: states, inputs, products, constant. m counts inputs and products.
 
     abc: (n, n+m+1) in 1/s and V/s; g: (n, q); cde: (q, n+m+1); w_phi: P, (q, q); lmn: (nodes, n+m+1), dimensionless but
     for its last column in V; v_phi: R, (nodes, q).
-    states, inputs, nodes: names; ground is not among the nodes. origin: state space with the same matrices but abc and
+    states, inputs, nodes: names; ground is not among the nodes. products: the last rows of w are their arguments, two
+    each, of which phi makes nothing. origin: state space with the same matrices but abc and
     cde, whose layouts are made into those of this one.
     """
 
@@ -175,6 +216,7 @@ class PiecewiseLinear:
     w_phi: Matrix
     lmn: Matrix
     v_phi: Matrix
+    products: tuple[Product, ...] = ()
     origin: PiecewiseLinear | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -220,14 +262,29 @@ class PiecewiseLinear:
 
         Pieces are tried from the middle ones on: each time those that hold the rest of the last ones, until they agree.
         The rest need not be unique, nor the one that the circuit would reach from its present state.
+        Products are iterated until they no longer change.
         Raises CircuitError naming a state that nothing brings to rest, or elements without a rest in any piece tried.
         """
+        if not self.products:
+            return self._rest_with(levels_v)[0]
+        values = np.zeros(len(self.products))
+        for _ in range(_REST_PASSES):
+            rest, w = self._rest_with(np.concatenate((levels_v, values)))
+            arguments = w[len(w) - 2 * values.size :].reshape(-1, 2)
+            before, values = values, np.array([f.at(*pair) for f, pair in zip(self.products, arguments, strict=True)])
+            if not (np.abs(values - before) > _REST_V).any():
+                return rest
+        names = ", ".join(dict.fromkeys(product.element for product in self.products))
+        raise CircuitError(f"nothing brings {names} to rest: the products do not settle")
+
+    def _rest_with(self, levels_v: Matrix) -> tuple[Rest, Matrix]:
+        """Rest and its w with the products held as well."""
         pieces = np.ones(len(self.kinks), np.intp)
         for _ in range(2 * len(self.kinks) + 1):
             rest, w = self._rest_within(pieces, levels_v)
             reached = np.array([kink.piece(*at) for kink, *at in zip(self.kinks, w, pieces, strict=True)], np.intp)
             if (reached == pieces).all():
-                return rest
+                return rest, w
             unsettled, pieces = reached != pieces, reached
         names = dict.fromkeys(kink.element for kink, moves in zip(self.kinks, unsettled, strict=True) if moves)
         raise CircuitError(f"nothing brings {', '.join(names)} to rest: no piece of its limits holds a rest")

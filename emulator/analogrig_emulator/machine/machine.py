@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     Circuit,
     Element,
@@ -39,6 +38,7 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
 from analogrig_emulator.circuit.nodal import Nodal, analyse
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
@@ -129,6 +129,7 @@ class AnalogComputer:
         self._initial_v = dict(initial_v or {})
         self._ic_ohm = ic_ohm
         self._sample_rate_hz = sample_rate_hz
+        self._ahead_ticks = 0
         self._lamp_delay_ticks = round(lamp_delay_s * sample_rate_hz * TICKS_PER_SAMPLE)
         self._wipers = _Wipers(circuit, components)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
@@ -266,12 +267,12 @@ class AnalogComputer:
 
     # ---- operation
 
-    def restart(self, mode: Mode = Mode.INITIAL_CONDITION) -> None:
+    def restart(self, mode: Mode = Mode.INITIAL_CONDITION, ahead_ticks: int = 0) -> None:
         """Restart in a mode: empty capacitors, inputs at 0 V, dark lamps, clock before sample 0.
 
-        Pots and initial voltages stay; a ramp stops at its present dial.
+        Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks: as for Engine.
         """
-        self._mode = mode
+        self._mode, self._ahead_ticks = mode, ahead_ticks
         self._dials |= self._wipers.contacts_at_rest(self._turns)
         self._turns = {}
         self._levels_v = {source.name: 0.0 for source in self._patched.inputs}
@@ -379,7 +380,7 @@ class AnalogComputer:
     def _engine(self) -> Engine:
         """Engine, made on first use after a restart: most machines have their pots set before they are played."""
         if self._powered is None:
-            self._powered = Engine(self._system, self._readings, self._sample_rate_hz)
+            self._powered = Engine(self._system, self._readings, self._sample_rate_hz, ahead_ticks=self._ahead_ticks)
             self._powered.watch(self._lamp_delay_ticks)
             self._charge_at_once(self._powered)
         return self._powered
@@ -403,7 +404,7 @@ class AnalogComputer:
         """Record the samples up to a tick and go there."""
         samples = max(tick // TICKS_PER_SAMPLE + 1 - self.recorded, 0)
         if not samples:
-            volts, later = np.empty((0, len(self._readings))), edges
+            volts, later = self._engine.run(0), edges
         else:
             at_last = (self.recorded + samples - 1) * TICKS_PER_SAMPLE
             volts, later = self._play(samples, _edges_until(edges, at_last)), _edges_after(edges, at_last)

@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.circuit.circuit import GROUND, Circuit, OpAmp, Pot, Resistor
+from analogrig_emulator.circuit.circuit import Circuit, OpAmp, Pot, Resistor
 from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
 from analogrig_emulator.circuit.nodal import analyse
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
 from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import PiecewiseLinear
@@ -209,8 +210,12 @@ class NoisySuspension:
         samples: int,
         changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
+        ahead_ticks: int = 0,
     ) -> Iterator[Matrix]:
-        """Play like SuspensionComputer.play. The noise ignores set() between blocks, and follows a ramp at its end."""
+        """Play like SuspensionComputer.play. The noise ignores set() between blocks, and follows a ramp at its end.
+
+        It does not change within ahead_ticks.
+        """
         computer = self._computer
         planned = computer.plan(changes, samples)
         turns = sorted(((turn.sample + 1 + turn.ramp_n, turn.values) for turn in planned), key=lambda turn: turn[0])
@@ -221,7 +226,8 @@ class NoisySuspension:
             temperature_c=self._temperature_c,
             sample_rate_hz=computer.sample_rate_hz,
         )
-        return self._blocks(computer.play_planned(excitation, samples, planned, block_samples), noise, turns)
+        quiet = computer.play_planned(excitation, samples, planned, block_samples, ahead_ticks)
+        return self._blocks(quiet, noise, turns)
 
     def _blocks(
         self, quiet: Iterator[Matrix], noise: CircuitNoise, turns: list[tuple[int, Mapping[str, float]]]
@@ -230,7 +236,12 @@ class NoisySuspension:
         for block in quiet:
             now = [(int(sample) - first, dials) for sample, dials in turns if sample < first + len(block)]
             del turns[: len(now)]
-            noise.add_to(block, signs, now, self._rng)
+            if block.shape[1] == len(signs):
+                noise.add_to(block, signs, now, self._rng)
+            else:
+                noise_v = np.zeros((len(block), len(signs)))
+                noise.add_to(noise_v, signs, now, self._rng)
+                np.add(block, np.tile(noise_v, 2), out=block)
             first += len(block)
             yield block
 

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     Circuit,
     CurrentSource,
@@ -23,6 +22,8 @@ from analogrig_emulator.circuit.circuit import (
     label,
 )
 from analogrig_emulator.circuit.components import is_part_of
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import CircuitError
 
 
@@ -93,7 +94,7 @@ def _drivers(circuit: Circuit) -> set[str]:
 
 
 def _output(element: Element) -> str | None:
-    if isinstance(element, OpAmp):
+    if isinstance(element, OpAmp | Multiplier | Function):
         return element.out
     if isinstance(element, VoltageSource):
         return element.minus if element.plus == GROUND else element.plus
@@ -134,7 +135,9 @@ def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
 
 def _check_feedback(circuit: Circuit, amp: OpAmp, drivers: set[str]) -> None:
     bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
-    if amp.minus != amp.out and amp.out not in _reachable(amp.minus, bonds, drivers | {GROUND}):
+    computing: tuple[Multiplier | Function, ...] = (*circuit.of(Multiplier), *circuit.of(Function))
+    fed_back = {amp.out} | {part.out for part in computing if amp.out in part.nodes[:-1]}
+    if amp.minus != amp.out and not fed_back & _reachable(amp.minus, bonds, drivers | {GROUND}):
         raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
 
@@ -149,14 +152,17 @@ def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
     bonds = [bond for element in circuit.elements for bond in element.bonds]
     elsewhere = _reachable(GROUND, bonds, {amp.minus, amp.out}) - {amp.minus, amp.out, GROUND}
     for element in circuit.elements:
-        if isinstance(element, OpAmp | VoltageSource | Capacitor) or amp.minus not in element.nodes:
+        if (
+            isinstance(element, OpAmp | VoltageSource | Capacitor | Multiplier | Function)
+            or amp.minus not in element.nodes
+        ):
             continue
         if not is_part_of(element, amp.name) and elsewhere.intersection(element.nodes):
             yield element
 
 
 def _passive_bonds(element: Element) -> tuple[tuple[str, str], ...]:
-    return () if isinstance(element, OpAmp | VoltageSource) else element.bonds
+    return () if isinstance(element, OpAmp | VoltageSource | Multiplier | Function) else element.bonds
 
 
 def _reachable(start: str, bonds: list[tuple[str, str]], borders: set[str]) -> set[str]:

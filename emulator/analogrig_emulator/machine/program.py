@@ -20,15 +20,15 @@ from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.errors import PotError
 
 CHANNELS = ("force", "displacement", "velocity", "net_force")
-"""Quantities on the card's four channels, in order. Every program has them."""
+"""Quantities on the card's four channels, in order, for a suspension."""
 
 SOURCE = "F"
-"""Name of every program's input, and its node is "in"."""
+"""Name of every program's first input, and its node is "in"."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Row of the scaling table: node, sign there, and full scale (10 V) in N, m or m/s."""
+    """Row of the scaling table: node, sign there, and full scale, the value of 10 V."""
 
     node: str
     sign: float
@@ -43,11 +43,11 @@ class Scales:
     quantities: Mapping[str, Scale]
 
     def full(self, quantity: str) -> float:
-        """Full scale of a quantity: value of 10 V in N, m or m/s."""
+        """Full scale of a quantity: value of 10 V."""
         return self.quantities[quantity].full
 
     def volts(self, quantity: str) -> float:
-        """Volts per unit (N, m, m/s) of a quantity, on a channel of the card: the node's sign is taken out."""
+        """Volts per unit of a quantity, on a channel of the card: the node's sign is taken out."""
         return 10.0 / self.quantities[quantity].full
 
     def volts_at_node(self, quantity: str) -> float:
@@ -97,6 +97,14 @@ class ForceLaw(Parameter):
         return (value * self.full_in / self.full_out) * self.gain
 
 
+@dataclass(frozen=True)
+class PotRow:
+    """Load of a pot, the resistor from its wiper to a virtual ground, and the parameters that turn it."""
+
+    load: str
+    settings: tuple[str, ...]
+
+
 class Program(ABC):
     """Circuit for the machine, with its scales and pots. Programs never change."""
 
@@ -108,9 +116,9 @@ class Program(ABC):
         """Scales of CHANNELS and of any other quantity of the program."""
 
     @property
-    @abstractmethod
     def parameters(self) -> Mapping[str, Parameter]:
-        """Parameters by setting ("M_kg"), first mass, damper and spring of the sprung mass."""
+        """Parameters by setting ("M_kg") that turn one pot each, first mass, damper and spring of the sprung mass."""
+        return {}
 
     @property
     @abstractmethod
@@ -136,14 +144,32 @@ class Program(ABC):
         return {name: parameter.value for name, parameter in self.parameters.items()}
 
     @functools.cached_property
+    def pots(self) -> Mapping[str, PotRow]:
+        """Pot table by pot."""
+        return {row.pot: PotRow(row.load, (name,)) for name, row in self.parameters.items()}
+
+    def pot_coefficient(self, pot: str, values: Mapping[str, float]) -> float:
+        """Coefficient of a pot under load, for the values of the parameters that turn it.
+
+        It may exceed 1; PotModel.dial rejects that. Raises PotError for a value that is not positive and finite.
+        """
+        (name,) = self.pots[pot].settings
+        return self.coefficient(name, values[name])
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Quantities on the card's channels, in order."""
+        return CHANNELS
+
+    @functools.cached_property
     def channel_nodes(self) -> tuple[str, ...]:
-        """Nodes of CHANNELS."""
-        return tuple(self.scales.quantities[channel].node for channel in CHANNELS)
+        """Nodes of the channels."""
+        return tuple(self.scales.quantities[channel].node for channel in self.channels)
 
     @functools.cached_property
     def channel_signs(self) -> NDArray[np.float64]:
-        """Signs of CHANNELS at their nodes: a card's differential input can be reversed."""
-        return np.array([self.scales.quantities[channel].sign for channel in CHANNELS])
+        """Signs of the channels at their nodes: a card's differential input can be reversed."""
+        return np.array([self.scales.quantities[channel].sign for channel in self.channels], dtype=np.float64)
 
     def coefficient(self, setting: str, value: float) -> float:
         """Coefficient under load of the pot of a setting, for a value in kg, N s/m or N/m.

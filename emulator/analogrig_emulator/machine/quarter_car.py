@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from analogrig_emulator.circuit.circuit import (
-    GROUND,
     Capacitor,
     DiodeLimiter,
     Element,
@@ -29,6 +28,7 @@ from analogrig_emulator.circuit.circuit import (
     VoltageSource,
 )
 from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
 

@@ -74,7 +74,8 @@ class SuspensionComputer:
             sample_rate_hz=sample_rate_hz,
             components=components,
         )
-        self.set(**self.program.values)
+        self._values = dict(self.program.values)
+        self.machine.turn({pot: self._dial(pot, self._values) for pot in self._pots})
         self._plays = 0
 
     @property
@@ -104,21 +105,24 @@ class SuspensionComputer:
         the pots arrive so many samples after the last one taken.
         Raises PotError naming the pot; no pot is turned then.
         """
-        self.machine.turn(self._resolve(settings), ramp_n)
+        values = dict(self._values)
+        self.machine.turn(self._resolve(settings, values), ramp_n)
+        self._values = values
 
     def dials_for(self, **settings: float) -> dict[str, float]:
         """Dials to which set(**settings) turns the pots."""
-        return self.machine.resting(self._resolve(settings))
+        return self.machine.resting(self._resolve(settings, dict(self._values)))
 
     def plan(self, changes: Sequence[PotTurn], samples: int) -> list[PotTurn]:
         """Dials by pot that play(..., samples, changes) sets, in order of time. Raises PotError."""
-        planned = []
+        planned, values = [], dict(self._values)
         for sample, settings, ramp_n in sorted(changes, key=lambda change: change.sample):
             if not (is_integer(sample) and 0 <= sample < samples):
                 raise PotError(
                     f"change of {', '.join(settings)} at sample {sample!r}: the run has samples 0 to {samples - 1}"
                 )
-            planned.append(PotTurn(sample, self.dials_for(**settings), check_ramp(ramp_n, settings)))
+            dials = self.machine.resting(self._resolve(settings, values))
+            planned.append(PotTurn(sample, dials, check_ramp(ramp_n, settings)))
         return planned
 
     def play(
@@ -127,23 +131,31 @@ class SuspensionComputer:
         samples: int,
         changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
+        ahead_ticks: int = 0,
     ) -> Iterator[NDArray[np.float64]]:
         """Play from rest; yield the volts of CHANNELS in blocks: float64 (block_samples or, last, fewer; 4).
+
+        If ahead_ticks is not 0, a row has 8 volts: those of the sample, and those so many ticks later, as for Engine.
 
         The excitation's first level applies at sample 0. A change takes effect right after its sample is
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
         Raises PotError, ExcitationError and EngineError; for invalid arguments before anything is played.
         """
-        return self.play_planned(excitation, samples, self.plan(changes, samples), block_samples)
+        return self.play_planned(excitation, samples, self.plan(changes, samples), block_samples, ahead_ticks)
 
     def play_planned(
-        self, excitation: Excitation, samples: int, turns: Sequence[PotTurn], block_samples: int = BLOCK_SAMPLES
+        self,
+        excitation: Excitation,
+        samples: int,
+        turns: Sequence[PotTurn],
+        block_samples: int = BLOCK_SAMPLES,
+        ahead_ticks: int = 0,
     ) -> Iterator[NDArray[np.float64]]:
         """Play like play(), with turns from plan()."""
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
         excitation.period_ticks(self.sample_rate_hz)
-        self.machine.restart(Mode.OPERATE)
+        self.machine.restart(Mode.OPERATE, ahead_ticks)
         self._plays += 1
         return self._blocks(self._plays, excitation, samples, list(turns), block_samples)
 
@@ -176,29 +188,39 @@ class SuspensionComputer:
         trains = {SOURCE: edges.within(*self.machine.window(samples))}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
-        volts *= self._signs
+        by_instant = volts.reshape(samples, -1, len(self._signs))
+        by_instant *= self._signs
         return volts
 
     # ---- pots
 
-    def _resolve(self, settings: Mapping[str, float]) -> dict[str, float]:
-        parameters = self.program.parameters
+    def _resolve(self, settings: Mapping[str, float], values: dict[str, float]) -> dict[str, float]:
+        """Dials for settings, which are entered into the values of the parameters."""
         dials: dict[str, float] = {}
         for key, value in settings.items():
-            pot = parameters[key].pot if key in parameters else key.removesuffix("_dial")
+            if key in self.program.values:
+                values[key] = value
+                continue
+            pot = key.removesuffix("_dial")
             if pot == key or pot not in self._pots:
-                known = (*parameters, *(f"{name}_dial" for name in self._pots))
+                known = (*self.program.values, *(f"{name}_dial" for name in self._pots))
                 raise PotError(f"unknown setting {key!r}; there are {', '.join(known)}")
-            if pot in dials:
-                raise PotError(f"pot {pot}: set twice at the same time")
-            dials[pot] = self._dial_for_value(pot, key, value) if key in parameters else check_dial(value, pot)
+            dials[pot] = check_dial(value, pot)
+        for pot, row in self.program.pots.items():
+            if any(name in settings for name in row.settings):
+                if pot in dials:
+                    raise PotError(f"pot {pot}: set twice at the same time")
+                dials[pot] = self._dial(pot, values, settings)
         return dials
 
-    def _dial_for_value(self, pot: str, key: str, value: float) -> float:
+    def _dial(self, pot: str, values: Mapping[str, float], settings: Mapping[str, float] | None = None) -> float:
+        """Dial of a pot for values of the parameters; settings: those to name in an error, all by default."""
         try:
-            return self._pots[pot].dial(self.program.coefficient(key, value))
+            return self._pots[pot].dial(self.program.pot_coefficient(pot, values))
         except PotError as cause:
-            raise PotError(f"{cause}; {key} = {value:g} cannot be set on program {self.program.name}") from cause
+            named = self.program.pots[pot].settings
+            texts = [f"{name} = {values[name]:g}" for name in named if settings is None or name in settings]
+            raise PotError(f"{cause}; {', '.join(texts)} cannot be set on program {self.program.name}") from cause
 
 
 @dataclass(frozen=True)
@@ -235,8 +257,8 @@ def _pots(program: Program, circuit: Circuit, components: Components) -> _Loaded
     loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
     tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
-        row.pot: _LoadedPot(components.pots.model(tracks_ohm[row.pot]), row.pot, loads_ohm[row.load])
-        for row in program.parameters.values()
+        pot: _LoadedPot(components.pots.model(tracks_ohm[pot]), pot, loads_ohm[row.load])
+        for pot, row in program.pots.items()
     }
 
 

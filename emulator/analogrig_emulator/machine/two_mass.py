@@ -13,8 +13,9 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from analogrig_emulator.circuit.circuit import GROUND, Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
+from analogrig_emulator.circuit.circuit import Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
 
 

@@ -34,6 +34,19 @@ keep(const library_t* const self, const size_t k, const est_step_t* const step, 
     }
 }
 
+/// Enter sample k; return the number of alarms.
+static size_t enter(library_t* const           self,
+                    const size_t               k,
+                    const float                u,
+                    const float                y,
+                    const uint8_t* const       valid,
+                    const library_out_t* const out) {
+    const est_sample_t sample = { .u = u, .y = y, .valid = (valid == 0) || (valid[k] != 0U) };
+    const est_step_t   step   = est_step(&self->estimator, sample);
+    keep(self, k, &step, out);
+    return step.alarm ? 1U : 0U;
+}
+
 size_t library_run(library_t* const           self,
                    const size_t               n,
                    const float* const         u,
@@ -42,10 +55,21 @@ size_t library_run(library_t* const           self,
                    const library_out_t* const out) {
     size_t alarms = 0U;
     for (size_t k = 0U; k < n; k++) {
-        const est_sample_t sample = { .u = u[k], .y = y[k], .valid = (valid == 0) || (valid[k] != 0U) };
-        const est_step_t   step   = est_step(&self->estimator, sample);
-        alarms += step.alarm ? 1U : 0U;
-        keep(self, k, &step, out);
+        alarms += enter(self, k, u[k], y[k], valid, out);
+    }
+    return alarms;
+}
+
+size_t library_run_codes(library_t* const           self,
+                         const size_t               n,
+                         const size_t               stride,
+                         const uint16_t* const      u,
+                         const uint16_t* const      y,
+                         const uint8_t* const       valid,
+                         const library_out_t* const out) {
+    size_t alarms = 0U;
+    for (size_t k = 0U; k < n; k++) {
+        alarms += enter(self, k, (float)u[k * stride], (float)y[k * stride], valid, out);
     }
     return alarms;
 }

@@ -41,6 +41,15 @@ bool library_start(library_t* self);
 size_t
 library_run(library_t* self, size_t n, const float* u, const float* y, const uint8_t* valid, const library_out_t* out);
 
+/// Enter codes as they lie in a table of all channels, `stride` codes from sample to sample; else as library_run().
+size_t library_run_codes(library_t*           self,
+                         size_t               n,
+                         size_t               stride,
+                         const uint16_t*      u,
+                         const uint16_t*      y,
+                         const uint8_t*       valid,
+                         const library_out_t* out);
+
 /// Number of parameters.
 uint8_t library_theta_count(const library_t* self);
 

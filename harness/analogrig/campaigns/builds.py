@@ -1,45 +1,41 @@
-"""Builds that play a campaign, identified by file contents, and the commands that played it.
+"""Builds that play a campaign, identified by file contents.
 
 The trials of one campaign all come from one build. A name does not identify a build: the firmware, library or analogrig
-behind it may differ on another machine, or when a campaign resumes. The commands stand in a file beside the results,
-which do not depend on it.
+behind it may differ on another machine, or when a campaign resumes.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import analogrig
 import analogrig_emulator
-from analogrig import config
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.library import LIBRARY
-from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.identity import Identity, version
+from analogrig.errors import ConfigurationError
+from analogrig.identity import version
 from analogrig.storage import replace_file
 
 DIGITS = 16
 """Hex digits of a SHA-256 that identify a build."""
-
-FORMAT, FORMAT_VERSION = "analogrig-campaign-identity", 1
-
-MOST_BYTES = 10_000_000
-"""Largest size of the file of commands."""
 
 _PACKAGES = tuple(Path(str(package.__file__)).parent for package in (analogrig_emulator, analogrig))
 
 
 @functools.cache
 def of_analogrig() -> str:
-    """Version of analogrig and, after a space, the hash of all files that decide what is played."""
-    sources = sorted(path for folder in _PACKAGES for kind in ("py", "so") for path in folder.rglob(f"*.{kind}"))
+    """Version of analogrig, the hash of all files that decide what is played, and that of its Python alone."""
+    return f"{version()} {_hash_of('py', 'so')} {_hash_of('py')}"
+
+
+def _hash_of(*kinds: str) -> str:
     whole = hashlib.sha256()
-    for path in sources:
+    for path in sorted(path for folder in _PACKAGES for kind in kinds for path in folder.rglob(f"*.{kind}")):
         whole.update(path.read_bytes())
-    return f"{version()} {whole.hexdigest()[:DIGITS]}"
+    return whole.hexdigest()[:DIGITS]
 
 
 def of_device(device: DeviceDescription) -> str:
@@ -56,15 +52,45 @@ def of_device(device: DeviceDescription) -> str:
 
 
 def check_analogrig(planned: str) -> None:
-    """Check that this analogrig has the version of the one that began the campaign.
+    """Check that this analogrig has the version and the Python of the one that began the campaign.
 
     The compilers may differ: the estimates are the same bits.
 
-    :raises ConfigurationError: it has another.
+    :raises ConfigurationError: it has others.
     """
-    begun_by = planned.partition(" ")[0]
+    begun_by, *_, sources = planned.split()
     if version() != begun_by:
         raise ConfigurationError(f"this worker has analogrig {version()}, the campaign was begun by {begun_by}")
+    here = of_analogrig().split()[-1]
+    if here != sources:
+        raise ConfigurationError(
+            f"this worker has analogrig {version()} with the sources {here}, the campaign was begun by {sources}:"
+            " install the same build"
+        )
+
+
+_supplied: dict[str, Path] = {}
+"""Files of devices that came with a campaign from another machine, by their hash."""
+
+
+def supply(files: Mapping[str, bytes], folder: Path) -> None:
+    """Keep files of devices in a folder of this worker; each is used only where its hash is the planned one."""
+    for digest, content in files.items():
+        if hashlib.sha256(content).hexdigest()[:DIGITS] == digest:
+            path = folder / f"analogrig-{digest}"
+            with replace_file(path) as file:
+                file.write(content)
+            path.chmod(0o700)
+            _supplied[digest] = path
+
+
+def supplied(device: DeviceDescription, planned: str) -> Path | None:
+    """File that came with the campaign for a device whose own file is absent here, or another."""
+    if device.program is None or planned not in _supplied:
+        return None
+    if device.program.is_file() and of_device(device) == planned:
+        return None
+    return _supplied[planned]
 
 
 def check_device(device: DeviceDescription, planned: str) -> None:
@@ -79,36 +105,3 @@ def check_device(device: DeviceDescription, planned: str) -> None:
         raise ConfigurationError(
             f"device {device.name}: {device.program} is another build than the one that the campaign was begun with"
         )
-
-
-def commands_of(out: Path) -> Path:
-    """Path of the file of the commands that have played the results ``out``."""
-    return out.with_name(f"{out.name}.identity")
-
-
-def load_commands(path: Path) -> tuple[Identity, ...]:
-    """Commands that have played, in order; none if there is no such file.
-
-    :raises RecordingError: it cannot be read, or is another file.
-    """
-    if not path.exists():
-        return ()
-    other = RecordingError(f"{path}: is no file of identities of a campaign: remove it")
-    try:
-        table = json.loads(config.read_bounded(path, MOST_BYTES))
-        is_ours = (table["format"], table["version"]) == (FORMAT, FORMAT_VERSION)
-        identities = tuple(config.build(Identity, each, str(path)) for each in table["played_by"])
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror or error}") from error
-    except (ConfigurationError, LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise other from error
-    if not is_ours:
-        raise other
-    return identities
-
-
-def save_commands(path: Path, played_by: tuple[Identity, ...]) -> None:
-    """:raises RecordingError: it cannot be written."""
-    table = {"format": FORMAT, "version": FORMAT_VERSION, "played_by": [each.as_table() for each in played_by]}
-    with replace_file(path) as file:
-        file.write(f"{json.dumps(table, indent=1)}\n".encode())

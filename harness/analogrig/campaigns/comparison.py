@@ -2,9 +2,12 @@
 
 The unit is the seed: with one seed both sides, and all cells of a campaign, saw the same noise and the same draws. Each
 quantity is reduced to one number a seed: its mean over all trials with that seed. Differences at common seeds are
-tested by a sign-flip permutation test, which is exact for any distribution. Sides without a common seed are tested by
+tested by a sign-flip permutation test, which is exact for any distribution. Beyond MOST_UNITS seeds, neighbours flip
+together: a subgroup of the sign flips, for which the test is exact as well. Sides without a common seed are tested by
 permuting the seeds between them. The p-values of all quantities are adjusted together (Holm 1979), so that the
 family-wise error rate is at most ``alpha``.
+
+Campaigns are read from their stores some seeds at a time, for all cells.
 """
 
 from __future__ import annotations
@@ -13,7 +16,6 @@ import dataclasses
 import itertools
 import json
 import math
-import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.campaigns.plan import Plan, list_differences
-from analogrig.campaigns.results import Results
-from analogrig.campaigns.rows import Row, changes, is_valid, row
+from analogrig.campaigns.rows import Row, is_valid, row
+from analogrig.campaigns.store import Store
+from analogrig.campaigns.trials import MISSED, Trials
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.judging.verdict import judge
 from analogrig.plant import PARAMETERS
@@ -41,10 +44,25 @@ RESAMPLES, _AT_ONCE = 99_999, 1_000
 PAIRED, UNPAIRED = "sign flips, paired by seed", "permutation of seeds"
 
 Word = Literal["worse", "better", "no difference shown"]
+NO_DIFFERENCE: Word = "no difference shown"
+
+MOST_UNITS = 1000
+"""Largest number of units whose signs are flipped; of more seeds, neighbours are one unit."""
+
+SEEDS_AT_ONCE = 100_000
+"""Largest number of trials of each side that are in memory at once, and of seeds of which differences are."""
 
 
 Observation = tuple[tuple[object, ...], Row]
 """Key of a trial, seed included, and its row."""
+
+
+@dataclass(frozen=True)
+class Values:
+    """Values of a quantity in n trials: the sum over each trial, and their number."""
+
+    sums: NDArray[np.float64]
+    counts: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -53,8 +71,8 @@ class Measure:
 
     name: str
     unit: str
-    of: Callable[[Row, Row | None], Sequence[float]]
-    """Values of a trial, limited to those that the other side's trial has too, if there is one."""
+    of: Callable[[Trials, Trials | None], Values]
+    """Values of trials, limited to those that the other side's trials have too, if there are any."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +93,7 @@ class Difference:
     @property
     def shown(self) -> bool:
         """True if the difference is statistically significant."""
-        return self.word != "no difference shown"
+        return self.word != NO_DIFFERENCE
 
 
 @dataclass(frozen=True)
@@ -107,39 +125,105 @@ class Comparison:
 
 def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0.01) -> Comparison:
     """Comparison of ``b`` with ``a``. The same two sides give the same result."""
-    if not 0.0 < alpha < 1.0:
-        raise ValueError(f"alpha must be between 0 and 1, not {alpha:g}")
     ours, theirs = _valid(a), _valid(b)
-    common = ours.keys() & theirs.keys()
-    found = [each for measure in MEASURES if (each := _difference(measure, ours, theirs)) is not None]
-    return Comparison(
-        differences=adjust_by_holm(found, alpha),
-        alpha=alpha,
-        trials=(len(ours), len(theirs)),
-        inconclusive=(len(a) - len(ours), len(b) - len(theirs)),
-        identical=(sum(ours[key]["theta"] == theirs[key]["theta"] for key in common), len(common)),
+    common = [key for key in ours if key in theirs]
+    if not common:
+        found = [each for measure in MEASURES if (each := _unpaired(measure, ours, theirs)) is not None]
+        return _comparison(found, alpha, (len(ours), len(theirs)), (len(a), len(b)), (0, 0))
+    common.sort(key=lambda key: int(ours[key]["seed"]))
+    seeds = np.array([ours[key]["seed"] for key in common], np.int64)
+    places = np.unique(seeds, return_inverse=True)[1]
+    pairing = Pairing(int(places[-1]) + 1)
+    pairing.add(places, *(Trials.of([side[key] for key in common]) for side in (ours, theirs)))
+    return _comparison(
+        pairing.differences(), alpha, (len(ours), len(theirs)), (len(a), len(b)), (pairing.identical, len(common))
     )
 
 
-def _latencies(trial: Row, other: Row | None) -> list[float]:
-    others = changes(trial if other is None else other)
-    both = [(mine.latency_n, his.latency_n) for mine, his in zip(changes(trial), others, strict=False)]
-    return [mine for mine, his in both if mine is not None and his is not None]
+def _comparison(
+    found: Sequence[Difference], alpha: float, valid: tuple[int, int], played: tuple[int, int], same: tuple[int, int]
+) -> Comparison:
+    if not 0.0 < alpha < 1.0:
+        raise ValueError(f"alpha must be between 0 and 1, not {alpha:g}")
+    return Comparison(
+        differences=adjust_by_holm(found, alpha),
+        alpha=alpha,
+        trials=valid,
+        inconclusive=(played[0] - valid[0], played[1] - valid[1]),
+        identical=same,
+    )
 
 
-def _missed(trial: Row, _: Row | None) -> list[float]:
-    return [float(change.missed) for change in changes(trial) if change.bound_n is not None]
+class Pairing:
+    """Differences of all measures by seed, gathered from trials that both sides played."""
+
+    def __init__(self, seeds: int) -> None:
+        """Start with no trials of so many seeds."""
+        self.identical = 0
+        """Number of trials with the same estimates on both sides."""
+        self._seeds, self._units = seeds, min(seeds, MOST_UNITS)
+        self._sums: NDArray[np.float64] = np.zeros((len(MEASURES), 3))
+        """By measure: sum over the seeds of A, of B, and number of seeds."""
+        self._moved: NDArray[np.float64] = np.zeros((len(MEASURES), self._units))
+        """(measures, units) sums of the differences of the seeds that flip together."""
+
+    def add(self, places: NDArray[np.int64], a: Trials, b: Trials) -> None:
+        """Add the valid trials of some seeds: all of each of these seeds, the same trials on both sides.
+
+        :param places: (n,) places of the trials' seeds among all, rising or not.
+        """
+        self.identical += int(np.count_nonzero(a.theta == b.theta))
+        first = int(places.min(initial=self._seeds))
+        at = places - first
+        unit = (first + np.arange(at.max(initial=-1) + 1)) * self._units // self._seeds
+        for i, measure in enumerate(MEASURES):
+            x, y = (_by_place(at, measure.of(mine, other)) for mine, other in ((a, b), (b, a)))
+            both = ~(np.isnan(x) | np.isnan(y))
+            self._sums[i] += x[both].sum(), y[both].sum(), np.count_nonzero(both)
+            self._moved[i] += np.bincount(unit[both], (y - x)[both], self._units)
+
+    def differences(self) -> list[Difference]:
+        """Differences of the measures of which both sides have values, not yet adjusted."""
+        out = []
+        for measure, (a, b, count), moved in zip(MEASURES, self._sums.tolist(), self._moved, strict=True):
+            if count:
+                means, p = (a / count, b / count), sign_flip_p(moved)
+                out.append(Difference(measure.name, measure.unit, *means, int(count), PAIRED, p, p, NO_DIFFERENCE))
+        return out
 
 
-def _false_alarms(trial: Row, _: Row | None) -> list[float]:
-    return [trial["false_alarms"] / trial["armed"]] if trial["armed"] else []
+def _by_place(places: NDArray[np.int64], values: Values) -> NDArray[np.float64]:
+    """Mean of the values at each place; NaN where there are none."""
+    sums, counts = (np.bincount(places, each) for each in (values.sums, values.counts))
+    return np.asarray(np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0))
 
 
-def _error(i: int) -> Callable[[Row, Row | None], list[float]]:
-    def errors(trial: Row, other: Row | None) -> list[float]:
-        if trial["errors"]:
-            return [abs(trial["errors"][i])]
-        return [LOST_ESTIMATE] if other is not None and other["errors"] else []
+def _latencies(trials: Trials, other: Trials | None) -> Values:
+    mine, others = trials.latency_n, (trials if other is None else other).latency_n
+    width = min(mine.shape[1], others.shape[1])
+    both = (mine[:, :width] >= 0) & (others[:, :width] >= 0)
+    return Values(np.where(both, mine[:, :width], 0).sum(axis=1, dtype=np.float64), both.sum(axis=1))
+
+
+def _missed(trials: Trials, _: Trials | None) -> Values:
+    visible = trials.bound_n >= 0
+    missed = visible & ((trials.change & MISSED) > 0)
+    return Values(missed.sum(axis=1, dtype=np.float64), visible.sum(axis=1))
+
+
+def _false_alarms(trials: Trials, _: Trials | None) -> Values:
+    armed = trials.armed > 0
+    rate = np.divide(trials.false_alarms, trials.armed, out=np.zeros(len(trials)), where=armed)
+    return Values(rate, armed.astype(np.int64))
+
+
+def _error(i: int) -> Callable[[Trials, Trials | None], Values]:
+    def errors(trials: Trials, other: Trials | None) -> Values:
+        error = np.abs(trials.error[:, i].astype(np.float64))
+        if other is not None:
+            error[np.isnan(error) & ~np.isnan(other.error[:, i])] = LOST_ESTIMATE
+        known = ~np.isnan(error)
+        return Values(np.where(known, error, 0.0), known.astype(np.int64))
 
     return errors
 
@@ -152,29 +236,19 @@ MEASURES = (
 )
 
 
-def _difference(measure: Measure, a: Mapping[Any, Row], b: Mapping[Any, Row]) -> Difference | None:
-    common = [key for key in a if key in b]
-    if common:
-        mine = _by_seed(measure, {key: a[key] for key in common}, b)
-        others = _by_seed(measure, {key: b[key] for key in common}, a)
-        seeds = [seed for seed in mine if seed in others]
-        x, y = (np.array([side[seed] for seed in seeds]) for side in (mine, others))
-        p, test = (sign_flip_p(y - x), PAIRED) if seeds else (1.0, PAIRED)
-    else:
-        x, y = (np.array(list(_by_seed(measure, side, {}).values())) for side in (a, b))
-        p, test = (permutation_p(x, y), UNPAIRED) if len(x) and len(y) else (1.0, UNPAIRED)
+def _unpaired(measure: Measure, a: Mapping[Any, Row], b: Mapping[Any, Row]) -> Difference | None:
+    sides = []
+    for rows in (a.values(), b.values()):
+        seeds = np.array([each["seed"] for each in rows], np.int64)
+        means = _by_place(np.unique(seeds, return_inverse=True)[1], measure.of(Trials.of(list(rows)), None))
+        sides.append(means[~np.isnan(means)])
+    x, y = sides
     if not (len(x) and len(y)):
         return None
+    p = permutation_p(x, y)
     return Difference(
-        measure.name, measure.unit, float(x.mean()), float(y.mean()), len(x), test, p, p, "no difference shown"
+        measure.name, measure.unit, float(x.mean()), float(y.mean()), len(x), UNPAIRED, p, p, NO_DIFFERENCE
     )
-
-
-def _by_seed(measure: Measure, side: Mapping[Any, Row], other: Mapping[Any, Row]) -> dict[int, float]:
-    values: dict[int, list[float]] = {}
-    for key, trial in side.items():
-        values.setdefault(trial["seed"], []).extend(measure.of(trial, other.get(key)))
-    return {seed: statistics.fmean(each) for seed, each in sorted(values.items()) if each}
 
 
 def sign_flip_p(differences: NDArray[np.float64]) -> float:
@@ -186,7 +260,14 @@ def sign_flip_p(differences: NDArray[np.float64]) -> float:
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=len(moved))))
         return float(np.mean(_are_as_extreme(signs @ moved, moved.sum())))
     rng = np.random.default_rng(0)
-    return _resampled_p(moved.sum(), lambda k: (2.0 * rng.integers(0, 2, (k, len(moved))) - 1.0) @ moved)
+    row_bytes = -(-len(moved) // 8)
+
+    def draw(k: int) -> NDArray[np.float64]:
+        signs = np.frombuffer(rng.bytes(k * row_bytes), np.uint8).reshape(k, row_bytes)
+        are_kept = np.unpackbits(signs, axis=1, count=len(moved)).astype(np.float64)
+        return np.asarray(2.0 * (are_kept @ moved) - moved.sum())
+
+    return _resampled_p(moved.sum(), draw)
 
 
 def permutation_p(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
@@ -220,56 +301,123 @@ def adjust_by_holm(found: Sequence[Difference], alpha: float) -> tuple[Differenc
 
 def _word(difference: Difference, p: float, alpha: float) -> Word:
     if p > alpha:
-        return "no difference shown"
+        return NO_DIFFERENCE
     return "worse" if difference.b > difference.a else "better"
 
 
 @dataclass(frozen=True)
-class Side:
-    """One side of a comparison."""
+class Recorded:
+    """Side of recordings."""
 
     trials: tuple[Observation, ...]
     """Trials, valid or not."""
-    plan: Plan | None = None
-    """Plan of the campaign; None: the trials come from recordings."""
 
 
-def load(path: Path) -> Side:
-    """Trials of a results file, of a recording, or of all recordings below a folder.
+@dataclass(frozen=True)
+class Campaign:
+    """Side of a campaign, whose trials stay in their file."""
 
-    :raises RecordingError: it cannot be read, or there is nothing valid in it.
+    path: Path
+    plan: Plan
+
+
+def load(path: Path) -> Recorded | Campaign:
+    """Side of a campaign, of a recording, or of all recordings below a folder.
+
+    :raises RecordingError: it cannot be read, or is no campaign that has ended, or has no valid recording.
     :raises ConfigurationError: two recordings are of one play; names them.
     """
     if path.is_dir() or path.suffix == ".npz":
-        side = Side(_load_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path]))
-    else:
-        results = Results.load(path)
-        cells = zip(results.plan.cells(), results.rows, strict=True)
-        rows = ((cell, each) for cell, its_rows in cells for each in its_rows)
-        side = Side(
-            tuple(((cell.rig, cell.device, *cell.values.items(), each["seed"]), each) for cell, each in rows),
-            results.plan,
-        )
-    if not _valid(side.trials):
-        raise RecordingError(f"{path}: holds no valid trial")
-    return side
+        side = Recorded(_load_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path]))
+        if not _valid(side.trials):
+            raise RecordingError(f"{path}: holds no valid trial")
+        return side
+    with Store.read(path) as store:
+        if not store.is_ended:
+            raise RecordingError(f"{path}: a campaign that has not ended: the command that began it goes on")
+        return Campaign(path, store.plan())
 
 
-def match(a: Side, b: Side) -> tuple[Sequence[Observation], Sequence[Observation]]:
-    """Trials of both sides that played the same; the devices may differ.
+def compare_sides(a: Recorded | Campaign, b: Recorded | Campaign, alpha: float = 0.01) -> Comparison:
+    """Comparison of the trials that both sides played; the devices may differ.
 
     :raises ConfigurationError: they are of different campaigns, or played nothing in common; names what differs.
+    :raises RecordingError: a campaign's file is damaged, or holds no valid trial.
     """
-    if a.plan is not None and b.plan is not None:
-        _check_same("A and B are different campaigns", _decisive_settings(a.plan), _decisive_settings(b.plan))
-        return a.trials, _in_order(b, _names(a.plan), _names(b.plan))
-    if a.plan is not None or b.plan is not None:
-        raise ConfigurationError("A and B cannot be compared: one is a campaign, the other are recordings")
+    match a, b:
+        case Recorded(), Recorded():
+            return compare(*common_plays(a, b), alpha)
+        case Campaign(), Campaign():
+            _check_same("A and B are different campaigns", _decisive_settings(a.plan), _decisive_settings(b.plan))
+            return _compare_campaigns(a, b, alpha)
+    raise ConfigurationError("A and B cannot be compared: one is a campaign, the other are recordings")
+
+
+def common_plays(a: Recorded, b: Recorded) -> tuple[Sequence[Observation], Sequence[Observation]]:
+    """Recordings of both sides that played the same.
+
+    :raises ConfigurationError: they played nothing in common; names what differs.
+    """
     common = {key[:-1] for key, _ in a.trials} & {key[:-1] for key, _ in b.trials}
     if not common:
         _check_same("A and B played nothing in common", *(_recorded_tables(side.trials[0]) for side in (a, b)))
     ours, theirs = ([each for each in side.trials if each[0][:-1] in common] for side in (a, b))
     return ours, theirs
+
+
+def _compare_campaigns(a: Campaign, b: Campaign, alpha: float) -> Comparison:
+    valid, played, common = np.zeros(2, np.int64), np.zeros(2, np.int64), 0
+    pairing, cells = Pairing(a.plan.spec.trials), _matched_cells(a.plan, b.plan)
+    with Store.read(a.path) as ours, Store.read(b.path) as theirs:
+        step = max(1, SEEDS_AT_ONCE // a.plan.size)
+        for first in range(0, a.plan.spec.trials, step):
+            window = range(first, min(first + step, a.plan.spec.trials))
+            pairs: list[tuple[NDArray[np.int64], Trials, Trials]] = []
+            for mine, other in enumerate(cells):
+                x, y = _read(ours, a.plan, mine, window), _read(theirs, b.plan, other, window)
+                valid += np.count_nonzero(x.is_valid), np.count_nonzero(y.is_valid)
+                played += len(x), len(y)
+                both = np.flatnonzero(x.is_valid[: len(y)] & y.is_valid[: len(x)])
+                if len(both):
+                    pairs.append((window.start + both, x.at(both), y.at(both)))
+            if pairs:
+                places, xs, ys = zip(*pairs, strict=True)
+                pairing.add(np.concatenate(places), Trials.joined(xs), Trials.joined(ys))
+                common += sum(map(len, places))
+    for side, count in zip((a, b), valid.tolist(), strict=True):
+        if not count:
+            raise RecordingError(f"{side.path}: holds no valid trial")
+    counts = (valid.tolist(), played.tolist())
+    return _comparison(
+        pairing.differences(),
+        alpha,
+        (counts[0][0], counts[0][1]),
+        (counts[1][0], counts[1][1]),
+        (pairing.identical, common),
+    )
+
+
+_COMPARED = ("outcome", "armed", "false_alarms", "change", "latency_n", "bound_n", "error", "theta")
+
+
+def _read(store: Store, plan: Plan, cell: int, window: range) -> Trials:
+    """Trials of a cell whose places are in ``window``: those from its start on, up to the end of the cell."""
+    begin = cell * plan.spec.trials
+    found = []
+    for part, trials in store.parts(plan, range(begin + window.start, begin + window.stop), _COMPARED):
+        if part.cell == cell:
+            found.append(trials[max(0, window.start - part.first) : max(0, window.stop - part.first)])
+    return Trials.joined(found)
+
+
+def _matched_cells(a: Plan, b: Plan) -> list[int]:
+    """Cells of b in the order of those of a: devices are matched by name, or by place if their names differ."""
+    wanted, names = _names(a), _names(b)
+    cells = b.cells()
+    if set(wanted) != set(names):
+        return list(range(len(cells)))
+    places = {(cell.rig, names[cell.device], *cell.values.items()): i for i, cell in enumerate(cells)}
+    return [places[cell.rig, wanted[cell.device], *cell.values.items()] for cell in a.cells()]
 
 
 def _check_same(otherwise: str, ours: Any, theirs: Any) -> None:
@@ -280,13 +428,6 @@ def _check_same(otherwise: str, ours: Any, theirs: Any) -> None:
 def _names(plan: Plan) -> list[str]:
     """Names of the devices."""
     return [str(device["name"]) for device in plan.devices]
-
-
-def _in_order(side: Side, wanted: Sequence[str], names: Sequence[str]) -> Sequence[Observation]:
-    """Trials with the devices numbered as on the other side, if their names match; else numbered by position."""
-    if set(wanted) != set(names):
-        return side.trials
-    return [((key[0], wanted.index(names[int(str(key[1]))]), *key[2:]), each) for key, each in side.trials]
 
 
 def _recorded_tables(trial: Observation) -> dict[str, Any]:

@@ -1,95 +1,95 @@
-"""Campaign execution: many trials, played by the available workers, to one results file.
+"""Campaign execution: many trials, played by the available workers, to one store.
 
-The results are a function of the plan alone. The number of workers, the order of their work, and interruptions do not
-change a byte.
+The aggregated results are a function of the plan alone. The number of workers, the order of their work, the division
+into tasks, and interruptions do not change a byte of them.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from analogrig.campaigns.journal import Journal
-from analogrig.campaigns.plan import Chunk, Plan, device_of
-from analogrig.campaigns.plays import close_devices, play_chunk
-from analogrig.campaigns.results import Results
-from analogrig.campaigns.rows import RATES, Row, counts
-from analogrig.campaigns.workers import Workers
-from analogrig.errors import DeviceError, LinkError
-from analogrig.judging.statistics import Decision
+from analogrig.campaigns.plan import Plan, device_files, device_of
+from analogrig.campaigns.plays import PlayedTask, close_devices, play_task
+from analogrig.campaigns.results import Results, load_ended, tally_of
+from analogrig.campaigns.store import NotAStoreError, Store
+from analogrig.campaigns.tally import Tally, Task, Tasks
+from analogrig.campaigns.trials import COLUMNS, Trials
+from analogrig.campaigns.workers import CampaignWorkers
+from analogrig.errors import ConfigurationError, DeviceError, LinkError
+from analogrig.identity import Identity
 
 
-class Tally:
-    """Chunks received so far, in any order, and the rows that count.
+def conduct(
+    plan: Plan,
+    workers: CampaignWorkers,
+    out: Path,
+    progress: Callable[[Tally], None] | None = None,
+    command: Identity | None = None,
+) -> Results:
+    """Play the plan to the store ``out``. After any interruption, another call resumes it.
 
-    In each cell, consecutive rounds without a gap count, up to the cell's end.
-    """
-
-    def __init__(self, plan: Plan) -> None:
-        self.came: dict[Chunk, list[Row]] = {}
-        self.counted: list[list[Row]] = [[] for _ in range(plan.size)]
-        self.ended = [False] * plan.size
-        self.trials = 0
-        self._stop = plan.spec.stop
-        self._rounds = [0] * plan.size
-        self._counts = [counts([]) for _ in range(plan.size)]
-
-    def add(self, chunk: Chunk, rows: list[Row]) -> None:
-        """Add the rows of a chunk, and count every round that is now without a gap."""
-        self.came[chunk] = rows
-        cell = chunk.cell
-        while not self.ended[cell]:
-            following = self.came.get(Chunk(self._rounds[cell], cell))
-            if following is None:
-                return
-            self._count(cell, following)
-
-    def _count(self, cell: int, rows: list[Row]) -> None:
-        self.counted[cell] += rows
-        self._rounds[cell] += 1
-        self.trials += len(rows)
-        for name, count in counts(rows).items():
-            self._counts[cell][name] += count
-        if (stop := self._stop) is not None:
-            known = RATES[stop.quantity].sequence(self._counts[cell], stop.confidence)
-            self.ended[cell] = known.decision(stop.rate) is not Decision.OPEN
-
-    def total(self) -> dict[str, int]:
-        """Total counts over all cells."""
-        return {name: sum(each[name] for each in self._counts) for name in counts([])}
-
-
-def conduct(plan: Plan, workers: Workers, out: Path, progress: Callable[[Tally], None] | None = None) -> Results:
-    """Play the plan to ``out``. After any interruption, another call resumes it.
-
-    :raises ConfigurationError: ``out`` or its journal hold something else, or a device refuses its configuration.
+    :param command: identity of this command, which is kept in the store if anything is left to play.
+    :raises ConfigurationError: ``out`` holds something else, or a device refuses its configuration.
     :raises RecordingError: ``out`` cannot be written.
-    :raises WorkerError: the workers cannot be reached, or keep dying over a chunk.
+    :raises WorkerError: the workers cannot be reached, or keep dying over a task.
     """
-    if out.exists():
-        return Results.load(out).of_plan(plan, out)
-    tally = Tally(plan)
-    with Journal(journal_of(out), plan) as journal:
-        if out.exists():  # another one has ended meanwhile
-            journal.remove()
-            return Results.load(out).of_plan(plan, out)
-        for chunk, rows in journal.rows.items():
-            tally.add(chunk, rows)
-        work: Any = functools.partial(play_chunk, plan.as_json())
+    if (ended := ended_results(plan, out)) is not None:
+        return ended
+    with Store.write(out, plan) as store:
+        if store.is_ended:  # by another process meanwhile
+            return load_ended(store)
+        if command is not None:
+            store.add_command(command)
+        tally = tally_of(store, plan)
         try:
-            for chunk, rows in workers.play(work, _open_chunks(plan, tally)):
-                journal.add(chunk, rows)
-                tally.add(chunk, rows)
-                if progress is not None:
+            for trials in _play(plan, workers, store, tally):
+                if progress is not None and trials:
                     progress(tally)
         finally:
             close_devices()
-        results = Results(plan, tuple(tuple(rows) for rows in tally.counted))
-        results.save(out)
-        journal.remove()
+        results = Results.of(plan, tally, store.commands())
+        counted = [each.trials for each in tally.cells]
+        store.finish(plan, counted, [{**cell.values, **asdict(summary)} for cell, summary in results.cells])
     return results
+
+
+def ended_results(plan: Plan, out: Path) -> Results | None:
+    """Results of the plan if its campaign has ended; None if there is something left to play.
+
+    :raises ConfigurationError: ``out`` holds something else.
+    :raises RecordingError: it cannot be read, or is damaged.
+    """
+    if not out.exists():
+        return None
+    try:
+        with Store.read(out) as store:
+            if not store.is_ended:
+                return None
+            results = load_ended(store)
+    except NotAStoreError as error:
+        raise ConfigurationError(f"{error}: choose another --out, or remove it") from error
+    plan.check_same(results.plan.as_plain(), f"{out}: holds another campaign")
+    return results
+
+
+def _play(plan: Plan, workers: CampaignWorkers, store: Store, tally: Tally) -> Iterator[int]:
+    """Play what is left; yield the number of trials of each task that has been stored and counted."""
+    workers.supply(device_files(plan.devices))
+    tasks, axes = Tasks(plan, tally, workers.slots), len(plan.spec.draw.axes())
+    work: Callable[[Task], PlayedTask] = functools.partial(play_task, plan.as_json())
+    for _, played in workers.play(work, iter(tasks)):
+        store.add(plan, played.parts)
+        count = 0
+        for part, columns in played.parts:
+            named: Any = dict(zip(COLUMNS, columns, strict=True))
+            tally.add(part, Trials.decode(part.trials, named, axes))
+            count += part.trials
+        tasks.note(count, played.seconds)
+        yield count
 
 
 def unreachable(plan: Plan) -> dict[str, str]:
@@ -107,15 +107,3 @@ def unreachable(plan: Plan) -> dict[str, str]:
         except (LinkError, DeviceError) as error:
             found[device.name] = str(error)
     return found
-
-
-def journal_of(out: Path) -> Path:
-    """Path of the journal in which an unfinished campaign keeps its rows."""
-    return out.with_name(f"{out.name}.journal")
-
-
-def _open_chunks(plan: Plan, tally: Tally) -> Iterator[Chunk]:
-    """Yield the chunks still to be played; evaluated at each step."""
-    for chunk in plan.chunks():
-        if chunk not in tally.came and not tally.ended[chunk.cell]:
-            yield chunk

@@ -1,17 +1,19 @@
 """Plan of a campaign: its file, with all the files that it names read in.
 
 A *cell* is one combination of rig, device and values of the grid. Each cell has the same number of trials, with the
-same seeds, so that cells and campaigns can be compared seed by seed. A *chunk* is some consecutive trials of one cell.
+same seeds, so that cells and campaigns can be compared seed by seed. A *part* is some consecutive trials of one cell.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +22,7 @@ from analogrig import config
 from analogrig.campaigns import builds
 from analogrig.campaigns.spec import MAX_CELLS, MAX_TRIALS, CampaignSpec
 from analogrig.devices.description import DeviceDescription
+from analogrig.devices.library import LIBRARY
 from analogrig.devices.registry import from_table, trusted
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import from_table as rig_of
@@ -66,14 +69,17 @@ class Case:
     seed: int
 
 
-class Chunk(NamedTuple):
-    """The trials of one cell that a worker receives at a time."""
+class Part(NamedTuple):
+    """Consecutive trials of one cell."""
 
-    round: int
     cell: int
+    first: int
+    """Place of the first one in the cell, from 0 on."""
+    trials: int
+    """Number of trials."""
 
     def __str__(self) -> str:
-        return f"cell {self.cell}, round {self.round}"
+        return f"cell {self.cell}, trials {self.first} to {self.first + self.trials - 1}"
 
 
 @dataclass(frozen=True)
@@ -122,6 +128,7 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> Plan:
+        """:raises ConfigurationError, ValueError: it is none."""
         return config.build(cls, json.loads(text), "the plan of the campaign")
 
     def as_table(self) -> dict[str, Any]:
@@ -134,9 +141,13 @@ class Plan:
         """Plan as JSON text; equal plans give equal text."""
         return json.dumps(self.as_table(), sort_keys=True, separators=(",", ":"))
 
+    def as_plain(self) -> Any:
+        """Plan as JSON has it, with lists for tuples."""
+        return json.loads(self.as_json())
+
     def check_same(self, table: Any, where: str) -> None:
         """:raises ConfigurationError: the plan of that table, as JSON has it, is another; names what differs."""
-        if differences := list_differences(table, json.loads(self.as_json()), ("there", "here")):
+        if differences := list_differences(table, self.as_plain(), ("there", "here")):
             raise ConfigurationError(f"{where} ({differences}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
@@ -148,16 +159,9 @@ class Plan:
             for rig, device, values in itertools.product(range(len(self.rigs)), range(len(self.devices)), combinations)
         ]
 
-    def chunks(self) -> Iterator[Chunk]:
-        """Yield the chunks round by round, so that all cells progress together."""
-        rounds, cells = -(-self.spec.trials // self.spec.chunk), len(self.cells())
-        return (Chunk(number, cell) for number in range(rounds) for cell in range(cells))
-
-    def seeds(self, chunk: Chunk) -> range:
-        first = chunk.round * self.spec.chunk
-        return range(
-            self.spec.first_seed + first, self.spec.first_seed + min(first + self.spec.chunk, self.spec.trials)
-        )
+    def seeds(self, part: Part) -> range:
+        first = self.spec.first_seed + part.first
+        return range(first, first + part.trials)
 
     def draw(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""
@@ -168,13 +172,18 @@ class Plan:
         """:raises ConfigurationError: the values make no scenario."""
         values = {**cell.values, **(self.draw(seed) if drawn is None else drawn)}
         try:
-            scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
+            scenario = _scenario(self._base, values, self.spec)
         except ValueError as error:
             raise ConfigurationError(f"{_text(values)}: {error}" if values else str(error)) from error
         rig = dict(self.rigs[cell.rig])
         if "noise_lsb" in values:
             rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
         return Case(rig, self.devices[cell.device], scenario, seed)
+
+    @functools.cached_property
+    def _base(self) -> Scenario:
+        """Scenario before the values of a cell are set."""
+        return Scenario.from_table(self.scenario, "the campaign's scenario")
 
     def _check(self) -> None:
         spec = self.spec
@@ -247,8 +256,25 @@ def device_of(table: Mapping[str, Any]) -> DeviceDescription:
     described = {key: value for key, value in table.items() if key != "build"}
     device = from_table(described, f"device {table['name']}")
     if "build" in table:
+        if (file := builds.supplied(device, table["build"])) is not None:
+            placed = {key: str(file) if _is_path(value, device.program) else value for key, value in described.items()}
+            device = from_table(placed, f"device {table['name']}")
         builds.check_device(device, table["build"])
     return device
+
+
+def _is_path(value: Any, path: Path | None) -> bool:
+    return isinstance(value, str) and path is not None and bool(value) and Path(value).absolute() == path
+
+
+def device_files(devices: Iterable[Mapping[str, Any]]) -> dict[str, bytes]:
+    """Contents of the files that devices run, by their hash, without those that analogrig brings."""
+    found = {}
+    for table in devices:
+        program = device_of(table).program
+        if program is not None and not program.is_relative_to(LIBRARY.parent):
+            found[str(table["build"])] = program.read_bytes()
+    return found
 
 
 def one_worker_only(rigs: Iterable[Mapping[str, Any]], devices: Iterable[Mapping[str, Any]]) -> str:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import json
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
 from analogrig.campaigns import builds
-from analogrig.campaigns.plan import Case, Cell, Chunk, Plan, device_of, open_table
+from analogrig.campaigns.plan import Case, Cell, Part, Plan, device_of, open_table
 from analogrig.campaigns.rows import Row, row, row_of_none
+from analogrig.campaigns.trials import Trials
 from analogrig.devices.device import Device
 from analogrig.errors import AnalogrigError, ConfigurationError, DeviceError, LinkError, RigError
 from analogrig.judging.exposure import exposure
@@ -108,21 +111,36 @@ class _Benches(threading.local):
 _benches = _Benches()
 
 
-def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
-    """Rows of a chunk of the plan (``Plan.as_json``): the same in every process on every machine.
+class PlayedTask(NamedTuple):
+    """What a worker returns of a task."""
+
+    parts: list[tuple[Part, tuple[bytes, ...]]]
+    """Parts, each with the columns of its trials (``Trials.encode``)."""
+    seconds: float
+    """Time that they took."""
+
+
+def play_task(plan: str, task: Sequence[Part]) -> PlayedTask:
+    """Play the parts of a task of the plan (``Plan.as_json``): the same trials in every process on every machine.
 
     :raises ConfigurationError: the build here is another, or a device refuses its configuration; names cell and seed.
     """
+    start_s = time.monotonic()
+    planned, _ = _plan(plan)
+    axes = list(planned.spec.draw.axes())
+    parts = [(part, Trials.of(play_part(plan, part), axes).encode()) for part in task]
+    return PlayedTask(parts, time.monotonic() - start_s)
+
+
+def play_part(plan: str, part: Part) -> list[Row]:
+    """Rows of a part; errors as ``play_task``."""
     planned, cells = _plan(plan)
-    numbered = Chunk(*chunk)
     rows = []
-    for seed in planned.seeds(numbered):
+    for seed in planned.seeds(part):
         try:
-            rows.append(_play_trial(planned, cells[numbered.cell], seed))
+            rows.append(_play_trial(planned, cells[part.cell], seed))
         except ConfigurationError as error:
-            raise ConfigurationError(
-                f"campaign {planned.spec.name}, cell {numbered.cell}, seed {seed}: {error}"
-            ) from error
+            raise ConfigurationError(f"campaign {planned.spec.name}, cell {part.cell}, seed {seed}: {error}") from error
     return rows
 
 
@@ -130,10 +148,22 @@ def _play_trial(plan: Plan, cell: Cell, seed: int) -> Row:
     """Row of a trial. One that cannot be played is inconclusive: the next one may succeed."""
     drawn = plan.draw(seed)
     try:
-        run = _benches.play(plan.case(cell, seed))
+        run = _benches.play(_fixed_case(plan, cell, seed) if not drawn else plan.case(cell, seed, drawn))
     except (DeviceError, LinkError, RigError) as error:
         return row_of_none(seed, drawn, " ".join(str(error).split()))
     return row(run, judge(run), drawn)
+
+
+_cases: dict[int, tuple[Cell, Case]] = {}
+"""Case of the cell that is being played, by thread: its trials differ in the seed alone."""
+
+
+def _fixed_case(plan: Plan, cell: Cell, seed: int) -> Case:
+    """Case of a cell without drawn values."""
+    thread = threading.get_ident()
+    if thread not in _cases or _cases[thread][0] is not cell:
+        _cases[thread] = cell, plan.case(cell, seed, {})
+    return dataclasses.replace(_cases[thread][1], seed=seed)
 
 
 @dataclass(frozen=True)

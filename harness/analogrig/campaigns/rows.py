@@ -1,17 +1,13 @@
-"""Rows: the record of each trial in plain values, and counts over many of them."""
+"""Rows: the record of each trial in plain values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from analogrig.config import MOST_NUMBER
-from analogrig.judging.bursts import BURST, ConfidenceSequence
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import ChangeVerdict, Verdict
-from analogrig.plant import MAX_SAMPLES, PARAMETERS
 from analogrig.run import Run
 
 Row = dict[str, Any]
@@ -78,89 +74,6 @@ def _errors(verdict: Verdict) -> list[float]:
     """Relative errors of the last estimate; empty if there is none or one is non-finite."""
     found = list(verdict.estimates[-1].error.values()) if verdict.estimates else []
     return found if all(map(math.isfinite, found)) else []
-
-
-def check_rows(rows: Sequence[Any], seeds: range) -> None:
-    """Check rows from a file.
-
-    :raises ValueError, TypeError, LookupError, AttributeError, OverflowError: one is not of ``row``, or they are of
-        other seeds.
-    """
-    for each in rows:
-        _check_row(each)
-    if [each["seed"] for each in rows] != list(seeds):
-        raise ValueError("rows of other seeds than the plan has")
-
-
-def _check_row(row: Any) -> None:
-    if row["outcome"] not in ("passed", "failed", "inconclusive"):
-        raise ValueError("a row without an outcome")
-    rising = [row[name] for name in ("false_alarms", "armed", "samples")]
-    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in rising) or rising != sorted(rising):
-        raise ValueError("a row whose counts cannot be")
-    if not all(map(_is_change, changes(row))):
-        raise ValueError("a change with values of the wrong types")
-    if (
-        not isinstance(row["errors"], list)
-        or len(row["errors"]) not in (0, len(PARAMETERS))
-        or not all(map(_is_number, row["errors"]))
-    ):
-        raise ValueError(f"errors that are not {len(PARAMETERS)} finite numbers")
-    if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
-        raise ValueError("a text that is not a string")
-    if not all(map(_is_number, row.get("drawn", {}).values())):
-        raise ValueError("a drawn value that is not a finite number")
-
-
-def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and abs(value) <= MOST_NUMBER  # type: ignore[arg-type]
-
-
-def _is_change(change: Change) -> bool:
-    latency_n, bound_n, *flags = change
-    times = all(value is None or type(value) is int for value in (latency_n, bound_n))
-    return times and all(type(flag) is bool for flag in flags)
-
-
-# ------------------------------------------------------------------------------------------------------------- of many
-
-
-@dataclass(frozen=True)
-class Rate:
-    """Rate of events per exposure; both are keys of ``counts``."""
-
-    events: str
-    exposure: str
-    unit: str
-    """Unit of the exposure, in words."""
-    burst: float
-    """Mean number of events of a burst that the bounds cover."""
-
-    def sequence(self, counted: Mapping[str, int], confidence: float, burst: float = 1.0) -> ConfidenceSequence:
-        """Confidence sequence for the rate; ``burst``: mean number of events of a burst, where more were observed."""
-        burst = max(burst, self.burst)
-        return ConfidenceSequence(confidence, burst, trials=counted[self.exposure], events=counted[self.events])
-
-
-RATES = {
-    rate.events: rate
-    for rate in (Rate("missed", "visible", "changes", 1.0), Rate("false_alarms", "armed", "samples", BURST))
-}
-
-
-def counts(rows: Sequence[Row]) -> dict[str, int]:
-    """Counts over the valid trials.
-
-    ``samples``, ``armed`` (samples in which the trigger was armed), ``false_alarms``, ``visible`` (detectable changes)
-    and ``missed`` (of those).
-    """
-    sound = list(filter(is_valid, rows))
-    visible = [change for each in sound for change in changes(each) if change.bound_n is not None]
-    return {
-        **{name: sum(each[name] for each in sound) for name in ("samples", "armed", "false_alarms")},
-        "visible": len(visible),
-        "missed": sum(change.missed for change in visible),
-    }
 
 
 def is_valid(row: Row) -> bool:

@@ -89,7 +89,7 @@ class CampaignSpec:
     """Number of trials of each cell, with consecutive seeds from ``first_seed`` on."""
     first_seed: int = 0
     chunk: int = 10
-    """Number of trials that a worker receives at a time."""
+    """Number of trials of a cell between two looks of ``[stop]``."""
     samples: int | None = None
     """Number of samples of each trial; overrides the scenario's."""
     change_at: int = 1000

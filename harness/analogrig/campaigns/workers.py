@@ -1,4 +1,4 @@
-"""Workers that play the chunks of a campaign: this process, processes of this machine, or a cluster of Dask.
+"""Workers that play the tasks of a campaign: this process, processes of this machine, or a cluster of Dask.
 
 Each takes tasks when it has capacity, and yields results in any order. Processes and cluster are executors of
 concurrent.futures. Only the tasks in flight on a killed worker are given to another. A task that has killed
@@ -16,10 +16,11 @@ import resource
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, forkserver, resource_tracker
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from analogrig.errors import ConfigurationError, WorkerError
@@ -90,8 +91,24 @@ class Workers(Protocol):
         """
 
 
+class CampaignWorkers(Workers, Protocol):
+    """Workers that a campaign can use."""
+
+    @property
+    def slots(self) -> int:
+        """Number of tasks that can be in flight."""
+
+    def supply(self, files: Mapping[str, bytes]) -> None:
+        """Bring the files that devices run to workers on other machines; ``files``: contents by hash."""
+
+
 class ThisProcess:
     """Worker that plays the tasks one after the other in this process."""
+
+    slots = 1
+
+    def supply(self, files: Mapping[str, bytes]) -> None:
+        """Files are where they are."""
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         for task in tasks:
@@ -106,10 +123,14 @@ class _Executors(ABC):
     _most_deaths = MOST_DEATHS
     _complaint = f"{number_of(MOST_DEATHS, 'worker')} died over it, one after the other"
 
+    def supply(self, files: Mapping[str, bytes]) -> None:  # noqa: B027 - workers of this machine need nothing
+        """Bring the files that devices run to workers on other machines."""
+
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         busy: dict[Future[Result], tuple[int, Task, int]] = {}
         try:
-            free = list(range(self._start()))
+            self._start()
+            free = list(range(self.slots))
             while True:
                 while free and (task := next(tasks, None)) is not None:
                     slot = free.pop()
@@ -130,9 +151,14 @@ class _Executors(ABC):
         finally:
             self._end()
 
+    @property
     @abstractmethod
-    def _start(self) -> int:
-        """Prepare for the first task; return the number of slots, which are the tasks in flight."""
+    def slots(self) -> int:
+        """Number of tasks that can be in flight."""
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Prepare for the first task."""
 
     @abstractmethod
     def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:
@@ -154,10 +180,13 @@ class Processes(_Executors):
         self._count = count
         self._pools: list[ProcessPoolExecutor] = []
 
-    def _start(self) -> int:
+    @property
+    def slots(self) -> int:
+        return self._count
+
+    def _start(self) -> None:
         prepare()
         self._pools = [_pool() for _ in range(self._count)]
-        return self._count
 
     def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:
         try:
@@ -173,6 +202,18 @@ class Processes(_Executors):
                 with contextlib.suppress(OSError, ValueError):
                     process.kill()
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _FileSupply:
+    """Start of a worker of a cluster, also of one that joins later: it keeps the files of the campaign's devices."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = dict(files)
+
+    def __call__(self, worker: Any) -> None:
+        from analogrig.campaigns.builds import supply
+
+        supply(self._files, Path(worker.local_directory))
 
 
 class Dask(_Executors):
@@ -197,18 +238,31 @@ class Dask(_Executors):
         except (OSError, ValueError) as error:
             raise WorkerError(f"--cluster {address}: no scheduler answers ({error})") from error
 
+    def supply(self, files: Mapping[str, bytes]) -> None:
+        if files:
+            plugin: Any = type(
+                "Files", (importlib.import_module("distributed").WorkerPlugin,), {"setup": _FileSupply(files)}
+            )
+            try:
+                self._client.register_plugin(plugin(), name="analogrig-files")
+            except (OSError, CancelledError) as error:
+                raise WorkerError(f"--cluster {self._address}: the connection to the scheduler is lost") from error
+
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         try:
             yield from super().play(work, tasks)
         except (OSError, CancelledError) as error:  # Dask cancels the futures of a client that has lost its scheduler
             raise WorkerError(f"--cluster {self._address}: the connection to the scheduler is lost") from error
 
-    def _start(self) -> int:
-        slots: int = sum(self._client.nthreads().values()) * _IN_HAND
-        if not slots:
+    @property
+    def slots(self) -> int:
+        threads: int = sum(self._client.nthreads().values())
+        return threads * _IN_HAND
+
+    def _start(self) -> None:
+        if not self.slots:
             raise WorkerError(f"--cluster {self._address}: the scheduler has no workers")
         self._executor = self._client.get_executor(pure=False)
-        return slots
 
     def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:  # noqa: ARG002
         future: Future[Result] = self._executor.submit(work, task)

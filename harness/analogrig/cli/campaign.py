@@ -13,9 +13,9 @@ from analogrig.cli.options import CAMPAIGN, FILE, add_allow, add_command, add_js
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, open_progress_line, show, show_result
 
 if TYPE_CHECKING:
-    from analogrig.campaigns.conduct import Tally
     from analogrig.campaigns.plan import Plan
-    from analogrig.campaigns.workers import Workers
+    from analogrig.campaigns.tally import Tally
+    from analogrig.campaigns.workers import CampaignWorkers
 
 
 MOST_WORKERS = 16
@@ -28,7 +28,7 @@ def add(commands: Any) -> None:
         "campaign",
         "play many trials over plants, changes, noise, rigs and devices",
         "campaign pot-plane",
-        "campaign my-campaign.toml --workers 4 --out results.json",
+        "campaign my-campaign.toml --workers 4 --out results.sqlite",
         "campaign pot-plane --cluster tcp://host:8786",
     )
     command.add_argument("spec", metavar=CAMPAIGN, help="shipped name or .toml file")
@@ -36,7 +36,8 @@ def add(commands: Any) -> None:
         "--out",
         type=Path,
         metavar=FILE,
-        help="file of the results, with a page beside it (default: build/campaign/NAME.json)",
+        help="SQLite file of the trials; beside it .json with the results, .html with a page"
+        " (default: build/campaign/NAME.sqlite)",
     )
     add_workers(command)
     add_allow(command)
@@ -66,59 +67,49 @@ def begin(arguments: argparse.Namespace) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
-    from analogrig.campaigns.builds import commands_of, load_commands
-    from analogrig.campaigns.conduct import conduct, journal_of, unreachable
-    from analogrig.campaigns.plan import Plan, one_worker_only
+    from analogrig.campaigns.conduct import conduct, ended_results, unreachable
+    from analogrig.campaigns.plan import Plan, device_of, one_worker_only
     from analogrig.campaigns.spec import CampaignSpec
     from analogrig.errors import WorkerError
+    from analogrig.identity import Identity
     from analogrig.output import move_aside
-    from analogrig.reporting.campaign import as_json, page_of, text, write_page
+    from analogrig.reporting.campaign import as_json, places_of, text, write_json, write_page
 
     plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
-    out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
-    page = page_of(out)
-    if not out.exists():
+    out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.sqlite"
+    summary, page = places_of(out)
+    results = ended_results(plan, out)
+    if results is None:
+        move_aside(summary)
         move_aside(page)
-    kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
-    try:
-        with workers(arguments, one_worker_only(plan.rigs, plan.devices), len(list(plan.chunks()))) as crew:
-            lacking = {} if out.exists() or arguments.cluster else unreachable(plan)
-            if len(lacking) == len(plan.devices):
-                return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
-            for name, why in lacking.items():
-                complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
-            _note_session(plan, out, arguments)
-            results = conduct(plan, crew, out, progress(plan))
-    except KeyboardInterrupt:
-        return complain(f"interrupted: {kept}", INTERRUPTED)
-    except WorkerError as error:
-        return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
-    played_by = load_commands(commands_of(out))
-    write_page(results, page, played_by)
+        kept = f"what is done is kept in {out}, and the same command goes on from there"
+        try:
+            with workers(arguments, one_worker_only(plan.rigs, plan.devices), plan.size * plan.spec.trials) as crew:
+                lacking = {} if arguments.cluster else unreachable(plan)
+                if len(lacking) == len(plan.devices):
+                    return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
+                for name, why in lacking.items():
+                    complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
+                files = [file for device in plan.devices for file in device_of(device).files()]
+                command = Identity.here(arguments.command_line, arguments.started, files)
+                results = conduct(plan, crew, out, progress(plan), command)
+        except KeyboardInterrupt:
+            return complain(f"interrupted: {kept}", INTERRUPTED)
+        except WorkerError as error:
+            return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
+    write_json(results, summary)
+    write_page(results, page)
     if arguments.json:
-        places = {"results": str(out), "page": str(page)}
-        show_result({**as_json(results), "played_by": [each.as_table() for each in played_by], **places}, arguments)
+        places = {"trials": str(out), "results": str(summary), "page": str(page)}
+        played_by = [each.as_table() for each in results.played_by]
+        show_result({**as_json(results), "played_by": played_by, "files": places}, arguments)
     else:
-        show(f"{text(results)}\nresults: {out}\npage:    {page}")
-    return STATUS[results.outcome()]
-
-
-def _note_session(plan: Plan, out: Path, arguments: argparse.Namespace) -> None:
-    """Keep the identity of this command beside the results that it will play a part of, if they lack any."""
-    from analogrig.campaigns.builds import commands_of, load_commands, save_commands
-    from analogrig.campaigns.conduct import journal_of
-    from analogrig.campaigns.plan import device_of
-    from analogrig.identity import Identity
-
-    if out.exists():
-        return
-    earlier = load_commands(commands_of(out)) if journal_of(out).exists() else ()
-    files = [file for device in plan.devices for file in device_of(device).files()]
-    save_commands(commands_of(out), (*earlier, Identity.here(arguments.command_line, arguments.started, files)))
+        show(f"{text(results)}\ntrials:  {out}\nresults: {summary}\npage:    {page}")
+    return STATUS[results.outcome]
 
 
 @contextlib.contextmanager
-def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[Workers]:
+def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[CampaignWorkers]:
     """Workers that the command line asks for, by default at most as many as are useful.
 
     ``alone``: a device that cannot be shared, or "".

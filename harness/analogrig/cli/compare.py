@@ -18,7 +18,7 @@ def add(commands: Any) -> None:
         commands,
         "compare",
         "test two campaigns or folders of runs for differences beyond chance",
-        "compare before.json after.json",
+        "compare before.sqlite after.sqlite",
         "compare runs/before runs/after --alpha 0.05 --json",
     )
     command.add_argument("a", type=Path, metavar=FILE, help="A: results of a campaign, or a folder of recordings")
@@ -43,10 +43,10 @@ def _probability(text: str) -> float:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from analogrig.campaigns.comparison import PAIRED, compare, load, match
+    from analogrig.campaigns.comparison import PAIRED, compare_sides, load
 
     with show_work(f"comparing {arguments.a} and {arguments.b}"):
-        found = compare(*match(load(arguments.a), load(arguments.b)), arguments.alpha)
+        found = compare_sides(load(arguments.a), load(arguments.b), arguments.alpha)
     if arguments.json:
         show_result(asdict(found), arguments)
     else:

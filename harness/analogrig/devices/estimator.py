@@ -68,7 +68,7 @@ class _Counters(ctypes.Structure):
     _fields_ = list(_COUNTERS.items())
 
 
-_FUNCTIONS = ("size", "init", "set", "start", "run", "theta_count", "counters")
+_FUNCTIONS = ("size", "init", "set", "start", "run", "run_codes", "theta_count", "counters")
 """Functions of estimator_c/ports/library/library.h, without their prefix."""
 
 
@@ -76,6 +76,13 @@ def _load(library: Path) -> ctypes.CDLL:
     c = load_library(library, (f"library_{does}" for does in _FUNCTIONS))
     c.library_size.restype = c.library_run.restype = ctypes.c_size_t
     c.library_run.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *(ctypes.c_void_p,) * 3, ctypes.POINTER(_Out)]
+    c.library_run_codes.restype = ctypes.c_size_t
+    c.library_run_codes.argtypes = [
+        ctypes.c_void_p,
+        *(ctypes.c_size_t,) * 2,
+        *(ctypes.c_void_p,) * 3,
+        ctypes.POINTER(_Out),
+    ]
     c.library_start.restype = ctypes.c_bool
     c.library_theta_count.restype = ctypes.c_uint8
     c.library_counters.restype = _Counters
@@ -129,19 +136,23 @@ class Estimator:
         :param with_theta: False: omit theta, which takes half of the time.
         :raises ValueError: u, y and valid differ in length.
         """
-        n = np.size(u)
-        inputs: list[NDArray[np.float32]] = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
+        u, y = np.asarray(u), np.asarray(y)
         mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
-        shapes = {x.shape for x in inputs} | (set() if mask is None else {mask.shape})
-        if len(shapes) != 1 or inputs[0].ndim != 1:
+        if u.ndim != 1 or u.shape != y.shape or (mask is not None and mask.shape != u.shape):
             raise ValueError("u, y and valid must be one-dimensional and of one length")
+        n = len(u)
         theta = np.empty((n, self.parameters if with_theta else 0), np.float32)
         innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
-        status, alarm = np.empty(n, np.uint8), np.empty(n, np.uint8)
+        status, alarm = np.empty(n, np.uint8), np.empty(n, np.bool_)
         arrays = (theta, innovation, statistic, status, alarm)
         out = _Out(*(array.ctypes.data if array.size else None for array in arrays))
         valid_at = None if mask is None else mask.ctypes.data
-        alarms_n = self._c.library_run(self._state, n, *(x.ctypes.data for x in inputs), valid_at, ctypes.byref(out))
+        if u.dtype == y.dtype == np.uint16 and u.strides == y.strides and u.strides[0] > 0:
+            where = (u.strides[0] // u.itemsize, u.ctypes.data, y.ctypes.data, valid_at)
+            alarms_n = self._c.library_run_codes(self._state, n, *where, ctypes.byref(out))
+        else:
+            u, y = (np.ascontiguousarray(x, dtype=np.float32) for x in (u, y))
+            alarms_n = self._c.library_run(self._state, n, u.ctypes.data, y.ctypes.data, valid_at, ctypes.byref(out))
         return EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm) if alarms_n else _NO_ALARMS)
 
     def save(self) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ it costs: harness/docs/decisions/045-bursts.md.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,7 +36,10 @@ _MOST_BLOCKS = 1000
 """Largest number of blocks in that test; more plays are merged, neighbours with neighbours."""
 
 _SIGMAS, _LEAST_WIDTH = 12.0, 60
-"""Half width of a sum over numbers of bursts: in standard deviations, and in bursts. The rest is below 1e-30."""
+"""Half width of a sum over counts: in standard deviations, and in counts. The rest is below 1e-30."""
+
+_ROOT_PRECISION = 1e-12
+"""Relative precision of a root."""
 
 _TERMS = np.arange(16.0)
 _WEIGHTS: NDArray[np.float64] = 1.0 / ((_TERMS + 1.0) * (_TERMS + 2.0))
@@ -66,11 +70,10 @@ def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
     It is the least one over all bursts of at most ``burst`` events on average: one alarm excludes few rates if it came
     alone. The upper bound rises with the bursts.
     """
-    from scipy.optimize import minimize_scalar
-
     _check(events, confidence, burst)
     if events == 0:
         return 0.0
+    from scipy.optimize import minimize_scalar
 
     def bound(burst: float) -> float:
         return _rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
@@ -87,27 +90,59 @@ def _probabilities(events: int, mean: float, burst: float) -> tuple[float, float
 
     k bursts have at most n events if at least k of n independent events are the last one of their burst.
     """
-    from scipy.special import bdtr, bdtrc, gammaln, xlogy
+    bursts, chances = _poisson(mean / burst)
+    first, as_many, fewer = _last_events(events, burst)
+    place = np.clip(bursts - first, 0, len(fewer) - 1)
+    return float(chances @ as_many[place]), float(chances @ fewer[place])
 
-    bursts = mean / burst
-    width = int(_SIGMAS * math.sqrt(bursts)) + _LEAST_WIDTH
-    number = np.arange(max(0, int(bursts) - width), int(bursts) + width + 1)
-    poisson = np.exp(xlogy(number, bursts) - bursts - gammaln(number + 1.0))
-    some = (number > 0) & (number <= events)
-    at_most, more = (number == 0).astype(np.float64), (number > events).astype(np.float64)
-    at_most[some] = bdtrc(number[some] - 1.0, events, 1.0 / burst)
-    more[some] = bdtr(number[some] - 1.0, events, 1.0 / burst)
-    return float(poisson @ at_most), float(poisson @ more)
+
+@functools.lru_cache(maxsize=2)
+def _last_events(events: int, burst: float) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
+    """A number k of events, and the probabilities that at least k, k + 1, ... of ``events`` are the last one of their
+    burst, and that fewer are. The first ones are 1 and 0, the last ones 0 and 1."""
+    first, chances = _binomial(events, 1.0 / burst)
+    return first, np.append(np.cumsum(chances[::-1])[::-1], 0.0), np.append(0.0, np.cumsum(chances))
+
+
+def _poisson(mean: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Counts of a Poisson distribution, and their probabilities."""
+    first, last = _likely(mean, mean)
+    count = np.arange(first, last + 1)
+    log_mean = math.log(mean) if mean > 0.0 else -math.inf
+    return count, _normalise(np.cumsum(np.append(0.0, log_mean - np.log(count[1:]))))
+
+
+def _binomial(trials: int, chance: float) -> tuple[int, NDArray[np.float64]]:
+    """First likely count of a binomial distribution, and the probabilities of the counts from there on."""
+    first, last = _likely(trials * chance, trials * chance * (1.0 - chance))
+    last = min(last, trials)
+    count = np.arange(last, first, -1)
+    log_odds = math.log(1.0 / chance - 1.0) if chance < 1.0 else -math.inf
+    falling = np.cumsum(np.append(0.0, np.log(count / (trials + 1 - count)) + log_odds))
+    return first, _normalise(falling[::-1])
+
+
+def _likely(mean: float, variance: float) -> tuple[int, int]:
+    """First and last count that matter."""
+    width = int(_SIGMAS * math.sqrt(variance)) + _LEAST_WIDTH
+    return max(0, int(mean) - width), int(mean) + width
+
+
+def _normalise(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Probabilities in proportion to exp(log_weights)."""
+    weights = np.exp(log_weights - log_weights.max())
+    return np.asarray(weights / weights.sum())
 
 
 def _rising_root(function: Callable[[float], float]) -> float:
     """Root above 0 of a rising function that is negative at 0."""
-    from scipy.optimize import brentq
-
-    high = 1.0
+    low, high = 0.0, 1.0
     while function(high) < 0.0:
-        high *= 2.0
-    return float(brentq(function, 0.0, high, xtol=1e-300, rtol=1e-12))
+        low, high = high, 2.0 * high
+    while high - low > _ROOT_PRECISION * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if function(middle) < 0.0 else (low, middle)
+    return high
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,8 @@ def write_picture(table: EffectsBySet, path: Path) -> None:
     """
     row_px, top_px = 10 * len(table) + 8, 56
     names = [row.name for row in next(iter(table.values()))]
-    height = top_px + row_px * len(names) + 30
+    bottom_px = top_px + row_px * len(names)
+    height = bottom_px + 48
     font = 'font-family="sans-serif" font-size="12"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="760" height="{height}" {font}>',
@@ -73,8 +74,12 @@ def write_picture(table: EffectsBySet, path: Path) -> None:
         parts.append(f'<text x="{265 + 90 * i}" y="41">{escape(name)}</text>')
     for decade in range(round(math.log10(_LEAST_LSB)), round(math.log10(_MOST_LSB)) + 1):
         x, colour = _x_px(10.0**decade), "#ddd" if decade else "#888"
-        parts.append(f'<path d="M{x:.1f} {top_px - 6}V{height - 32}" stroke="{colour}"/>')
-        parts.append(f'<text x="{x:.1f}" y="{height - 16}" text-anchor="middle">{10.0**decade:g}</text>')
+        parts.append(f'<path d="M{x:.1f} {top_px - 6}V{bottom_px - 2}" stroke="{colour}"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom_px + 14}" text-anchor="middle">{10.0**decade:g}</text>')
+    middle = (_x_px(_LEAST_LSB) + _x_px(_MOST_LSB)) / 2.0
+    title = f"largest change over {SAMPLES} samples [LSB of 12 bits over 10 V], logarithmic"
+    parts.append(f'<text x="{middle:.1f}" y="{bottom_px + 36}" text-anchor="middle">{title}</text>')
+    parts.append(f'<text x="240" y="{top_px - 15}" text-anchor="end">effect</text>')
     for k, name in enumerate(names):
         y = top_px + row_px * k
         parts.append(f'<text x="240" y="{y + row_px / 2:.1f}" text-anchor="end">{escape(name)}</text>')

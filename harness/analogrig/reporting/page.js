@@ -1,10 +1,11 @@
 "use strict";
 (() => {
-  const HEIGHT_PX = 210;
+  const HEIGHT_PX = 246;
   const LEFT_PX = 84;
   const RIGHT_PX = 80;
   const ROBUST_TAIL = 0.15; // share of the visible estimates on either side that may lie outside the plot
   const ROBUST_SPREAD = 0.6; // relative distance from the truth beyond which an estimate does not widen the plot
+  const INNOVATIONS_SHOWN = 0.99; // share of the visible innovations that determines their range
   const CEILINGS_SHOWN = 2;
   const BUCKET_PX = 3;
   const { begin, curve, drawn, lettered, padded, position, trouble, verticals } = plotting;
@@ -77,6 +78,14 @@
         Math.max(highest, Math.min(to, highest * (1 + ROBUST_SPREAD))),
       );
     };
+  }
+
+  // Symmetrical. The innovations before convergence and after a change must not squash the others.
+  function innovationRange(u, low, high) {
+    const sorted = Float64Array.from(inView(u.data[1]), Math.abs).sort();
+    if (!sorted.length) return [-1, 1];
+    const shown = sorted[Math.floor((showEvery.checked ? 1 : INNOVATIONS_SHOWN) * (sorted.length - 1))];
+    return padded(-shown, shown);
   }
 
   function statisticRange(u, low, high) {
@@ -178,12 +187,16 @@
     };
   }
 
+  // A generator holds its level between edges.
+  const stepped = uPlot.paths.stepped({ align: 1 });
+
   function pair(signals, ink, caption, left, right) {
     const words = (name) => name.replace("_", " ");
     const label = (name) => `${words(name)} [${signals[name].unit}]`;
     const curveOf = (name, scale, colour) => {
       const points = circled(signals.clipped.raw, run.columns.findIndex((c) => c.name === name), ink, colour);
-      return { of: signals[name].values, label: words(name), colour, unit: signals[name].unit, scale, points };
+      const paths = name === "force" ? stepped : undefined;
+      return { of: signals[name].values, label: words(name), colour, unit: signals[name].unit, scale, points, paths };
     };
     const curves = [curveOf(left, "left", "first"), curveOf(right, "right", "second")];
     const axes = [axis("left", label(left), 3, ink, "first"), axis("right", label(right), 1, ink, "second")];
@@ -193,9 +206,14 @@
   function estimate(signals, ink, name, caption, unit) {
     const known = truth(name);
     const found = { of: signals[name].values, label: "estimate", colour: "first", unit };
-    const paths = uPlot.paths.stepped({ align: 1 });
-    const curves = known ? [{ of: known, label: "truth", colour: "truth", unit, width: 4, paths }, found] : [found];
+    const curves = known ? [{ of: known, label: "truth", colour: "truth", unit, width: 4, paths: stepped }, found] : [found];
     return plotOf(ink, caption, curves, estimateRange(found.of, known), [axis("left", `${name} [${unit}]`, 3, ink)]);
+  }
+
+  function innovation(signals, ink) {
+    const caption = "Innovation: the measured displacement less the predicted one";
+    const curves = [{ of: signals.innovation.values, label: "innovation", colour: "first", unit: "codes" }];
+    return plotOf(ink, caption, curves, innovationRange, [axis("left", "innovation [codes]", 3, ink)]);
   }
 
   function statistic(signals, ink) {
@@ -217,6 +235,8 @@
     },
   };
 
+  const seconds = { time: false, from: "x", range: (u, min, max) => [min * run.period_s, max * run.period_s] };
+
   function described(signals, ink) {
     return [
       pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
@@ -227,6 +247,7 @@
         estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
         estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),
       ] : []),
+      ...(signals.innovation ? [innovation(signals, ink)] : []),
       ...(signals.statistic ? [statistic(signals, ink)] : []),
     ].map((plot) => ({
       ...plot,
@@ -236,8 +257,12 @@
       key: "run",
       right_px: plot.axes.length > 1 ? 0 : RIGHT_PX,
       data: [places, ...plot.data],
-      scales: { x: samples, ...plot.scales },
-      axes: [plotting.axis("x", "sample", 2, ink, { size: 26, labelSize: 18 }), ...plot.axes],
+      scales: { x: samples, seconds, ...plot.scales },
+      axes: [
+        plotting.axis("x", "sample", 2, ink, { size: 26, labelSize: 18 }),
+        plotting.axis("seconds", "problem time [s]", 2, ink, { size: 26, labelSize: 18, grid: { show: false } }),
+        ...plot.axes,
+      ],
       series: [{ label: "sample" }, ...plot.series],
       marks,
       under: [

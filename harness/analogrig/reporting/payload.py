@@ -147,6 +147,7 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
             for start, end, plant in _true_segments(run)
         ],
         "ceiling": _finite(verdict.ceiling),
+        "period_s": run.conditions.sample_period_problem_s,
     }
 
 
@@ -229,6 +230,8 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
     if run.datasheet.model is not None:
         estimates = condense(trajectory(run, part).astype(np.float32), size)
         reported |= {name: estimates[:, i] for i, name in enumerate(PARAMETERS)}
+    if run.datasheet.innovation:
+        reported["innovation"] = condense(run.innovation[part], size)
     if run.datasheet.statistic:
         reported["statistic"] = condense(run.statistic[part], size)
     return {

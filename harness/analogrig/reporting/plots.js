@@ -5,6 +5,8 @@ const plotting = (() => {
   const PRINT_WIDTH_PX = 700; // an A4 page between its margins
   const DENSE_PX = 10; // smallest distance of false alarms that do not fade
   const DENSE_ALPHA = 0.2; // opacity of the most faded alarms
+  const ZOOM = 1.25; // factor of one step of the wheel or one key
+  const MOVE = 0.25; // share of the visible width by which a key moves the plots
 
   // Columns with their raw values, and with their values in the unit of the plot; null for a non-finite one.
   async function decoded(columns, deflated) {
@@ -141,6 +143,76 @@ const plotting = (() => {
     return document.documentElement.classList.contains("printing");
   }
 
+  // Zooming and moving. All plots with the same key follow.
+
+  function show(u, min, max) {
+    for (const plot of uPlot.sync(u.cursor.sync.key).plots) plot.setScale("x", { min, max });
+  }
+
+  function ends(u) {
+    return [u.data[0][0], u.data[0][u.data[0].length - 1]];
+  }
+
+  // Move by a distance on the x axis, but not beyond the ends of the data.
+  function move(u, distance) {
+    const { min, max } = u.scales.x;
+    const [first, last] = ends(u);
+    const by = Math.max(first - min, Math.min(last - max, distance));
+    show(u, min + by, max + by);
+  }
+
+  // Magnify the visible width by a factor; `at` keeps its place.
+  function zoom(u, factor, at = (u.scales.x.min + u.scales.x.max) / 2) {
+    const { min, max } = u.scales.x;
+    const [first, last] = ends(u);
+    show(u, Math.max(first, at + (min - at) / factor), Math.min(last, at + (max - at) / factor));
+  }
+
+  function width(u) {
+    return u.scales.x.max - u.scales.x.min;
+  }
+
+  // The wheel with Ctrl zooms around the pointer; across, or with Shift, it moves the plots.
+  function wheeled(u, event) {
+    const across = event.shiftKey && !event.deltaX ? event.deltaY : event.deltaX;
+    if (event.ctrlKey) zoom(u, event.deltaY < 0 ? ZOOM : 1 / ZOOM, u.posToVal(event.offsetX, "x"));
+    else if (Math.abs(across) > Math.abs(event.deltaY) || event.shiftKey) move(u, (across * width(u)) / u.over.clientWidth);
+    else return; // the page scrolls
+    event.preventDefault();
+  }
+
+  const KEYS = {
+    ArrowLeft: (u) => move(u, -MOVE * width(u)),
+    ArrowRight: (u) => move(u, MOVE * width(u)),
+    "+": (u) => zoom(u, ZOOM),
+    "-": (u) => zoom(u, 1 / ZOOM),
+    Home: (u) => move(u, -Infinity),
+    End: (u) => move(u, Infinity),
+    0: (u) => show(u, ...ends(u)),
+  };
+
+  function typed(u, event) {
+    if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in KEYS)) return;
+    KEYS[event.key](u);
+    event.preventDefault();
+  }
+
+  // Dragging with Shift moves the plots; without, uPlot selects a range to zoom to.
+  function pressed(u, target, select) {
+    return (event) => {
+      if (!event.shiftKey) return select(event);
+      let from = event.clientX;
+      const drag = (next) => {
+        move(u, ((from - next.clientX) * width(u)) / u.over.clientWidth);
+        from = next.clientX;
+      };
+      addEventListener("mousemove", drag);
+      addEventListener("mouseup", () => removeEventListener("mousemove", drag), { once: true });
+      event.preventDefault();
+      return undefined;
+    };
+  }
+
   // The pointer reads out all plots with the same key. Dragging zooms all of them. `under` and `over` draw more below
   // and above the signals.
   function options({ key, right_px, scales, axes, series, marks, under = [], over = [] }, width, height, ink) {
@@ -148,7 +220,7 @@ const plotting = (() => {
       width,
       height,
       padding: [20, right_px, 0, 0],
-      cursor: { y: false, sync: { key, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } },
+      cursor: { y: false, sync: { key, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 }, bind: { mousedown: pressed } },
       scales,
       axes,
       series,
@@ -168,6 +240,9 @@ const plotting = (() => {
     plot.place.append(frame);
     const width = isPrinting() ? PRINT_WIDTH_PX : plot.place.clientWidth;
     const drawn = new uPlot(options(plot, width, heights[isPrinting() ? 1 : 0], ink), plot.data, frame);
+    drawn.over.addEventListener("wheel", (event) => wheeled(drawn, event), { passive: false });
+    frame.addEventListener("keydown", (event) => typed(drawn, event));
+    frame.tabIndex = 0;
     const canvas = drawn.root.querySelector("canvas");
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", plot.name);

@@ -13,7 +13,6 @@ from analogrig.judging.verdict import (
     STATISTIC,
     ChangeVerdict,
     ChannelFault,
-    DiagnosisVerdict,
     MisfitPeriod,
     SegmentEstimate,
     Verdict,
@@ -113,15 +112,14 @@ def tweaks(verdict: Verdict) -> str:
 
 def diagnoses(verdict: Verdict) -> str:
     """Table of the diagnoses, compared with the truth."""
-    reported = [(tweak, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis is not None]
     if DIAGNOSES in verdict.not_judged:
         return "<p>Not judged: the device does not report diagnoses.</p>"
-    if not reported:
+    if all(tweak.diagnosis is None for tweak in verdict.tweaks):
         return "<p>The device reported no diagnosis of a change.</p>"
     caption = "Diagnoses of the device; delay and isolation bound in samples from the change"
     numbers = ("Extent", "Error", "Delay", "Bound", "Onset error")
     head = heading(("Sample", "Changed", "Named"), numbers, ("Result",))
-    return table(caption, head, (_diagnosis_row(*each) for each in reported))
+    return table(caption, head, map(_diagnosis_row, verdict.tweaks))
 
 
 def channel_faults(verdict: Verdict) -> str:
@@ -251,9 +249,14 @@ def _change_row(tweak: ChangeVerdict) -> str:
     return row([*cells, number(ratio, ".2f"), cell(word, f"text {kind}")])
 
 
-def _diagnosis_row(tweak: ChangeVerdict, diagnosis: DiagnosisVerdict) -> str:
+def _diagnosis_row(tweak: ChangeVerdict) -> str:
+    sample, diagnosis = f'<th scope="row">{tweak.sample}</th>', tweak.diagnosis
+    if diagnosis is None:
+        return row(
+            [sample, cell(tweak.what), cell("nothing"), *[number(None)] * 5, cell("no diagnosis", "text neutral")]
+        )
     word, kind = ("✓ right", "good") if diagnosis.right else ("✗ WRONG", "bad")
-    cells = [f'<th scope="row">{tweak.sample}</th>', cell(tweak.what), cell(diagnosis.named)]
+    cells = [sample, cell(tweak.what), cell(diagnosis.named)]
     cells += [number(diagnosis.extent, ".3f"), number(diagnosis.extent_error, "+.1%")]
     cells += [number(diagnosis.delay_n), number(diagnosis.bound_n), number(diagnosis.onset_error_n, "+d")]
     return row([*cells, cell(word, f"text {kind}")])

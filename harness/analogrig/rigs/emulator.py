@@ -40,6 +40,7 @@ from analogrig_emulator import (
     Sampler,
     SuspensionComputer,
     acquired,
+    ahead_ticks,
     drawn_offsets_v,
     is_repeatable,
     preset,
@@ -124,7 +125,7 @@ class ComputerDescription:
     wiper_noise_ohm: float = 0.0
     """Largest rise of a wiper's resistance while its pot is turned (``ramp_n``)."""
     noise: bool = False
-    """Thermal noise of resistors and noise of the amplifiers; costs about 8 us a sample and instant of the card."""
+    """Thermal noise of resistors and noise of the amplifiers; costs about 0.2 us a sample."""
 
     def components_for(self, seed: int) -> Components:
         """Components of the machine: as measured, or drawn from the seed.
@@ -371,7 +372,8 @@ class EmulatorRig(Rig):
         drawn, card = self._description.computer, self._card
         is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm and not drawn.noise
         is_nominal &= drawn.specimen is None and drawn.values is None
-        return is_nominal and probes_per_sample(card) == 1 and card.clock_drift_ppm == 0
+        is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
+        return is_nominal and is_on_time
 
     def _repeat(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
         count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v

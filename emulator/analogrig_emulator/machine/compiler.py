@@ -1,0 +1,537 @@
+"""Compiler from equations to a patch: amplitude and time scaling, pots, polarities, netlist.
+
+Scaling as an operator does it: 10 V stand for the full scale of a quantity, from the file or 1.2 times its peak in the
+trial play. No quantity may exceed 12 V in that play. A cord of coefficient up to 1 is a pot into 100k, up to 10 a pot
+into 10k, and beyond that it is refused. Coefficients suffice for the range of every parameter.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element, OpAmp, Pot, Resistor, VoltageSource
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier
+from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
+from analogrig_emulator.circuit.part import GROUND
+from analogrig_emulator.errors import PotError, ProgramError
+from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
+from analogrig_emulator.machine.program import SOURCE, PotRow, Program, Scale, Scales
+from analogrig_emulator.machine.program_file import Equations, read_program
+from analogrig_emulator.machine.stages import (
+    REFERENCE,
+    Cord,
+    Factors,
+    PatchStage,
+    StageKind,
+    Stages,
+    stages_of,
+)
+from analogrig_emulator.machine.trial import Reach, reaches
+
+MACHINE_V = 10.0
+"""Voltage of full scale, of the reference, and scale of the multipliers."""
+
+LINEAR_V = 12.0
+"""Greatest voltage in a trial play: amplifiers are linear up to there."""
+
+INPUT_OHM = 100e3
+GAIN_10_OHM = 10e3
+INVERTER_OHM = 10e3
+TRACK_OHM = 10e3
+
+_CAPACITORS_FARAD = (1e-6, 1e-7, 1e-8, 1e-9)
+_LOOP_FARAD = 47e-12
+"""Capacitor across an amplifier with a multiplier in its loop: without it the loop rings."""
+
+_BARRED_V = 0.05
+"""Voltage beyond zero at which a root's diode conducts: at zero itself it would switch without end at rest."""
+
+_OFF_OHM = 1e12
+_ON_OHM = 1e3
+_HEADROOM = 1.2
+_ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+
+_LEAST_COEFFICIENT = 2e-4
+"""One winding of a pot's 5000."""
+
+_MOST_CORNERS = 6
+_EXACT = 1e-9
+
+
+@dataclass(frozen=True)
+class PatchedCord:
+    """Cord as patched: node and sign of its source there, coefficient for the file's values, gain 1 or 10.
+
+    pot: its pot, if it has one; per_unit: coefficient of that pot by product of the cord's factors.
+    """
+
+    cord: Cord
+    node: str
+    sign: int
+    coefficient: float
+    gain: int
+    resistor: str
+    pot: str = ""
+    per_unit: float = 0.0
+
+
+@dataclass(frozen=True)
+class PatchedElement:
+    """Computing element as patched: name, node of its output, sign and full scale there, and cords.
+
+    farad: capacitor of an integrator, else 0.
+    """
+
+    name: str
+    stage: PatchStage
+    node: str
+    sign: int
+    full: float
+    cords: tuple[PatchedCord, ...]
+    farad: float = 0.0
+
+
+@dataclass(frozen=True)
+class PatchedProgram(Program):
+    """Program compiled from equations.
+
+    patch: computing elements in the order of the diagram; inverters: names of the last amplifiers, by quantity;
+    input_nodes: node by input; reach: range in the trial play by quantity.
+    """
+
+    equations: Equations
+    stages: Stages
+    fulls: Mapping[str, float]
+    reach: Mapping[str, Reach]
+    patch: tuple[PatchedElement, ...]
+    inverters: Mapping[str, str]
+    input_nodes: Mapping[str, str]
+    elements: tuple[Element, ...]
+
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.equations.name
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return self.equations.channels
+
+    @functools.cached_property
+    def scales(self) -> Scales:
+        places = {each.stage.name: (each.node, each.sign) for each in self.patch}
+        places |= {name: (node, 1) for name, node in self.input_nodes.items()}
+        return Scales(
+            self.equations.speed,
+            {name: Scale(*places[name], self.fulls[name]) for name in self.equations.quantities},
+        )
+
+    @functools.cached_property
+    def values(self) -> dict[str, float]:
+        return {name: row.value for name, row in self.equations.parameters.items() if row.pot}
+
+    @functools.cached_property
+    def _cords(self) -> dict[str, PatchedCord]:
+        return {cord.pot: cord for element in self.patch for cord in element.cords if cord.pot}
+
+    @functools.cached_property
+    def pots(self) -> Mapping[str, PotRow]:
+        return {
+            pot: PotRow(
+                cord.resistor, tuple(name for name in _names(self.stages, cord.cord.factors) if name in self.values)
+            )
+            for pot, cord in self._cords.items()
+        }
+
+    def pot_coefficient(self, pot: str, values: Mapping[str, float]) -> float:
+        cord = self._cords[pot]
+        try:
+            return cord.per_unit * self.stages.factor(cord.cord.factors, self.equations.values | dict(values))
+        except ProgramError as cause:
+            raise PotError(f"pot {pot}: {cause}") from cause
+
+    @property
+    def amplifiers(self) -> int:
+        return sum(1 for element in self.elements if isinstance(element, OpAmp))
+
+    @property
+    def integrators(self) -> tuple[str, ...]:
+        return tuple(each.name for each in self.patch if each.stage.kind is StageKind.INTEGRATOR)
+
+    def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
+        given = iter(models)
+        return [replace(each, model=next(given)) if isinstance(each, OpAmp) else each for each in self.elements]
+
+
+def load_program(path: str | Path) -> PatchedProgram:
+    """Program of a file, compiled. Raises ProgramError that names the file, the place and the cure."""
+    equations = read_program(path)
+    try:
+        return compile_program(equations)
+    except ProgramError as cause:
+        raise ProgramError(f"{path}: {cause}") from cause
+
+
+@functools.lru_cache(maxsize=32)
+def compile_program(equations: Equations) -> PatchedProgram:
+    """Patch that solves the equations.
+
+    Raises ProgramError naming the term that cannot be patched, and what to change.
+    """
+    stages = stages_of(equations)
+    reach = reaches(stages)
+    fulls = _Scaling(stages, reach).fulls()
+    return _Patcher(stages, reach, fulls).program()
+
+
+@dataclass
+class _Scaling:
+    """Full scale of every quantity."""
+
+    stages: Stages
+    reach: Mapping[str, Reach]
+    found: dict[str, float] = field(default_factory=lambda: {REFERENCE: 1.0})
+
+    def fulls(self) -> dict[str, float]:
+        equations = self.stages.equations
+        for name, quantity in equations.inputs.items():
+            self.found[name] = quantity.full or 0.0
+        for name, quantity in equations.states.items():
+            self.found[name] = self._declared(f"states.{name}", name, quantity.full)
+        for stage in self.stages.stages:
+            if stage.kind is not StageKind.INTEGRATOR:
+                self.found[stage.name] = self._full(stage)
+        return self.found
+
+    def _declared(self, place: str, name: str, full: float | None) -> float:
+        """Full scale from the file, or from the trial play."""
+        peak = self.reach[name].peak
+        if full is None:
+            if not peak:
+                raise ProgramError(f"{place}: {name} stays at 0 in the trial play; give its full scale, full = ...")
+            return _rounded_up(_HEADROOM * peak)
+        if peak > full * LINEAR_V / MACHINE_V:
+            raise ProgramError(
+                f"{place}: {name} reaches {peak:.4g} in the trial play, {peak / full * MACHINE_V:.3g} V at full scale "
+                f"{full:g}; write full = {_rounded_up(peak):g}, lower the trial levels of the inputs, or narrow a range"
+            )
+        return full
+
+    def _full(self, stage: PatchStage) -> float:
+        sources = [self.found[cord.source] for cord in stage.cords]
+        if stage.kind in (StageKind.RECTIFIER, StageKind.PRODUCT):
+            return math.prod(sources)
+        if stage.kind is StageKind.ROOT:
+            return math.sqrt(sources[0])
+        declared = self.stages.equations.signals.get(stage.name)
+        full = self._declared(stage.place, stage.name, declared.full if declared else None)
+        return full if declared and declared.full else self._raised(stage, full, sources)
+
+    def _raised(self, stage: PatchStage, full: float, sources: Sequence[float]) -> float:
+        """Full scale raised until no coefficient exceeds 10."""
+        if stage.kind is StageKind.QUOTIENT:
+            return max(full, _rounded_up(sources[0] / sources[1] / 10.0))
+        if stage.kind is StageKind.SUMMER:
+            most = [extremes(self.stages, cord, stage.place)[1] * self.found[cord.source] for cord in stage.cords]
+            return max(full, _rounded_up(max(most) / 10.0))
+        return full
+
+
+def extremes(stages: Stages, cord: Cord, place: str) -> tuple[float, float]:
+    """Least and greatest magnitude of a cord's coefficient in the plant's units, over the ranges of parameters."""
+    parameters = stages.equations.parameters
+    names = _names(stages, cord.factors)
+    if len(names) > _MOST_CORNERS:
+        raise ProgramError(f"{place}: term {cord.text} has {len(names)} parameters; name parts of it as signals")
+    found = []
+    for corner in itertools.product(*(dict.fromkeys((parameters[name].low, parameters[name].high)) for name in names)):
+        try:
+            factor = stages.factor(cord.factors, stages.equations.values | dict(zip(names, corner, strict=True)))
+        except ProgramError as cause:
+            raise ProgramError(f"{place}: {cause}") from cause
+        found.append(abs(cord.number) * factor)
+    return min(found), max(found)
+
+
+def _names(stages: Stages, factors: Factors) -> list[str]:
+    """Parameters in factors."""
+    found: dict[str, None] = {}
+    for name, _ in factors:
+        inner = stages.composites[name].names() if name in stages.composites else (name,)
+        found |= dict.fromkeys(each for each in inner if each in stages.equations.parameters)
+    return list(found)
+
+
+class _Patcher:
+    """Elements of a patch, stage by stage."""
+
+    def __init__(self, stages: Stages, reach: Mapping[str, Reach], fulls: Mapping[str, float]) -> None:
+        self._stages, self._reach, self._fulls = stages, reach, fulls
+        rows = stages.stages
+        self._divisor_signs = {
+            stage.name: 1 if reach[stage.cords[1].source].low > 0 else -1
+            for stage in rows
+            if stage.kind is StageKind.QUOTIENT
+        }
+        self._inputs = list(stages.equations.inputs)
+        self._signs = signs_of(rows, self._inputs, self._divisor_signs)
+        self._nodes: dict[tuple[str, int], str] = {}
+        self._elements: list[Element] = []
+        self._amplifiers: dict[str, int] = {}
+        self._uses = self._users(rows)
+        self._pots: list[str] = []
+        self._pot_numbers = itertools.count(1)
+
+    def program(self) -> PatchedProgram:
+        rows = self._stages.stages
+        inverters = inverted(rows, self._signs, self._divisor_signs)
+        self._number(rows, inverters)
+        for place, name in enumerate(self._inputs):
+            self._elements.append(VoltageSource(SOURCE if not place else f"{SOURCE}{place + 1}", self._nodes[name, 1]))
+        for sign in sorted({sign for stage in rows for sign in self._reference_signs(stage)}, reverse=True):
+            name = "REFP" if sign > 0 else "REFM"
+            self._nodes[REFERENCE, sign] = name.lower()
+            self._elements.append(VoltageSource(name, name.lower(), dc_v=sign * MACHINE_V))
+        patch = [self._patched(stage) for stage in rows]
+        for name in inverters:
+            self._invert(name)
+        equations = self._stages.equations
+        return PatchedProgram(
+            equations=equations,
+            stages=self._stages,
+            fulls=self._fulls,
+            reach=self._reach,
+            patch=tuple(patch),
+            inverters={name: f"U{self._amplifiers[f'-{name}']}" for name in inverters},
+            input_nodes={name: self._nodes[name, 1] for name in self._inputs},
+            elements=tuple(self._elements),
+        )
+
+    # ---- names
+
+    def _number(self, rows: Sequence[PatchStage], inverters: Sequence[str]) -> None:
+        """Give every output its node."""
+        for place, name in enumerate(self._inputs):
+            self._nodes[name, 1] = "in" if not place else f"in{place + 1}"
+        counts = {StageKind.PRODUCT: 0, StageKind.FUNCTION: 0}
+        amplifiers = itertools.count(1)
+        for stage in rows:
+            if stage.kind in counts:
+                counts[stage.kind] += 1
+                self._nodes[stage.name, self._signs[stage.name]] = f"{_LETTERS[stage.kind]}{counts[stage.kind]}".lower()
+            else:
+                self._amplifiers[stage.name] = number = next(amplifiers)
+                self._nodes[stage.name, self._signs[stage.name]] = f"u{number}"
+        for name in inverters:
+            self._amplifiers[f"-{name}"] = number = next(amplifiers)
+            self._nodes[name, -self._signs[name]] = f"u{number}"
+
+    def _users(self, rows: Sequence[PatchStage]) -> Counter[str]:
+        """Number of cords by parameter."""
+        return Counter(name for stage in rows for cord in stage.cords for name in _names(self._stages, cord.factors))
+
+    def _pot_name(self, cord: Cord) -> str:
+        """Name of the parameter, if it turns this pot alone; else P1, P2, ..."""
+        names = _names(self._stages, cord.factors)
+        taken = {pot.lower() for pot in self._pots}
+        if len(names) == 1 and self._uses[names[0]] == 1 and not _reserved(names[0]) and names[0].lower() not in taken:
+            name = names[0]
+        else:
+            name = f"P{next(self._pot_numbers)}"
+        self._pots.append(name)
+        return name
+
+    def _reference_signs(self, stage: PatchStage) -> Iterator[int]:
+        for cord in stage.cords:
+            if cord.source == REFERENCE:
+                yield self._source_sign(stage, cord)
+
+    def _source_sign(self, stage: PatchStage, cord: Cord) -> int:
+        """Sign at which a cord takes its source."""
+        relative = cord_sign(stage.kind, cord.number, self._divisor_signs.get(stage.name, 1))
+        return relative * self._signs[stage.name] if relative else self._signs.get(cord.source, 1)
+
+    # ---- stages
+
+    def _patched(self, stage: PatchStage) -> PatchedElement:
+        match stage.kind:
+            case StageKind.PRODUCT:
+                return self._multiplier(stage)
+            case StageKind.FUNCTION:
+                return self._function(stage)
+            case StageKind.INTEGRATOR:
+                return self._integrator(stage)
+            case StageKind.SUMMER:
+                return self._summer(stage)
+            case StageKind.RECTIFIER:
+                return self._rectifier(stage)
+        return self._loop(stage)
+
+    def _summer(self, stage: PatchStage) -> PatchedElement:
+        cords = [self._cord(stage, place, self._ratio(stage, cord)) for place, cord in enumerate(stage.cords)]
+        number = self._amplifiers[stage.name]
+        self._elements.append(Resistor(f"R{number}FB", f"s{number}", f"u{number}", INPUT_OHM))
+        return self._amplifier(stage, cords)
+
+    def _integrator(self, stage: PatchStage) -> PatchedElement:
+        speed = self._stages.equations.speed
+        rates = [speed * self._ratio(stage, cord) for cord in stage.cords]
+        most = [
+            rate * extremes(self._stages, cord, stage.place)[1] for rate, cord in zip(rates, stage.cords, strict=True)
+        ]
+        farad = next((each for each in _CAPACITORS_FARAD if max(most) * INPUT_OHM * each <= 1 + _EXACT), None)
+        farad = _CAPACITORS_FARAD[-1] if farad is None else farad
+        self._check_speed(stage, max(most) * GAIN_10_OHM * farad)
+        cords = [self._cord(stage, place, rate * INPUT_OHM * farad) for place, rate in enumerate(rates)]
+        number = self._amplifiers[stage.name]
+        self._elements.append(Capacitor(f"C{number}", f"s{number}", f"u{number}", farad))
+        return replace(self._amplifier(stage, cords), farad=farad)
+
+    def _check_speed(self, stage: PatchStage, coefficient: float) -> None:
+        if coefficient > 1 + _EXACT:
+            speed = self._stages.equations.speed
+            raise ProgramError(
+                f"{stage.place}: integrator of {stage.name} needs a coefficient of {10 * coefficient:.3g} with 1 nF, "
+                f"beyond 10; write speed = {speed / coefficient:.3g} or less, or raise the full scale of {stage.name}"
+            )
+
+    def _rectifier(self, stage: PatchStage) -> PatchedElement:
+        number, cord = self._amplifiers[stage.name], stage.cords[0]
+        sign = self._source_sign(stage, cord)
+        node, junction = self._nodes[cord.source, sign], f"s{number}"
+        ends = (node, junction) if sign > 0 else (junction, node)
+        name = f"L{number}"
+        self._elements.append(DiodeLimiter(name, *ends, 0.0, INPUT_OHM, _OFF_OHM))
+        self._elements.append(Resistor(f"R{number}FB", junction, f"u{number}", INPUT_OHM))
+        return self._amplifier(stage, [PatchedCord(cord, node, sign, 1.0, 1, name)])
+
+    def _loop(self, stage: PatchStage) -> PatchedElement:
+        """Divider or root: the amplifier settles where its multiplier's product equals the first cord."""
+        number, dividend = self._amplifiers[stage.name], stage.cords[0]
+        sign, junction, out = self._signs[stage.name], f"s{number}", f"u{number}"
+        is_root = stage.kind is StageKind.ROOT
+        other = stage.name if is_root else stage.cords[1].source
+        other_sign = sign if is_root else self._signs[other]
+        product_full = self._fulls[stage.name] * self._fulls[other]
+        ratio = self._fulls[dividend.source] / product_full
+        # Small resistors make the loop fast; a gain of 10 would make the input's too small for its source.
+        ohm = GAIN_10_OHM if ratio * extremes(self._stages, dividend, stage.place)[1] <= 1 + _EXACT else INPUT_OHM
+        cords = [self._cord(stage, 0, ratio, ohm)]
+        # The product must cancel the dividend's current.
+        product_sign = -self._source_sign(stage, dividend)
+        name, node = f"XU{number}", f"xu{number}"
+        scale_v = MACHINE_V * sign * other_sign * product_sign
+        self._elements += [
+            Multiplier(name, out, self._nodes[other, other_sign], node, scale_v),
+            Resistor(f"R{number}X", node, junction, ohm),
+            Capacitor(f"C{number}", junction, out, _LOOP_FARAD),
+        ]
+        if is_root:  # The diode bars the other root, where the loop would latch up.
+            ends = (junction, out) if sign > 0 else (out, junction)
+            self._elements.append(DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM))
+        else:
+            self._elements.append(Resistor(f"R{number}FB", junction, out, _OFF_OHM))
+            cords.append(PatchedCord(stage.cords[1], self._nodes[other, other_sign], other_sign, 1.0, 1, name))
+        return self._amplifier(stage, cords)
+
+    def _multiplier(self, stage: PatchStage) -> PatchedElement:
+        sign, node = self._output(stage)
+        one, other = (self._direct(stage, cord) for cord in stage.cords)
+        self._elements.append(
+            Multiplier(node.upper(), one.node, other.node, node, MACHINE_V * sign * one.sign * other.sign)
+        )
+        return PatchedElement(node.upper(), stage, node, sign, self._fulls[stage.name], (one, other))
+
+    def _function(self, stage: PatchStage) -> PatchedElement:
+        sign, node = self._output(stage)
+        cord = self._direct(stage, stage.cords[0])
+        to_x = cord.sign * MACHINE_V / self._fulls[cord.cord.source]
+        to_y = sign * MACHINE_V / self._fulls[stage.name]
+        points = [(to_x * x, to_y * y) for x, y in self._stages.equations.functions[stage.function].points]
+        self._elements.append(Function(node.upper(), cord.node, node, tuple(sorted(points))))
+        return PatchedElement(node.upper(), stage, node, sign, self._fulls[stage.name], (cord,))
+
+    def _output(self, stage: PatchStage) -> tuple[int, str]:
+        sign = self._signs[stage.name]
+        return sign, self._nodes[stage.name, sign]
+
+    def _direct(self, stage: PatchStage, cord: Cord) -> PatchedCord:
+        sign = self._source_sign(stage, cord)
+        return PatchedCord(cord, self._nodes[cord.source, sign], sign, 1.0, 1, "")
+
+    def _invert(self, name: str) -> None:
+        number, sign = self._amplifiers[f"-{name}"], self._signs[name]
+        self._elements += [
+            Resistor(f"R{number}_1", self._nodes[name, sign], f"s{number}", INVERTER_OHM),
+            Resistor(f"R{number}FB", f"s{number}", f"u{number}", INVERTER_OHM),
+            OpAmp(f"U{number}", GROUND, f"s{number}", f"u{number}", IDEAL),
+        ]
+
+    def _amplifier(self, stage: PatchStage, cords: Sequence[PatchedCord]) -> PatchedElement:
+        number = self._amplifiers[stage.name]
+        sign, node = self._output(stage)
+        self._elements.append(OpAmp(f"U{number}", GROUND, f"s{number}", node, IDEAL))
+        return PatchedElement(f"U{number}", stage, node, sign, self._fulls[stage.name], tuple(cords))
+
+    # ---- cords
+
+    def _ratio(self, stage: PatchStage, cord: Cord) -> float:
+        """Volts at the stage by volt at the source, for a coefficient of 1 in the plant's units."""
+        return self._fulls[cord.source] / self._fulls[stage.name]
+
+    def _cord(self, stage: PatchStage, place: int, ratio: float, ohm: float = INPUT_OHM) -> PatchedCord:
+        """Cord into an amplifier; ratio: coefficient by product of the cord's number and factors; ohm: for gain 1."""
+        cord, number = stage.cords[place], self._amplifiers[stage.name]
+        most = ratio * extremes(self._stages, cord, stage.place)[1]
+        coefficient = ratio * abs(cord.number) * self._stages.factor(cord.factors, self._stages.equations.values)
+        self._check_coefficient(stage, cord, coefficient, most)
+        gain = 1 if most <= 1 + _EXACT else 10
+        sign = self._source_sign(stage, cord)
+        node, resistor = self._nodes[cord.source, sign], f"R{number}_{place + 1}"
+        pot, top = "", node
+        if cord.factors or abs(coefficient - gain) > _EXACT:
+            pot = self._pot_name(cord)
+            node = f"w_{pot}"
+            self._elements.append(Pot(pot, top, node, GROUND, TRACK_OHM, 0.0))
+        self._elements.append(Resistor(resistor, node, f"s{number}", ohm / gain))
+        return PatchedCord(cord, top, sign, coefficient, gain, resistor, pot, ratio * abs(cord.number) / gain)
+
+    def _check_coefficient(self, stage: PatchStage, cord: Cord, coefficient: float, most: float) -> None:
+        what = f"{stage.place}: term {cord.text} of {stage.name}"
+        if most > 10 * (1 + _EXACT):
+            raise ProgramError(
+                f"{what} needs a coefficient of {most:.3g}, and there are 10; "
+                f"write full = {_rounded_up(self._fulls[stage.name] * most / 10):g} for {stage.name}"
+            )
+        if coefficient < _LEAST_COEFFICIENT:
+            raise ProgramError(
+                f"{what} has a coefficient of {coefficient:.2g}, below one winding of a pot ({_LEAST_COEFFICIENT:g}); "
+                f"delete the term, or lower the full scale of {stage.name}"
+            )
+
+
+_LETTERS = {StageKind.PRODUCT: "X", StageKind.FUNCTION: "D"}
+
+
+def _reserved(name: str) -> bool:
+    """True if an element of the patch may be called so."""
+    head, rest = name[:1].upper(), name[1:].upper()
+    return (
+        (head in "UXDRCLPF" and rest[:1].isdigit()) or name.upper() in (SOURCE, "REFP", "REFM") or "XU" in name.upper()
+    )
+
+
+def _rounded_up(value: float) -> float:
+    """Next round number."""
+    decade = 10.0 ** math.floor(math.log10(value))
+    return next(step * decade for step in _ROUND if step * decade >= value * (1 - _EXACT))

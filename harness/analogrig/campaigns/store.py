@@ -1,0 +1,302 @@
+"""Store of a campaign: one SQLite file that is appended to, survives any interruption, and is read in part.
+
+While the campaign runs, the file is in WAL mode and locked, and each task is one transaction. When it has ended, the
+file stands alone, has exactly the trials that count, and a summary of each cell. A store from elsewhere is checked
+before anything in it is used: its schema must be the one below, and it has no views, triggers or virtual tables.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sqlite3
+import urllib.parse
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from analogrig import config
+from analogrig.campaigns.plan import Part, Plan
+from analogrig.campaigns.trials import COLUMNS, MOST_TRIALS, Trials
+from analogrig.errors import AnalogrigError, ConfigurationError, RecordingError
+from analogrig.identity import Identity
+
+APPLICATION, VERSION = 0x616E7267, 3
+"""``application_id`` and ``user_version`` of the file."""
+
+_SCHEMA = {
+    "campaign": "CREATE TABLE campaign (plan TEXT NOT NULL)",
+    "commands": "CREATE TABLE commands (number INTEGER PRIMARY KEY, identity TEXT NOT NULL)",
+    "trials": "CREATE TABLE trials (first INTEGER PRIMARY KEY, count INTEGER NOT NULL, "
+    + ", ".join(f"{name} BLOB NOT NULL" for name in COLUMNS)
+    + ")",
+    "cells": "CREATE TABLE cells (cell INTEGER PRIMARY KEY, summary TEXT NOT NULL)",
+}
+"""``trials``: a part of a cell in each row; ``first`` is cell times trials of a cell, plus place in the cell."""
+
+_PAGE_BYTES = 1024
+"""A row has some kilobytes, and its last page is half empty on average."""
+
+_MOST_VALUE_BYTES = 20_000_000
+
+_MOST_PLAN_CHARACTERS = 4_000_000
+
+_MOST_COMMANDS = 10_000
+
+_MAGIC = b"SQLite format 3\0"
+
+_BUSY = "database is locked"
+
+
+class Store:
+    """Open store of a campaign."""
+
+    def __init__(self, path: Path, *, is_read_only: bool) -> None:
+        """Open an existing store.
+
+        :raises RecordingError: it cannot be read, or is none.
+        :raises ConfigurationError: another campaign is writing to it.
+        """
+        self.path = path
+        _check_header(path)
+        with self._wrapped():
+            mode = "ro" if is_read_only else "rw"
+            name = f"file:{urllib.parse.quote(str(path.absolute()))}?mode={mode}"
+            self._file = sqlite3.connect(name, uri=True, isolation_level=None, timeout=0.0)
+        try:
+            with self._wrapped():
+                self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_VALUE_BYTES)
+                self._file.execute("PRAGMA trusted_schema = OFF")
+                self._file.execute("PRAGMA cell_size_check = ON")
+                self._file.execute(f"PRAGMA locking_mode = {'NORMAL' if is_read_only else 'EXCLUSIVE'}")
+                self._check_schema()
+                self.plan_text = self._read_plan()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Store to read from; errors as the constructor's."""
+        return cls(path, is_read_only=True)
+
+    @classmethod
+    def write(cls, path: Path, plan: Plan) -> Self:
+        """Store of this plan to append to; create it if there is none.
+
+        :raises ConfigurationError: it belongs to another campaign or to something else, or another process has it.
+        :raises RecordingError: it cannot be read or written.
+        """
+        if not path.exists():
+            _create(path, plan)
+        try:
+            store = cls(path, is_read_only=False)
+        except NotAStoreError as error:
+            raise ConfigurationError(f"{error}: choose another --out, or remove it") from error
+        try:
+            if store.plan_text != plan.as_json():
+                plan.check_same(store.plan().as_plain(), f"{path}: holds another campaign")
+            if not store.is_ended:
+                with store._wrapped():
+                    store._file.execute("PRAGMA journal_mode = WAL")
+                    store._file.execute("PRAGMA synchronous = FULL")
+                    store._file.execute("BEGIN IMMEDIATE")  # takes the lock, which stays
+                    store._file.execute("COMMIT")
+        except BaseException:
+            store.close()
+            raise
+        return store
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        with contextlib.suppress(sqlite3.Error):
+            self._file.close()
+
+    @property
+    def is_ended(self) -> bool:
+        """True if the campaign has ended."""
+        with self._wrapped():
+            return self._file.execute("SELECT 1 FROM cells LIMIT 1").fetchone() is not None
+
+    def plan(self) -> Plan:
+        """:raises RecordingError: what is there is no plan."""
+        with self._checked():
+            return Plan.from_json(self.plan_text)
+
+    def commands(self) -> tuple[Identity, ...]:
+        """Commands that have played a part, in order."""
+        query = "SELECT identity FROM commands ORDER BY number LIMIT ?"
+        with self._wrapped(), self._checked():
+            return tuple(
+                config.build(Identity, json.loads(text), str(self.path))
+                for (text,) in self._file.execute(query, (_MOST_COMMANDS,))
+            )
+
+    def add_command(self, identity: Identity) -> None:
+        with self._wrapped():
+            self._file.execute("INSERT INTO commands (identity) VALUES (?)", (json.dumps(identity.as_table()),))
+
+    def add(self, plan: Plan, played: Iterable[tuple[Part, Sequence[bytes]]]) -> None:
+        """Append the encoded trials of a task in one transaction; they are on the disk when this returns.
+
+        :raises RecordingError: they cannot be written.
+        """
+        with self._transaction():
+            for part, columns in played:
+                self._insert(plan, part, columns)
+
+    def finish(self, plan: Plan, counted: Sequence[int], summaries: Sequence[Mapping[str, Any]]) -> None:
+        """Remove the trials beyond the end of each cell, add the summaries, and leave a file that stands alone.
+
+        :param counted: number of trials that count, by cell.
+        """
+        with self._transaction():
+            for cell, (count, summary) in enumerate(zip(counted, summaries, strict=True)):
+                if count < plan.spec.trials:
+                    self._cut(plan, cell, count)
+                self._file.execute("INSERT INTO cells VALUES (?, ?)", (cell, json.dumps(summary, sort_keys=True)))
+        with self._wrapped():
+            self._file.execute("PRAGMA journal_mode = DELETE")
+        with contextlib.suppress(OSError):  # a reader may have left it; without a log it means nothing
+            self.path.with_name(f"{self.path.name}-shm").unlink()
+
+    def _cut(self, plan: Plan, cell: int, count: int) -> None:
+        """Remove the trials of a cell beyond the first ``count``."""
+        begin = cell * plan.spec.trials
+        (last,) = list(self.parts(plan, range(begin + count - 1, begin + count)))
+        part, trials = last
+        end = begin + plan.spec.trials
+        self._file.execute("DELETE FROM trials WHERE first >= ? AND first < ?", (begin + part.first, end))
+        kept = count - part.first
+        self._insert(plan, part._replace(trials=kept), trials[:kept].encode())
+
+    def _insert(self, plan: Plan, part: Part, columns: Sequence[bytes]) -> None:
+        marks = ", ".join("?" * (2 + len(COLUMNS)))
+        values = (part.cell * plan.spec.trials + part.first, part.trials, *columns)
+        self._file.execute(f"INSERT INTO trials VALUES ({marks})", values)  # noqa: S608 - question marks
+
+    def parts(
+        self, plan: Plan, numbers: range | None = None, columns: Sequence[str] = COLUMNS
+    ) -> Iterator[tuple[Part, Trials]]:
+        """Yield the parts with any of these trials in the order of cells and seeds, each with its trials.
+
+        :param numbers: numbers of trials, as ``first`` in the table; None: all.
+        :param columns: columns to read; the others are 0.
+        :raises RecordingError: what is there is no part of this campaign.
+        """
+        trials, size = plan.spec.trials, plan.size * plan.spec.trials
+        wanted = numbers if numbers is not None else range(size)
+        query = f"SELECT first, count, {', '.join(columns)} FROM trials WHERE first > ? AND first < ? ORDER BY first"  # noqa: S608 - names of COLUMNS
+        end = -1
+        with self._wrapped(), self._checked():
+            for first, count, *values in self._file.execute(query, (wanted.start - MOST_TRIALS, wanted.stop)):
+                if not (isinstance(first, int) and isinstance(count, int) and 1 <= count <= MOST_TRIALS):
+                    raise ValueError("a part of no size")
+                cell, place = divmod(first, trials)
+                if not end <= first <= first + count <= (cell + 1) * trials <= size or first < 0:
+                    raise ValueError("parts that overlap")
+                end = first + count
+                if end > wanted.start:
+                    if not all(isinstance(value, bytes) for value in values):
+                        raise ValueError("a column that is no blob")
+                    found = dict(zip(columns, values, strict=True))
+                    axes = len(plan.spec.draw.axes())
+                    yield Part(cell, place, count), Trials.decode(count, found, axes)
+
+    def _check_schema(self) -> None:
+        found = dict(self._file.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall())
+        if found != _SCHEMA:
+            raise RecordingError(f"{self.path}: damaged results of a campaign (other tables)")
+
+    def _read_plan(self) -> str:
+        rows = self._file.execute("SELECT plan FROM campaign LIMIT 2").fetchall()
+        if len(rows) != 1 or not isinstance(rows[0][0], str) or len(rows[0][0]) > _MOST_PLAN_CHARACTERS:
+            raise RecordingError(f"{self.path}: damaged results of a campaign (no plan)")
+        return str(rows[0][0])
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with self._wrapped():
+            self._file.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._file.execute("COMMIT")
+            except BaseException:
+                with contextlib.suppress(sqlite3.Error):
+                    self._file.execute("ROLLBACK")
+                raise
+
+    @contextlib.contextmanager
+    def _wrapped(self) -> Iterator[None]:
+        """:raises RecordingError: SQLite failed.
+        :raises ConfigurationError: another process has the file."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            if _BUSY in str(error):
+                raise ConfigurationError(f"{self.path}: another campaign is writing to it") from error
+            raise RecordingError(f"{self.path}: {error}") from error
+
+    @contextlib.contextmanager
+    def _checked(self) -> Iterator[None]:
+        """:raises RecordingError: values that no campaign writes."""
+        try:
+            yield
+        except RecordingError:
+            raise
+        except (AnalogrigError, LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as e:
+            raise RecordingError(f"{self.path}: damaged results of a campaign ({e})") from e
+
+
+class NotAStoreError(RecordingError):
+    """The file is no store of a campaign, and is left alone."""
+
+
+def _check_header(path: Path) -> None:
+    """Check the first bytes without opening the file as a database.
+
+    :raises NotAStoreError: no campaign has written it, or another version of analogrig.
+    :raises RecordingError: it cannot be read.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise NotAStoreError(f"{path}: not a file")
+        with path.open("rb") as file:
+            head = file.read(100)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from error
+    found = [int.from_bytes(head[at : at + 4], "big") for at in (68, 60)]
+    if not head.startswith(_MAGIC) or found[0] != APPLICATION:
+        raise NotAStoreError(f"{path}: not the results of a campaign")
+    if found[1] != VERSION:
+        raise NotAStoreError(f"{path}: results of another version of analogrig")
+
+
+def _create(path: Path, plan: Plan) -> None:
+    """Create an empty store; it is at ``path`` as a whole or not at all."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.closing(sqlite3.connect(partial, isolation_level=None)) as file:
+            file.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
+            file.execute("BEGIN")
+            file.execute(f"PRAGMA application_id = {APPLICATION}")
+            file.execute(f"PRAGMA user_version = {VERSION}")
+            for statement in _SCHEMA.values():
+                file.execute(statement)
+            file.execute("INSERT INTO campaign VALUES (?)", (plan.as_json(),))
+            file.execute("COMMIT")
+        partial.replace(path)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from error
+    except sqlite3.Error as error:
+        raise RecordingError(f"{path}: {error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink()

@@ -1,0 +1,76 @@
+"""``analogrig patch``: a program file as a patch of the analogue computer."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from analogrig.cli.options import FILE, add_command, add_json
+from analogrig.cli.terminal import PASSED, show, show_plain, show_result
+
+_SAMPLES = 800
+
+
+def add(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "patch",
+        "compile a program file, and print its scaling sheet",
+        "patch dc-motor",
+        "patch motor.toml --drawing build/motor.svg --netlist build/motor.cir",
+    )
+    command.add_argument("program", metavar="PROGRAM", help="program file, or the name of a shipped one")
+    command.add_argument("--drawing", type=Path, metavar=FILE, help="drawing of the patch, an .svg file")
+    command.add_argument("--netlist", type=Path, metavar=FILE, help="SPICE deck of the patch, for ngspice")
+    add_json(command)
+    command.set_defaults(command=_patch)
+
+
+def _patch(arguments: argparse.Namespace) -> int:
+    from analogrig.config import locate
+    from analogrig.errors import ConfigurationError
+    from analogrig.output import move_aside
+    from analogrig.storage import replace_file
+    from analogrig_emulator.machine.compiler import load_program
+    from analogrig_emulator.machine.drawing import patch_drawing
+    from analogrig_emulator.machine.sheet import dials, scaling_sheet
+
+    if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
+        raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
+    wanted = [path for path in (arguments.drawing, arguments.netlist) if path is not None]
+    file = locate("programs", arguments.program)
+    for path in wanted:
+        move_aside(path, [file])
+    program = load_program(file)
+    texts = {}
+    if arguments.drawing is not None:
+        texts[arguments.drawing] = patch_drawing(program)
+    if arguments.netlist is not None:
+        texts[arguments.netlist] = _deck(program)
+    for path, text in texts.items():
+        with replace_file(path) as out:
+            out.write(text.encode())
+    if arguments.json:
+        full = {name: program.scales.full(name) for name in program.equations.quantities}
+        files = {"files": [str(path) for path in wanted]}
+        show_result({"program": program.name, "full": full, "dials": dials(program), **files}, arguments)
+    else:
+        show_plain(scaling_sheet(program).rstrip("\n"))
+        for path in wanted:
+            show(f"written: {path}")
+    return PASSED
+
+
+def _deck(program: Any) -> str:
+    """Deck of the patch under the square wave of the machine, between the levels of the trial play."""
+    from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, Excitation, SuspensionComputer
+    from analogrig_emulator.machine.compiler import MACHINE_V
+
+    computer = SuspensionComputer(program)
+    (name, quantity), *_ = program.equations.inputs.items()
+    low_v, high_v = (level * MACHINE_V / program.scales.full(name) for level in quantity.trial)
+    excitation = Excitation(low_v=low_v, high_v=high_v)
+    rate_hz = computer.sample_rate_hz
+    edges = {SOURCE: excitation.edges(0, _SAMPLES * TICKS_PER_SAMPLE, rate_hz)}
+    return Deck(computer.circuit, _SAMPLES, rate_hz, edges, title=f"program {program.name}").text()

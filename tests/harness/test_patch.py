@@ -1,0 +1,60 @@
+"""``analogrig patch``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from analogrig.cli import main
+
+MOTOR = Path(__file__).parents[2] / "fixtures" / "programs" / "dc-motor.toml"
+
+
+def test_sheet_drawing_and_deck_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drawing, deck = tmp_path / "motor.svg", tmp_path / "motor.cir"
+    assert main(["patch", str(MOTOR), "--drawing", str(drawing), "--netlist", str(deck)]) == 0
+    assert "dc-motor: DC motor with load" in capsys.readouterr().out
+    assert drawing.read_text().startswith("<svg")
+    assert deck.read_text().startswith("* program dc-motor") and ".tran" in deck.read_text()
+
+
+def test_shipped_program_goes_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["patch", "pendulum"]) == 0
+    assert "pendulum with damping" in capsys.readouterr().out
+    assert main(["patch", "pendolum"]) == 2
+    assert "no program is called 'pendolum': there are bump-stop, dc-motor" in capsys.readouterr().err
+
+
+def test_json_has_scales_and_dials(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["patch", str(MOTOR), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["full"] == {"u": 24.0, "i": 20.0, "omega": 300.0}
+    assert found["dials"]["J"] == pytest.approx(0.6394, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        ("name = 3", [], "bad.toml: "),
+        (MOTOR.read_text().replace("k*omega", "k*omga"), [], "bad.toml: equations, line 1: unknown name 'omga'; did"),
+        (MOTOR.read_text(), ["--drawing", "motor.png"], "motor.png: the file's name must end with .svg"),
+    ],
+)
+def test_bad_use_is_one_line(
+    text: str, arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    assert main(["patch", str(path), *arguments]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err and captured.err.count("\n") == 1 and not captured.out
+
+
+def test_file_that_is_read_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "motor.toml"
+    path.write_text(MOTOR.read_text())
+    assert main(["patch", str(path), "--netlist", str(path)]) == 2
+    assert str(path) in capsys.readouterr().err
+    assert path.read_text() == MOTOR.read_text()
