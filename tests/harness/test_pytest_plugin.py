@@ -28,7 +28,7 @@ from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
 
 SHORT = """\
-samples = 400
+samples = 900
 {head}
 [excitation]
 low_v = 0.1
@@ -36,7 +36,7 @@ high_v = 9.9
 frequency_hz = 200.0
 
 [[tweaks]]
-sample = 300
+sample = 700
 stiffness_n_per_m = 18000.0
 
 [expect]
@@ -46,7 +46,7 @@ missed = 0
 PLAYS = """\
 def test_it(hil_play):
     played = hil_play("short.toml")
-    assert played.run.samples == 400
+    assert played.run.samples == 900
     {assertion}
 """
 
@@ -247,7 +247,7 @@ def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
     result = run(user, "--hil-dut", "inproc", "--hil-rig", "noisy.toml", "--junitxml", "junit.xml")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
-        ["E*<no: K at 300: * samples, allowed 1 (0 x bound * + 1)>*", "play it again with: analogrig run --scenario *"]
+        ["E*<no: K at 700: * samples, allowed 1 (0 x bound * + 1)>*", "play it again with: analogrig run --scenario *"]
     )
     (line,) = [line for line in result.outlines if line.startswith("play it again with: ")]
     monkeypatch.chdir(user.path)
@@ -307,7 +307,7 @@ def test_command_of_a_play_names_files_as_the_user_does_and_says_nothing_when_no
         def test_it(hil_play):
             played = hil_play("short.toml", seed=5)
             print(played.repeat, played.verdict.theta_hash, sep="#")
-            assert not hil_play(dataclasses.replace(Scenario.load("short.toml"), samples=500)).repeat
+            assert not hil_play(dataclasses.replace(Scenario.load("short.toml"), samples=1000)).repeat
             assert hil_play("thesis").repeat
         """
     )
@@ -458,7 +458,7 @@ def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(use
     assert statement["test"].endswith("::test_it")
     result = again(user)  # the scenario's [expect] alone would pass
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*scenario.toml: K at 300: * samples, allowed *"])
+    result.stdout.fnmatch_lines(["*scenario.toml: K at 700: * samples, allowed *"])
     assert len(list(user.path.glob("build/runs/*"))) == 1, "one more of the same"
     again(user, "--hil-dut", "inproc").assert_outcomes(passed=1)
 

@@ -35,7 +35,7 @@ from tests.harness.processes import LONG_S
 from tests.served.serving import RIG, ROOT, Served, serving, serving_in_thread
 
 THESIS = Scenario.load("thesis")
-SHORT = dataclasses.replace(THESIS, samples=300, tweaks=())
+SHORT = dataclasses.replace(THESIS, samples=700, tweaks=())
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -19,7 +20,8 @@ from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 
-RECORD_N = 700
+RECORD_N, CHANGE_AT = 1100, 800
+"""Samples of a record, and the one of its change: after the warm-up of the device."""
 
 
 class Recorder(Rig):
@@ -51,7 +53,7 @@ class Recorder(Rig):
 
 
 SCENARIO = dataclasses.replace(
-    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(PotChange(sample=400, stiffness_n_per_m=16000.0),)
+    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(PotChange(sample=CHANGE_AT, stiffness_n_per_m=16000.0),)
 )
 
 
@@ -79,14 +81,15 @@ def test_device_restarts_with_each_record(run: Run) -> None:
 def test_each_record_is_judged_as_a_separate_run(run: Run) -> None:
     whole, parts = judge(run), [judge(single(seed)) for seed in (0, 1)]
     assert whole.outcome == "passed"
-    assert [tweak.sample for tweak in whole.tweaks] == [400, RECORD_N + 400]
+    assert [tweak.sample for tweak in whole.tweaks] == [CHANGE_AT, RECORD_N + CHANGE_AT]
     for tweak, part in zip(whole.tweaks, parts, strict=True):
         assert (tweak.latency_n, tweak.bound_n) == (part.tweaks[0].latency_n, part.tweaks[0].bound_n)
-    assert [(each.start, each.end) for each in whole.estimates] == [(0, 400), (400, 700), (700, 1100), (1100, 1400)]
+    bounds = [0, CHANGE_AT, RECORD_N, RECORD_N + CHANGE_AT, 2 * RECORD_N]
+    assert [(each.start, each.end) for each in whole.estimates] == list(itertools.pairwise(bounds))
 
 
 def test_alarm_detects_no_change_of_an_earlier_record(run: Run) -> None:
-    late = dataclasses.replace(run, alarm_index=np.array([RECORD_N + 5, RECORD_N + 405]))
+    late = dataclasses.replace(run, alarm_index=np.array([RECORD_N + 5, RECORD_N + CHANGE_AT + 5]))
     verdict = judge(dataclasses.replace(late, alarm_kind=run.alarm_kind[:2], alarm_statistic=run.alarm_statistic[:2]))
     assert verdict.tweaks[0].missed
     assert verdict.false_alarms == (RECORD_N + 5,)
