@@ -34,8 +34,8 @@ from analogrig_emulator import Excitation, SuspensionComputer
 
 SELF_TEST_SEED = 0
 
-LEAD_N = 500
-"""Least number of samples in a record before a change, in which the device learns the plant."""
+LEAD_N = 1000
+"""Least number of samples in a record before a change: the warm-up of the default device, and some periods."""
 
 _AFTER_N = 0.05
 """Delay of a scheduled pot change after its sample, in samples."""

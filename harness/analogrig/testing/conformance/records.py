@@ -19,7 +19,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.run import Channel
 from analogrig.scenario import PotChange, Scenario
 
-SAMPLES_N, CHANGE_AT, BLOCK_N = 360, 240, 97
+SAMPLES_N, CHANGE_AT, BLOCK_N = 800, 640, 97
 """Samples of a record, sample of its change, and usual length of a block: a prime, so that none fits a buffer."""
 
 _ARRAYS = ("flags", "theta", "innovation", "statistic")
@@ -37,7 +37,7 @@ class Stimulus:
 
     @classmethod
     def of_plant(cls, seed: int) -> Self:
-        """Samples of the emulated computer, whose plant changes in the last third."""
+        """Samples of the emulated computer, whose plant changes in the last fifth, after the warm-up of most devices."""
         scenario = Scenario.load("healthy")
         changes = (PotChange(CHANGE_AT, mass_kg=60.0, stiffness_n_per_m=18_000.0),)
         scenario = dataclasses.replace(scenario, samples=SAMPLES_N, tweaks=changes)
