@@ -169,7 +169,9 @@ with socket.create_connection((host, int(port))) as connection:
 
 def test_instants_of_a_users_command_are_dated_in_real_time(tmp_path: Path) -> None:
     tweaks = (Asked(4000, stiffness_n_per_m=18000.0), Asked(11_000, damping_n_s_per_m=2200.0))
-    scenario = dataclasses.replace(Scenario.load("thesis"), samples=16_000, tweaks=tweaks)
+    scenario = Scenario.load("thesis")
+    expect = dataclasses.replace(scenario.expect, false_alarms=1)  # at the ARL0 of the device one run of six has one
+    scenario = dataclasses.replace(scenario, samples=16_000, tweaks=tweaks, expect=expect)
     script = tmp_path / "turn.py"
     script.write_text(PROGRAM)
     with serving("--rig", "emulator-real", "--real-time") as instrument:

@@ -30,13 +30,16 @@ from tests.harness.runs import made_run
 FRONT, SOFT = Plant(115.0, 3021.0, 24500.0), Plant(115.0, 3021.0, 18000.0)
 SQUARE_N = np.where(np.arange(900) % 100 < 50, 2900.0, 30.0)
 
-RAMPED = """
-samples = 700
+CHANGE_AT = 700
+"""Beginning of the ramp: after the warm-up of the device."""
+
+RAMPED = f"""
+samples = 1100
 [excitation]
 low_v = 0.1
 high_v = 9.9
 [[tweaks]]
-sample = 300
+sample = {CHANGE_AT}
 stiffness_n_per_m = 18000.0
 ramp_n = 60
 """
@@ -115,11 +118,11 @@ def test_latency_of_a_ramp_counts_from_its_start(ramped: Path) -> None:
     verdict = judge(played(Scenario.load(str(ramped))))
     (tweak,) = verdict.tweaks
     assert verdict.outcome == "passed"
-    assert tweak.sample == 300
+    assert tweak.sample == CHANGE_AT
     assert tweak.bound_n is not None
     assert tweak.latency_n is not None
     assert 0.5 * tweak.bound_n < tweak.latency_n < 60
-    jump = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(300, stiffness_n_per_m=18000.0),))
+    jump = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(CHANGE_AT, stiffness_n_per_m=18000.0),))
     assert as_json(judge(played(jump)))["tweaks"][0]["bound"] < tweak.bound_n
 
 
@@ -151,7 +154,7 @@ def test_alarms_while_a_change_lasts_and_the_first_after_it_are_not_false() -> N
 def test_ramp_is_in_the_recording(ramped: Path, tmp_path: Path) -> None:
     run = played(Scenario.load(str(ramped)))
     run.save(tmp_path / "run.npz")
-    assert Run.load(tmp_path / "run.npz").conditions.segments[1] == Segment(300, SOFT, 60)
+    assert Run.load(tmp_path / "run.npz").conditions.segments[1] == Segment(CHANGE_AT, SOFT, 60)
     assert RecordingRig.open(tmp_path / "run.npz").scenario().tweaks[0].ramp_n == 60
     assert judge(Run.load(tmp_path / "run.npz")) == judge(run)
 
@@ -196,19 +199,19 @@ def test_plant_of_the_truth_follows_the_emulated_machine_through_a_ramp(
     ramped: Path, given: dict[str, float], limit_lsb: float
 ) -> None:
     """1/M, B and K change evenly in the harness, dials in the machine, which the load of the pots tells apart."""
-    scenario = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(300, ramp_n=60, **given),))
+    scenario = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(CHANGE_AT, ramp_n=60, **given),))
     after = dataclasses.replace(FRONT, **given)
     with open_rig("emulator-ideal") as rig:
         volts = np.concatenate([block.volts for block in rig.perform(scenario, 1).blocks])
-    state, plants = (0.0, 0.0), [FRONT] * 300
+    state, plants = (0.0, 0.0), [FRONT] * CHANGE_AT
     plants += [FRONT.interpolate(after, (k + 0.5) / 60) for k in range(60)] + [after] * 340
     seen = []
     for plant, force_v in zip(plants, volts[:, 0], strict=True):
         seen.append(state[0] / 0.01996)
         state = SampledPlant.from_plant(plant, 0.01).next(state, force_v * 294.0)
     error_lsb = np.abs(np.array(seen) - volts[:, 1]) / (10.0 / 4096)
-    assert error_lsb[:300].max() < 0.01
-    assert error_lsb[300:].max() < limit_lsb
+    assert error_lsb[:CHANGE_AT].max() < 0.01
+    assert error_lsb[CHANGE_AT:].max() < limit_lsb
 
 
 def test_deck_of_a_ramp_plays_what_the_rig_plays(ramped: Path) -> None:
@@ -219,7 +222,7 @@ def test_deck_of_a_ramp_plays_what_the_rig_plays(ramped: Path) -> None:
         deck = netlist(rig, scenario, 1)
         volts = np.concatenate([block.volts for block in rig.perform(scenario, 1).blocks])
     assert np.abs(deck.volts(["u5"])[:, 0] - volts[:, 1]).max() < 2.0 * 10.0 / 4096
-    assert deck.turns[-1][0] == 360
+    assert deck.turns[-1][0] == CHANGE_AT + 60
 
 
 @pytest.mark.parametrize(
@@ -229,7 +232,7 @@ def test_deck_of_a_ramp_plays_what_the_rig_plays(ramped: Path) -> None:
             (PotChange(300, mass_kg=60.0, ramp_n=60), PotChange(350, mass_kg=70.0)),
             "at sample 300 lasts 60 samples, beyond",
         ),
-        ((PotChange(699, mass_kg=60.0), PotChange(700, mass_kg=70.0)), "beyond the last of 700 samples"),
+        ((PotChange(1099, mass_kg=60.0), PotChange(1100, mass_kg=70.0)), "beyond the last of 1100 samples"),
     ],
 )
 def test_ramps_that_cannot_be_are_refused(ramped: Path, tweaks: tuple[PotChange, ...], message: str) -> None:
