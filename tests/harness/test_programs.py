@@ -255,5 +255,5 @@ def test_wiper_noise_is_off_until_the_rig_asks_for_it(ramped: Path, tmp_path: Pa
             codes[name] = np.concatenate([b.codes for b in rig.perform(Scenario.load(str(ramped)), 1).blocks])
     silent, noisy = codes.values()
     moved = np.abs(silent.astype(int) - noisy.astype(int)).max(axis=1)
-    assert moved[:301].max() == 0
-    assert moved[301:360].max() > 0
+    assert moved[: CHANGE_AT + 1].max() == 0
+    assert moved[CHANGE_AT + 1 : CHANGE_AT + 60].max() > 0
