@@ -85,7 +85,7 @@ EST_ROBUST_SHARED void est_edges_shares(est_edges_t* const          self,
     if (edge_age_n < ((uint32_t)shape.nb + shape.nk)) {
         const float* const delta = &self->theta[shape.na];
         float              rest[EST_NB_MAX];
-        const float* const others = est_delta_to_plain(&delta[1], delta[0], (uint_fast8_t)(shape.nb - 1U), rest);
+        const float* const others = est_delta_to_plain(&delta[1], delta[0], (uint8_t)(shape.nb - 1U), rest);
         EST_UNROLL
         for (uint_fast8_t j = 0U; j < shape.nb; j++) {
             const uint_fast8_t lag = (uint_fast8_t)(shape.nk + j);

@@ -193,7 +193,7 @@ def test_every_field_of_a_configuration_has_a_comment_with_its_unit_or_range() -
 @pytest.mark.parametrize(
     ("processor", "level", "most"),
     [
-        *((processor, level, 400) for processor in stack.BUILDS for level in ("-Os", "-O2", "-O3")),
+        *((processor, level, 440) for processor in stack.BUILDS for level in ("-Os", "-O2", "-O3")),
         (stack.CORTEX_M4F, "-O0", 4000),
         (stack.CORTEX_M0, "-O0", 4000),
         (stack.AVR, "-O0", 2600),
