@@ -324,7 +324,7 @@ def test_folder_of_scenarios_is_a_suite(user: pytest.Pytester) -> None:
     folder = user.mkdir("suite")
     (folder / "good.toml").write_text(SHORT.format(head="seed = 5", expect=""))
     (folder / "impatient.toml").write_text(
-        SHORT.format(head='rig = "rig.toml"', expect="late_slack_n = 0\nlate_information_ratio = 1.0")
+        SHORT.format(head='seed = 4\nrig = "rig.toml"', expect="late_slack_n = 0\nlate_information_ratio = 1.0")
     )
     shipped = Path(__file__).parents[2] / "fixtures" / "rigs" / "emulator-0-10v.toml"
     (folder / "rig.toml").write_text(shipped.read_text())
@@ -446,7 +446,9 @@ def again(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
 
 
 def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(user: pytest.Pytester) -> None:
-    user.path.joinpath("deafer.toml").write_text('kind = "inproc"\n[estimator]\nnoise_variance = 400.0\n')
+    user.path.joinpath("deafer.toml").write_text(
+        'kind = "inproc"\n[estimator]\nnoise_variance = 400.0\nnoise_estimated = false\n'
+    )
     user.makepyfile(DETECTS_SOON.format(within=1.5))
     first = run(user, "--hil-dut", "deafer.toml")
     first.assert_outcomes(failed=1)
