@@ -37,7 +37,7 @@ class Stimulus:
 
     @classmethod
     def of_plant(cls, seed: int) -> Self:
-        """Samples of the emulated computer, whose plant changes in the last fifth, after the warm-up of most devices."""
+        """Samples of the emulated computer, whose plant changes after the warm-up of most devices."""
         scenario = Scenario.load("healthy")
         changes = (PotChange(CHANGE_AT, mass_kg=60.0, stiffness_n_per_m=18_000.0),)
         scenario = dataclasses.replace(scenario, samples=SAMPLES_N, tweaks=changes)
