@@ -90,6 +90,13 @@ def test_broad_peak_of_the_spectrum_is_no_hum(estimator: Estimator) -> None:
     assert final(steps.judged(estimator)) != "hum"
 
 
+def test_line_that_is_elsewhere_in_the_next_block_is_noise(estimator: Estimator) -> None:
+    steps = Steps()
+    line = np.where(steps.at < SETTLING_N + PERIOD_N, 5.5, 10.3)
+    steps.innovation += 1.2 * np.sin(2.0 * np.pi * line / BLOCK_N * steps.at)
+    assert final(steps.judged(estimator)) == "noise"
+
+
 def test_force_that_steps_all_the_time_has_no_edges_to_judge(estimator: Estimator) -> None:
     steps = Steps()
     steps.u = 4000.0 * steps.rng.integers(0, 2, N)
