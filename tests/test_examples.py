@@ -22,7 +22,7 @@ EXAMPLES = CHECKOUT / "harness" / "examples"
 LIBRARY_PAGE = CHECKOUT / "harness/docs/howto/test-a-c-library.md"
 BIN = Path(sys.executable).parent
 PORT_OF_THE_EXAMPLES = "5000"
-THESIS_7 = "9465dc32dad9bba0"
+THESIS_7 = "54f04f72e4f6d22a"
 """First digits of the theta hash of the scenario thesis, seed 7."""
 GROUP_OF_THE_EXAMPLES = "239.74.163.2"
 

@@ -33,7 +33,7 @@ from analogrig.scenario import Scenario
 from analogrig.testing.counterexample import Counterexample
 from tests.harness.scripted_ecu import DBC, Answer, ScriptedEcu, write
 
-THESIS_HASH = "9465dc32dad9bba0"
+THESIS_HASH = "54f04f72e4f6d22a"
 SEED = 7
 MISSING = 0x01
 SHORT = dataclasses.replace(Scenario.load("healthy"), samples=12)

@@ -28,7 +28,7 @@ from tests.harness.fed import catalogue
 from tests.harness.processes import LONG_S
 
 QUESTION = encode(pack(Identify(1)))
-THESIS_HASH = "9465dc32dad9bba0"
+THESIS_HASH = "54f04f72e4f6d22a"
 """First digits of the theta_hash of the scenario thesis with the seed 7, on any device."""
 
 

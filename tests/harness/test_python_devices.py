@@ -28,7 +28,7 @@ from analogrig.run import UNARMED, UNREPORTED
 from analogrig.scenario import Scenario
 
 ESTIMATORS = "tests.harness.python_estimators"
-THESIS_HASH, HEALTHY_HASH = "9465dc32dad9bba0", "7cfdea2e26d7eb6a"
+THESIS_HASH, HEALTHY_HASH = "54f04f72e4f6d22a", "50312902f3570e68"
 
 pytestmark = pytest.mark.usefixtures("_own_path")
 
