@@ -90,9 +90,10 @@ def test_broad_peak_of_the_spectrum_is_no_hum(estimator: Estimator) -> None:
     assert final(steps.judged(estimator)) != "hum"
 
 
-def test_line_that_is_elsewhere_in_the_next_block_is_noise(estimator: Estimator) -> None:
+@pytest.mark.parametrize("lines", [(5.5, 10.3), (10.3, 5.5)])
+def test_line_that_is_elsewhere_in_the_next_block_is_noise(estimator: Estimator, lines: tuple[float, float]) -> None:
     steps = Steps()
-    line = np.where(steps.at < SETTLING_N + PERIOD_N, 5.5, 10.3)
+    line = np.where(steps.at < SETTLING_N + PERIOD_N, *lines)
     steps.innovation += 1.2 * np.sin(2.0 * np.pi * line / BLOCK_N * steps.at)
     assert final(steps.judged(estimator)) == "noise"
 
@@ -241,6 +242,13 @@ def test_healthy_plants_raise_no_misfit(estimator: Estimator) -> None:
     for excitation in (Excitation(), Excitation(on_samples=False, drift_ppm=20.0), Excitation(part_of_range=0.25)):
         played = simulate((FRONT, FRONT), np.full(10, 5000), excitation, 5000, seed=3)
         assert not estimator.watch_fit(played.u, played.y).cause.any()
+
+
+def test_edges_in_quick_succession_are_no_misfit(estimator: Estimator) -> None:
+    """Edges are always in doubt, so that nothing is known of the regions."""
+    assert estimator.init()
+    played = simulate((FRONT, FRONT), np.full(10, 5000), Excitation(half_period_n=10.0), 5000, seed=3)
+    assert not estimator.watch_fit(played.u, played.y).cause.any()
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
