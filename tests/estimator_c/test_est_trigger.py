@@ -319,6 +319,17 @@ def test_edges_anywhere_between_the_samples_raise_no_alarm(estimator: Estimator,
     assert alarms[LOCKED] > 60, "without it hardly an edge passes for what it is"
 
 
+@pytest.mark.parametrize("noise_estimated", [0, 1])
+def test_edges_that_are_never_where_the_last_one_was_are_edges_anywhere(
+    estimator: Estimator, noise_estimated: int
+) -> None:
+    """With MAY_SLIP: the innovations after several edges show it."""
+    u, y = suspension([(0, FRONT)], np.arange(10.3, 4000.0, 33.37), 4000, 1.0, 1)
+    assert estimator.init(noise_estimated=noise_estimated)
+    alarms = estimator.run(u, y).alarms
+    assert (alarms < 1000).all()
+
+
 def test_missing_samples_do_not_move_the_statistic(estimator: Estimator) -> None:
     u, y = suspension([(0, FRONT)], np.arange(10.0, 600.0, 50.0), 600, 1.0, 2)
     valid = np.ones(600)
