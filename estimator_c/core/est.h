@@ -405,7 +405,7 @@ typedef struct {
     float   sum;     ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
     float   share;   ///< share of this block in the noise variance
     float   inflation;  ///< factor for what the model does not explain
-    float   credit;     ///< alarms that may be justified
+    float   credit;     ///< alarms that may be justified without being plain
     uint8_t left_n;     ///< equations left in this block; 0: it is complete, or an alarm is on trial
     bool    followed;   ///< the noise variance contains this block
     uint8_t trial_n;    ///< equations since the alarm on trial; 0: none is

@@ -46,8 +46,12 @@
 /// An alarm is justified if the squared errors of the old estimate exceed those of the new one by this factor.
 #define EST_JUSTIFIED 4.0F
 
-/// Number of alarms that may be justified in close succession, and its increase per block: one per 5,000 equations. A
-/// plant whose equations fit it only for a while justifies every alarm.
+/// A justified alarm is plain if the squared errors of the old estimate exceed 64 expected variances on average.
+#define EST_PLAIN (64.0F * (float)(EST_TRIAL_N - EST_TRIAL_BEGIN_N) * EST_CUSUM_GAIN)
+
+/// Number of alarms that may be justified in close succession without being plain, and its increase per block: one per
+/// 5,000 equations. A plant whose equations fit it only for a while justifies every alarm, but its squared errors stay
+/// comparable to the scale.
 #define EST_CREDIT_MAX 4.0F
 #define EST_CREDIT_PER_BLOCK ((float)EST_BLOCK_N / 5000.0F)
 
@@ -118,9 +122,10 @@ static inline void est_scale_begin_trial(est_scale_t* const self) {
 
 /// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
 static inline void est_scale_conclude(est_scale_t* const self) {
-    const bool justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
-    if (justified && (self->credit >= 1.0F)) {
-        self->credit -= 1.0F;
+    const bool  justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
+    const float cost      = ((self->sum * self->weight) > EST_PLAIN) ? 0.0F : 1.0F;
+    if (justified && (self->credit >= cost)) {
+        self->credit -= cost;
     } else if (self->inflation < EST_INFLATION_MAX) {
         self->inflation *= EST_INFLATION_STEP;
     } else {

@@ -15,6 +15,8 @@ MARGIN, GROWTH_MAX = 2.0, 9.0
 INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 4.0, 0.9998933, 1e6
 TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
 JUSTIFIED, CREDIT_MAX, CREDIT_PER_BLOCK = 4.0, 4.0, BLOCK_N / 5000.0
+PLAIN = 64.0 * (TRIAL_N - TRIAL_BEGIN_N)
+"""Squared errors of the old estimate, in expected variances, beyond which a justified alarm is plain."""
 NOISE_LEAST = 0.07
 """Smallest noise variance that is followed, in configured ones."""
 
@@ -65,9 +67,11 @@ class ReferenceScale:
         """Judge the alarm on trial, if one is."""
         if not self._trial_n:
             return
-        self.is_doubtful |= abs(self._balance) < NEAR * self._energy
-        if self._trial_n > TRIAL_LEAST_N and self._balance > 0.0 and self._credit >= 1.0:
-            self._credit -= 1.0
+        excess = self._balance - PLAIN * self.expected
+        self.is_doubtful |= min(abs(self._balance), abs(excess)) < NEAR * self._energy
+        cost = 0.0 if excess > 0.0 else 1.0
+        if self._trial_n > TRIAL_LEAST_N and self._balance > 0.0 and self._credit >= cost:
+            self._credit -= cost
         elif self.inflation < INFLATION_MAX:
             self.inflation *= INFLATION_STEP
         self._trial_n = 0
