@@ -20,7 +20,17 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.scenario import PLANTS, PlantChoice, PotChange, Scenario
 from analogrig.testing.played import Played
-from analogrig.testing.strategies import DAMPING_RATIO, REACH, link_faults, random_suspensions, rigs, scenarios, seeds
+from analogrig.testing.strategies import (
+    DAMPING_RATIO,
+    REACH,
+    SETTLING_N,
+    WARM_UP_N,
+    link_faults,
+    random_suspensions,
+    rigs,
+    scenarios,
+    seeds,
+)
 from analogrig_emulator import Excitation
 from tests.harness.runs import made_run
 
@@ -75,7 +85,7 @@ def test_random_plants_are_those_that_the_device_is_held_to() -> None:
 @pytest.mark.parametrize(
     ("fails", "expected"),
     [
-        (lambda _: True, {"samples": 700, "tweaks": 1}),
+        (lambda _: True, {"samples": WARM_UP_N + SETTLING_N, "tweaks": 1}),
         (lambda scenario: len(scenario.tweaks) == 2, {"tweaks": 2}),
         (lambda scenario: any("mass_kg" in tweak.overrides() for tweak in scenario.tweaks), {"tweaks": 1}),
     ],
