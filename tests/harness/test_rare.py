@@ -90,7 +90,7 @@ def test_alarms_after_an_alarm_are_as_many_as_those_that_were_waited_for() -> No
 
 
 def test_rate_does_not_depend_on_how_loud_the_branches_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One false alarm in 16 million samples: the weights make up for every loudness."""
+    """One false alarm in 730,000 samples: the weights make up for every loudness."""
     rate, error = mean_rate(1e5, plays=16, branches=1000)
     monkeypatch.setattr(rare, "LOUDER", np.array([1.8, 2.3]))
     other, off = mean_rate(1e5, plays=16, branches=1000)
