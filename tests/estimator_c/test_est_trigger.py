@@ -169,6 +169,20 @@ def test_false_alarms_are_rarer_than_promised(estimator: Estimator) -> None:
     assert len(estimator.run(u, y).alarms) <= 260
 
 
+@pytest.mark.parametrize(("factor", "found"), [(0.9, (20, 20)), (0.988, (8, 16))])
+def test_only_changes_close_to_the_noise_inflate_the_scale(
+    estimator: Estimator, factor: float, found: tuple[int, int]
+) -> None:
+    """Twenty changes of the stiffness, one in 250 samples. Each of 1.2 % is an alarm that a misfit might raise too."""
+    onsets = range(1000, 6000, 250)
+    stiffnesses = [24500.0, 24500.0 * factor] * 10
+    changes = [(at, (115.0, 3021.0, k)) for at, k in zip(onsets, reversed(stiffnesses), strict=True)]
+    for seed in range(4):
+        u, y = suspension([(0, FRONT), *changes], np.arange(10.0, 6000.0, 50.0), 6000, 1.0, seed)
+        assert estimator.init()
+        assert found[0] <= len(estimator.run(u, y).alarms) <= found[1]
+
+
 @pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
 @pytest.mark.parametrize("seed", range(5))
 def test_edges_that_cross_a_sampling_instant_raise_no_alarm(estimator: Estimator, slip: int, seed: int) -> None:
