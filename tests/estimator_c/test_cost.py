@@ -66,7 +66,7 @@ BEYOND = {
     "M4F, n = 6, edges may slip, worst": 807,
     "M4F, n = 6, edges may slip, fixed, worst": 744,
     "M3, n = 4, edges locked, worst": 8417,
-    "M4F, code of the core at -Os, everything": 6328,
+    "M4F, code of the core at -Os, everything": 6368,
     "M4F, code of the core at -Os, trigger alone": 1574,
 }
 """What the core still misses, and may not exceed; a limit that it comes to keep must be taken off this list.
