@@ -516,7 +516,8 @@ class _Patcher:
         if coefficient < _LEAST_COEFFICIENT:
             raise ProgramError(
                 f"{what} has a coefficient of {coefficient:.2g}, below one winding of a pot ({_LEAST_COEFFICIENT:g}); "
-                f"delete the term, or lower the full scale of {stage.name}"
+                f"delete the term, lower the full scale of {stage.name}, "
+                "or let it move more in the trial (speed, period_s)"
             )
 
 

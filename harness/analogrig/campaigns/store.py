@@ -273,7 +273,8 @@ def _check_header(path: Path) -> None:
         raise RecordingError(f"{path}: {error.strerror or error}") from error
     found = [int.from_bytes(head[at : at + 4], "big") for at in (68, 60)]
     if not head.startswith(_MAGIC) or found[0] != APPLICATION:
-        raise NotAStoreError(f"{path}: not the results of a campaign")
+        cure = ": name the .sqlite file beside it" if path.suffix == ".json" else ""
+        raise NotAStoreError(f"{path}: not the results of a campaign{cure}")
     if found[1] != VERSION:
         raise NotAStoreError(f"{path}: results of another version of analogrig")
 

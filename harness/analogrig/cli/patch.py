@@ -38,6 +38,8 @@ def _patch(arguments: argparse.Namespace) -> int:
 
     if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
         raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
+    if arguments.drawing is not None and arguments.drawing == arguments.netlist:
+        raise ConfigurationError(f"{arguments.drawing}: named for the drawing and for the netlist: name two files")
     wanted = [path for path in (arguments.drawing, arguments.netlist) if path is not None]
     file = locate("programs", arguments.program)
     for path in wanted:

@@ -89,6 +89,7 @@ COLUMNS = (
     Column("missed", "missed", ",", lambda summary: summary.missed),
     Column("visible", "of", ",", lambda summary: summary.visible),
     Column("miss rate at most", "at most", ".2g", lambda summary: summary.miss_rate[1] if summary.visible else None),
+    Column("late", "late", ",", lambda summary: summary.late),
     Column("false alarms", "false al.", ",", lambda summary: summary.false_alarms),
     Column(
         "per sample at most",
@@ -208,8 +209,8 @@ def render(results: Results) -> str:
         heading=html.escape(f"Campaign {spec.name}: {results.outcome.upper()}"),
         sentence=html.escape(
             f"{scenario}: {total.trials:,} trials in {len(results.aggregates):,} cells, {total.samples:,} samples;"
-            f" {total.missed:,} of {total.visible:,} visible changes missed, {total.false_alarms:,} false alarms,"
-            f" {total.inconclusive:,} trials inconclusive."
+            f" {total.missed:,} of {total.visible:,} visible changes missed, {total.late:,} detected late,"
+            f" {total.false_alarms:,} false alarms, {total.inconclusive:,} trials inconclusive."
         ),
         maps=_maps(results) + _drawn_maps(results) + _distributions(results),
         table=_table(results),

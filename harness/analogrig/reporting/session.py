@@ -186,9 +186,8 @@ def render(session: RunList) -> str:
 
 def _table(runs: Sequence[Entry]) -> str:
     head = heading(
-        ("Started", "Run", "Scenario", "Rig", "Device", "Build"),
+        ("Started", "Outcome", "Run", "Scenario", "Rig", "Device", "Build"),
         ("Seed", "Samples", "Changes", "Missed", "False alarms", "Latency / bound"),
-        ("Outcome",),
     )
     return table("In the order of their start; latency over bound of all detected changes", head, map(_row, runs))
 
@@ -202,11 +201,11 @@ def _row(run: Entry) -> str:
     return row(
         [
             cell(run.started[:19].replace("T", " "), "date"),
+            outcome,
             f'<th scope="row">{link}</th>',
             *map(cell, words),
             *(number(value, ",d") for value in numbers),
             number(run.ratio, ".2f"),
-            outcome,
         ]
     )
 
