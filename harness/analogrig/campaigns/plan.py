@@ -303,7 +303,10 @@ def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -
     before = vars(plant.plant())
     changed = {_CHANGES[axis]: factor * before[_CHANGES[axis]] for axis, factor in values.items() if axis in _CHANGES}
     tweaks = (*base.tweaks, PotChange(spec.change_at, **changed)) if changed else base.tweaks
-    return dataclasses.replace(base, plant=plant, tweaks=tweaks)
+    expect = base.expect
+    if spec.false_alarms is not None:
+        expect = dataclasses.replace(expect, false_alarms=spec.false_alarms)
+    return dataclasses.replace(base, plant=plant, tweaks=tweaks, expect=expect)
 
 
 def _text(values: Mapping[str, float]) -> str:
