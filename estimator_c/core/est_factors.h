@@ -46,9 +46,7 @@ static inline void est_factors_reset(est_factors_t* const self, const est_config
     for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
         self->d[j] = EST_VARIANCE_MAX;
     }
-    for (uint_fast16_t i = 0U; i < EST_UPPER_N; i++) {
-        self->upper[i] = 0.0F;
-    }
+    clear(self->upper, EST_UPPER_N);
     est_factors_inflate(self, config, 1.0F);  // limits each d to its prior
 }
 
