@@ -117,7 +117,7 @@ EST_ROBUST_SHARED void shift(float* const x, const uint_fast8_t n, const float n
 
 static void shift_u(est_t* const self, const float newest) { shift(self->u, EST_INPUTS_KEPT, newest); }
 
-static void shift_y(est_t* const self, const float newest) { shift(self->y, EST_NA_MAX + 1U, newest); }
+static void shift_y(est_t* const self, const float newest) { shift(self->y, EST_NA_MAX, newest); }
 
 /// Number of samples before its own that an equation needs.
 static inline uint8_t count_past(const est_config_t* const config) {
@@ -388,14 +388,12 @@ static bool can_bridge(const est_t* const self) {
 #endif
 }
 
-/// Enter u(k) and y(k). Return EST_GATHERING while the equation of this sample needs unknown samples.
-static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
-    float u = sample.u;
-    float y = sample.y;
-    subtract_reference(self, &u, &y);
+/// Subtract the references and enter u(k). Return EST_GATHERING while the equation of this sample needs unknown samples.
+static est_status_t enter_input(est_t* const self, float u, float* const y) {
+    subtract_reference(self, &u, y);
     shift_u(self, u);
     const bool edge = EST_KNOWS_EDGES && est_edges_is_edge(self->config, self->u) && self->known;
-    if (EST_WITH_WATCH && is_stuck(self, y, edge)) {
+    if (EST_WITH_WATCH && is_stuck(self, *y, edge)) {
         increment(&self->counters.stuck);
         return EST_REFUSED;  // MISRA D4
     }
@@ -412,21 +410,22 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     self->bridged_n = 0U;
 #endif
     increment_long(&self->counters.updated);
-    shift_y(self, y);
     if (self->pending_n > 0U) {
         gather(self);
+        shift_y(self, *y);
         return EST_GATHERING;  // MISRA D4
     }
     return EST_UPDATED;
 }
 
-/// Classify the sample, and enter it if it is good.
-static est_status_t examine(est_t* const self, const est_sample_t sample) {
+/// Classify the sample, and enter its u if it is good. `y`: that of its equation.
+static est_status_t examine(est_t* const self, const est_sample_t sample, float* const y) {
     if (!sample.valid) {
         return EST_MISSING;  // MISRA D4
     }
     if (in_range(self->config, sample.u) && in_range(self->config, sample.y)) {
-        return enter_input(self, sample);  // MISRA D4
+        *y = sample.y;
+        return enter_input(self, sample.u, y);  // MISRA D4
     }
     if (EST_WITH_WATCH && is_plausible(sample.u) && is_plausible(sample.y)) {
         increment(&self->counters.saturated);
@@ -583,7 +582,7 @@ EST_SHARED void note_slip(est_t* const self) {
 }
 
 /// Enter a sample that is not good. Return true iff its y is to be predicted; its u is taken for the last one.
-static bool enter_gap(est_t* const self, const est_status_t status) {
+static bool enter_gap(est_t* const self, const est_status_t status, float* const y) {
     if (status == EST_REFUSED) {
         increment(&self->counters.refused);
     } else {
@@ -603,10 +602,12 @@ static bool enter_gap(est_t* const self, const est_status_t status) {
     if (bridged && self->known) {
         self->bridged_n++;
         shift_u(self, self->u[0]);
-        shift_y(self, self->y[0]);
+        *y = self->y[0];
         increment(&self->edge_age_n);
         return true;  // MISRA D4
     }
+#else
+    (void)y;
 #endif
     forget_samples(self);
     return false;
@@ -714,7 +715,7 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     self->y[0] -= innovation;
 }
 
-EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, est_step_t* const step) {
+EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     est_equation_t            equation;
     float                     weight_min;
@@ -728,7 +729,8 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, est_s
     if (self->factors.weight < weight_min) {
         limit_factors(self, shape);
     }
-    est_equation_fill(self, shape, equation.x);
+    est_equation_fill(self, shape, y, equation.x);
+    shift_y(self, y);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
     if (EST_WITH_ROBUSTNESS && (step->status != EST_UPDATED)) {
         bridge(self, shape, equation.innovation);
@@ -770,22 +772,22 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, est_s
 
 /// Enter the equation with code specialised for the two usual shapes. Omitted where the shape is fixed or room is
 /// scarce.
-static void dispatch_equation(est_t* const self, est_step_t* const step) {
+static void dispatch_equation(est_t* const self, const float y, est_step_t* const step) {
     const est_shape_t shape = est_shape_of(self->config);
 #if !defined(EST_FIXED_NA) && !EST_FOR_SIZE && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) && (EST_NK_MAX >= 1U) &&       \
     (EST_THETA_MAX >= 6U)
     const est_shape_t locked       = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
     const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = 1U };
     if (same_shape(shape, free_running)) {
-        enter_equation(self, free_running, step);
+        enter_equation(self, free_running, y, step);
         return;  // MISRA D4
     }
     if (same_shape(shape, locked)) {
-        enter_equation(self, locked, step);
+        enter_equation(self, locked, y, step);
         return;  // MISRA D4
     }
 #endif
-    enter_equation(self, shape, step);
+    enter_equation(self, shape, y, step);
 }
 
 // ---------------------------------------------          API           ---------------------------------------------
@@ -821,11 +823,12 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
-    est_step_t step    = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
+    float      y       = 0.0F;
+    est_step_t step    = { .status = examine(self, sample, &y), .alarm = false, .innovation = 0.0F };
     step.statistic     = self->trigger.statistic;
     const bool updated = step.status == EST_UPDATED;
-    if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status))) {
-        dispatch_equation(self, &step);
+    if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status, &y))) {
+        dispatch_equation(self, y, &step);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);
     return step;

@@ -62,10 +62,7 @@ est_edges_begin(est_edges_t* const self, const est_config_t* const config, const
         self->early.x[i] = ((i == 0U) || EST_WITH_ROBUSTNESS) ? before : 0.0F;  // its differences are equal to it
         self->late.x[i]  = 0.0F;
     }
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
-        self->theta[i] = theta[i];
-    }
+    (void)append(self->theta, theta, EST_THETA_MAX);
 }
 
 /// Shares of early and of late edges in an equation, whitened.

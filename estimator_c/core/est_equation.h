@@ -17,9 +17,10 @@ typedef struct {
 } est_equation_t;
 
 /// Fill x from the stored samples.
-EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, float* const x) {
-    const bool   delta = est_delta_applies(self->config);
-    float* const inputs = append(x, self->y, (uint_fast8_t)(shape.na + 1U));
+EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const x) {
+    const bool   delta  = est_delta_applies(self->config);
+    float* const inputs = append(&x[1], self->y, shape.na);
+    x[0]                = y;
     if (delta) {
         est_delta_difference(x, shape.na);
     }
