@@ -302,6 +302,7 @@ EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
 static float last_innovation(const est_t* const self) {
     const uint_fast8_t count = est_theta_count(self);
     float              out   = self->whitener.past[0].x[0];
+    EST_UNROLL
     for (uint_fast8_t i = 0U; i < count; i++) {
         out -= self->whitener.past[i + 1U].x[0] * self->theta[i];
     }

@@ -32,7 +32,7 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
     for (uint_fast8_t j = 0U; j < count; j++) {
         const float d     = self->d[j] * scale;
         const float prior = est_is_offset(shape, j) ? p0_offset : p0;
-        self->d[j]        = (d < prior) ? d : prior;
+        self->d[j]        = est_min(d, prior);
     }
 }
 

@@ -92,20 +92,16 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
 static inline float
 est_scale_follow(est_scale_t* const self, const float noise_variance, const float least, const float share_least) {
     const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
-    const float most    = EST_GROWTH_MAX * noise_variance;
-    const float limited = (mean < most) ? mean : most;
+    const float limited = est_min(mean, EST_GROWTH_MAX * noise_variance);
     const float noise   = noise_variance + (self->share * (limited - noise_variance));
-    const float share   = self->share / (1.0F + self->share);
-    self->share         = (share > share_least) ? share : share_least;
-    return (noise > least) ? noise : least;
+    self->share         = est_max(self->share / (1.0F + self->share), share_least);
+    return est_max(noise, least);
 }
 
 /// Let the inflation decrease, and the number of alarms that may be justified increase, by one block.
 static inline void est_scale_relax(est_scale_t* const self) {
-    const float inflation = self->inflation * EST_INFLATION_DECAY;
-    const float credit    = self->credit + EST_CREDIT_PER_BLOCK;
-    self->inflation       = (inflation > 1.0F) ? inflation : 1.0F;
-    self->credit          = (credit < EST_CREDIT_MAX) ? credit : EST_CREDIT_MAX;
+    self->inflation = est_max(self->inflation * EST_INFLATION_DECAY, 1.0F);
+    self->credit    = est_min(self->credit + EST_CREDIT_PER_BLOCK, EST_CREDIT_MAX);
 }
 
 /// Begin the trial of an alarm. The block restarts after it.

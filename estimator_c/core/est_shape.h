@@ -94,6 +94,12 @@ EST_SHARED void clear(float* const out, const uint_fast8_t n) {
     }
 }
 
+/// The smaller number; the second one if either is NaN.
+EST_SHARED float est_min(const float a, const float b) { return (a < b) ? a : b; }
+
+/// The larger number; the second one if either is NaN.
+EST_SHARED float est_max(const float a, const float b) { return (a > b) ? a : b; }
+
 /// Orders of the model.
 typedef struct {
     uint8_t na;
