@@ -86,7 +86,7 @@ static bool codes_valid(const est_config_t* const config) {
 }
 
 static bool needs_adaptation(const est_config_t* const config) {
-    return (config->nc > 0U) || (config->random_walk > 0.0F);
+    return (est_shape_of(config).nc > 0U) || (config->random_walk > 0.0F);
 }
 
 /// True iff this build supports the configuration.
@@ -462,9 +462,8 @@ EST_INLINE est_finding_t judge_readings(est_t* const                self,
                                         const est_shape_t           shape,
                                         const est_equation_t* const equation,
                                         const float                 weight) {
-    const float        e      = (self->doubt_n > 1U)
-                        ? est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape))
-                        : equation->innovation;  // theta has not changed yet
+    const float e = (self->doubt_n > 1U) ? est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape))
+                                         : equation->innovation;  // theta has not changed yet
     const est_shares_t shares = est_edges_shares(self, shape);
     watch_edges(self, e, shares.early - shares.late);
     return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - shares.early, e - shares.late,
@@ -615,10 +614,10 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
 }
 
 /// Update everything an equation determines besides theta.
-static void adapt(est_t* const self, const float* const x) {
+static void adapt(est_t* const self, const est_shape_t shape, const float* const x) {
     const est_config_t* const config = self->config;
     if (config->random_walk > 0.0F) {
-        est_factors_walk(&self->factors, config);
+        est_factors_walk(&self->factors, config->random_walk, est_shape_count(shape));
         est_factors_inflate(&self->factors, config, 1.0F);
     }
     store_residual(self, x);
@@ -739,7 +738,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION && self->adaptive) {
-        adapt(self, equation.x);
+        adapt(self, shape, equation.x);
     }
     const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
     const float weight = precision * weight_of(self);
@@ -864,15 +863,16 @@ void est_copy_theta(const est_t* const self, float* const out) {
 
 float est_variance(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
-    const est_shape_t shape                      = est_shape_of(self->config);
-    float             factor[EST_THETA_MAX + 1U] = { 0.0F };  // after that of y(k); MISRA D2
-    factor[index + 1U]                           = 1.0F;
+    const est_shape_t shape = est_shape_of(self->config);
+    float             factor[EST_THETA_MAX + 1U];  // 0 for the first coefficient of A, then those of theta
+    clear(factor, EST_THETA_MAX + 1U);
+    factor[index + 1U] = 1.0F;
     if (est_delta_applies(self->config)) {
         est_delta_difference(factor, shape.na);
         est_delta_difference(&factor[shape.na + 1U], (uint_fast8_t)(shape.nb - 1U));
     }
 #if EST_WITH_ROBUSTNESS
-    if (est_is_offset(shape, index)) {  // see copy_theta()
+    if (est_is_offset(shape, index)) {  // see compute_plain()
         factor[shape.na] += self->reference_y;
         factor[shape.na + shape.nb] -= self->reference_u;
     }

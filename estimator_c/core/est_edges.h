@@ -44,8 +44,8 @@ EST_INLINE void est_edges_compare(est_edges_t* const self, const float e, const 
 
 /// Conclude the comparison. Return true iff the edges are displaced again and again.
 static inline bool est_edges_displaced(est_edges_t* const self) {
-    const float whole  = self->span * self->energy;
-    const float part   = (whole > 0.0F) ? ((self->along * self->along) / whole) : 0.0F;
+    const float whole = self->span * self->energy;
+    const float part  = (whole > 0.0F) ? ((self->along * self->along) / whole) : 0.0F;
     self->misfit      = est_max(self->misfit + (part - EST_DISPLACED), 0.0F);
     return self->misfit > EST_DISPLACED_SUM;
 }

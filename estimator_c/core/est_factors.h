@@ -72,21 +72,22 @@ static inline void walk_row(est_factors_t* const self, const uint_fast8_t row, c
 
 /// P := P + random_walk I. The factors are those of Thornton's time update, "Triangular covariance factorizations for
 /// Kalman filtering" (1976). Rank-one updates compute them without work space.
-static inline void est_factors_walk(est_factors_t* const self, const est_config_t* const config) {
-    for (uint_fast8_t i = 0U; i < est_shape_count(est_shape_of(config)); i++) {
-        walk_row(self, i, config->random_walk * self->weight);
+static inline void est_factors_walk(est_factors_t* const self, const float random_walk, const uint_fast8_t count) {
+    const float variance = random_walk * self->weight;
+    for (uint_fast8_t i = 0U; i < count; i++) {
+        walk_row(self, i, variance);
     }
 }
 
 /// Variance of the sum of `factor` times the parameters.
 static inline float
 est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, const float* const factor) {
-    float out = 0.0F;
+    float        out    = 0.0F;
+    const float* column = self->upper;
     for (uint_fast8_t k = 0U; k < count; k++) {
-        const float* const column = &self->upper[(k * (k - 1U)) / 2U];
-        float              sum    = factor[k];
+        float sum = factor[k];
         for (uint_fast8_t i = 0U; i < k; i++) {
-            sum += column[i] * factor[i];
+            sum += *column++ * factor[i];  // MISRA D3
         }
         out += sum * sum * self->d[k];
     }

@@ -65,7 +65,7 @@
 
 /// Begin a block. The scale determines the weight of a squared innovation in the cumulative sum.
 EST_SHARED void est_scale_restart(est_scale_t* const self, const float noise_variance) {
-    self->weight = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
+    self->weight   = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
     self->sum      = 0.0F;
     self->left_n   = EST_BLOCK_N;
     self->followed = false;
