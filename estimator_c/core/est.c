@@ -172,9 +172,8 @@ EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float
     }
 }
 
-static void refresh_prefilter(est_t* const self) {
-    const uint_fast8_t na = est_shape_of(self->config).na;
-    float              a[EST_NA_MAX + 1U];
+EST_SHARED void refresh_prefilter(est_t* const self, const uint_fast8_t na) {
+    float a[EST_NA_MAX + 1U];
     contract_a(self, na, a);
     self->refresh_in = self->config->refresh_n;
     if (est_whitener_accepts(&a[1], na)) {
@@ -193,7 +192,7 @@ static void renew(est_t* const self) {
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
-        refresh_prefilter(self);
+        refresh_prefilter(self, est_shape_of(self->config).na);
     } else {
         // the last step left no work
     }
@@ -244,8 +243,8 @@ static void clear_theta(est_t* const self) {
     }
 }
 
-/// Subtract the reference from the codes. The first sample becomes the reference: the samples that follow are then small
-/// numbers, which float32 rounds less. Without an offset in the model, codes are what they are.
+/// Subtract the reference from the codes. The first sample becomes the reference: the samples that follow are then
+/// small numbers, which float32 rounds less. Without an offset in the model, codes are what they are.
 EST_INLINE void subtract_reference(est_t* const self, float* const u, float* const y) {
 #if EST_WITH_ROBUSTNESS
     if (est_shape_of(self->config).offset > 0U) {
@@ -389,7 +388,8 @@ static bool can_bridge(const est_t* const self) {
 #endif
 }
 
-/// Subtract the references and enter u(k). Return EST_GATHERING while the equation of this sample needs unknown samples.
+/// Subtract the reference and enter u(k). Return EST_GATHERING while the equation of this sample needs unknown
+/// samples.
 static est_status_t enter_input(est_t* const self, float u, float* const y) {
     subtract_reference(self, &u, y);
     shift_u(self, u);
@@ -524,7 +524,7 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
         compare_prefilter(self, shape);
     } else if (self->renewal == EST_RENEWAL_PREFILTER) {
         self->renewal = EST_RENEWAL_NONE;
-        refresh_prefilter(self);
+        refresh_prefilter(self, shape.na);
     } else if (remembers_edge(self)) {
         self->renewal = EST_RENEWAL_COMPARE;
     } else {
@@ -534,8 +534,8 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
 
-/// End the trial of an earlier alarm, and put a new one on trial unless theta has overflown: the present estimate is kept
-/// and compared with the next one.
+/// Put an alarm of the cumulative sum on trial, unless theta has overflown: the present estimate is kept and compared
+/// with the next one. An earlier trial ends.
 static void put_on_trial(est_t* const self, const bool overflown) {
 #if EST_WITH_ROBUSTNESS
     if (self->scale.trial_n > 0U) {
