@@ -173,10 +173,10 @@ EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float
 }
 
 EST_SHARED void refresh_prefilter(est_t* const self, const uint_fast8_t na) {
-    float a[EST_NA_MAX + 1U];
+    float a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
     contract_a(self, na, a);
     self->refresh_in = self->config->refresh_n;
-    if (est_whitener_accepts(&a[1], na)) {
+    if (est_whitener_accepts(&a[1], EST_NA_MAX)) {
         est_whitener_set(&self->whitener, &a[1], na);
         increment(&self->counters.refreshes);
     }

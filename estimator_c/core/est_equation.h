@@ -50,14 +50,22 @@ EST_SHARED float est_equation_residual(const float* const x, const float* const 
     return out;
 }
 
+/// Initialiser against false warnings: gcc does not see that each gain is written before it is read. Omitted in a
+/// build for size, where gcc would call memset().
+#if EST_FOR_SIZE
+#define EST_ZEROED
+#else
+#define EST_ZEROED = { 0.0F }
+#endif
+
 /// Whiten the equation in place and compute its innovation.
 EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     const est_shape_t     shape,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
     const uint_fast8_t count = est_shape_count(shape);
-    float* const       x     = equation->x;  // cppcheck F2
-    float              gain[EST_NA_MAX];
+    float* const       x     = equation->x;          // cppcheck F2
+    float              gain[EST_NA_MAX] EST_ZEROED;  // MISRA D2
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         gain[i] = est_filter_of(whitener)[i];
@@ -68,14 +76,6 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
     }
     equation->innovation = est_equation_residual(x, theta, count);
 }
-
-/// Initialiser against a false warning: gcc does not see that each gain is written before it is read. Omitted in a
-/// build for size, where gcc would call memset().
-#if EST_FOR_SIZE
-#define EST_ZEROED
-#else
-#define EST_ZEROED = { 0.0F }
-#endif
 
 /// Update theta and the covariance with one measurement: Bierman, "Factorization Methods for Discrete Sequential
 /// Estimation" (1977), section V.3. The forgetting factor of thesis Equ 3.21 divides the weight of P, and with it
