@@ -87,7 +87,7 @@ est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, 
     for (uint_fast8_t k = 0U; k < count; k++) {
         float sum = factor[k];
         for (uint_fast8_t i = 0U; i < k; i++) {
-            sum += *column++ * factor[i];  // MISRA D3
+            sum += *column++ * factor[i];
         }
         out += sum * sum * self->d[k];
     }
