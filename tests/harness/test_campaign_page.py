@@ -16,7 +16,7 @@ from analogrig.campaigns.rows import Row
 from analogrig.campaigns.spec import CampaignSpec, Draw, Grid
 from analogrig.campaigns.summary import Aggregate, Distribution
 from analogrig.campaigns.trials import Trials
-from analogrig.reporting.campaign import render, write_page
+from analogrig.reporting.campaign_page import render, write_page
 from tests.browser import Watched
 
 
