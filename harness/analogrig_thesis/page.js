@@ -34,7 +34,7 @@
       const values = curves.map((each) => columns[each.column].values);
       return {
         place: document.querySelector(`[data-figure="${number}"]`),
-        frame: ["div", "h4"],
+        frame: ["div", "p"],
         caption: title,
         name: `Fig. ${number}, ${title}`,
         key: number,

@@ -79,6 +79,7 @@ COLUMNS = (
     Column("bound", "bound", ".1f", lambda summary: summary.bound_n),
 )
 
+
 def text(results: Results) -> str:
     """Results as several lines of text, without a final newline."""
     spec, total = results.plan.spec, results.total

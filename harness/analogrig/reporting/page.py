@@ -11,6 +11,7 @@ from analogrig.reporting.payload import as_script, payload
 from analogrig.run import Run
 from analogrig.storage import replace_file
 
+
 def write_report(run: Run, verdict: Verdict, path: Path) -> None:
     """Write a run and its verdict as one HTML page without remote resources, atomically.
 

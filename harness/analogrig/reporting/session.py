@@ -72,8 +72,10 @@ class RunList:
     """Runs below a folder, in the order of their start."""
 
     runs: tuple[Entry, ...]
-    unread: tuple[str, ...]
-    """One line for each run that has not ended or failed before its first sample, and each file that is no verdict."""
+    unended: tuple[str, ...] = ()
+    """One line for each run that has not ended, or failed before its first sample."""
+    unread: tuple[str, ...] = ()
+    """One line for each file that is no verdict."""
 
     def count(self, outcome: str) -> int:
         """Number of runs with an outcome."""
@@ -89,28 +91,36 @@ def find_session(folder: Path, page: Path) -> RunList:
     if not folder.is_dir():
         raise ConfigurationError(f"{folder}: no such folder")
     runs: list[Entry] = []
+    unended: list[str] = []
     unread: list[str] = []
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(each for each in folders if not each.endswith(".previous"))  # of earlier commands
         if VERDICT_FILE not in files:
             continue
-        if len(runs) + len(unread) == MOST_RUNS:
+        if len(runs) + len(unended) + len(unread) == MOST_RUNS:
             raise ConfigurationError(f"{folder}: more than {MOST_RUNS:,} runs: name a folder within it")
         try:
             entry = _read(Path(parent), folder, page.parent)
+        except _NoResultError as error:
+            unended.append(str(error))
         except (ConfigurationError, RecordingError) as error:
             unread.append(str(error))
         else:
             runs += [entry] if entry else []
-    if not runs and not unread:
+    if not (runs or unended or unread):
         raise ConfigurationError(f"{folder}: holds no run: no {VERDICT_FILE} of analogrig run, replay or judge")
-    return RunList(tuple(sorted(runs, key=lambda run: (run.started, run.folder))), tuple(unread))
+    return RunList(tuple(sorted(runs, key=lambda run: (run.started, run.folder))), tuple(unended), tuple(unread))
+
+
+class _NoResultError(RecordingError):
+    """The verdict is that of a run without results."""
 
 
 def _read(parent: Path, folder: Path, start: Path) -> Entry | None:
     """Run in ``parent``; None if its verdict is that of another command, such as ``thesis``.
 
-    :raises ConfigurationError: the verdict cannot be read, is none, or is that of a run without results.
+    :raises ConfigurationError: the verdict cannot be read, or is none.
+    :raises _NoResultError: the run has no results.
     """
     path = parent / VERDICT_FILE
     try:
@@ -119,13 +129,13 @@ def _read(parent: Path, folder: Path, start: Path) -> Entry | None:
             raise ConfigurationError(f"{path}: not a verdict of this version: run analogrig judge again")
         if "scenario" not in table:
             if table["outcome"] == "inconclusive":
-                raise ConfigurationError(f"{path}: inconclusive: {', '.join(map(str, table['reasons']))}")
+                raise _NoResultError(f"{path}: inconclusive: {', '.join(map(str, table['reasons']))}")
             return None
         return _entry(table, parent, folder, start)
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror or error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError, ArithmeticError) as error:
-        raise ConfigurationError(f"{path}: not a verdict of analogrig: {type(error).__name__}") from error
+        raise ConfigurationError(f"{path}: not a verdict of analogrig: run the command again, or remove it") from error
 
 
 def _entry(table: Mapping[str, Any], parent: Path, folder: Path, start: Path) -> Entry:
@@ -166,8 +176,9 @@ def render(session: RunList) -> str:
     """The page as text."""
     counts = ", ".join(f"{session.count(outcome)} {outcome}" for outcome in _SIGNS)
     worst = next((outcome for outcome in ("failed", "inconclusive") if session.count(outcome)), "passed")
-    worst = "inconclusive" if worst == "passed" and session.unread else worst
-    unread = "".join(f"<li>{text(line)}</li>" for line in session.unread)
+    lines = (*session.unended, *session.unread)
+    worst = "inconclusive" if worst == "passed" and lines else worst
+    unread = "".join(f"<li>{text(line)}</li>" for line in lines)
     return assemble_page(
         FOLDER / "session.html",
         (TABLES,),
