@@ -206,9 +206,13 @@ class OutputFolder:
     def _stage_status(self, reason: str, identity: Mapping[str, Any]) -> None:
         shutil.rmtree(self.parts, ignore_errors=True)
         self.parts.mkdir()
-        texts = {"reason": reason, "command": self._command, "started": self._started}
-        escaped = {name: html.escape(text) for name, text in texts.items()}
-        page = assemble_page(_PAGE, title=f"INCONCLUSIVE: {escaped['command']}", **escaped)
+        page = assemble_page(
+            _PAGE,
+            title=html.escape(f"INCONCLUSIVE: {self._command}"),
+            reason=html.escape(reason),
+            command=html.escape(self._command),
+            started=html.escape(self._started),
+        )
         (self.parts / self.page.name).write_text(page, encoding="utf-8", errors="replace")
         self._write_verdict({"outcome": "inconclusive", "valid": False, "reasons": [reason], "identity": identity})
 

@@ -19,7 +19,7 @@ from analogrig.reporting.session import find_session, write_session
 from analogrig_emulator.effects import Effect
 from analogrig_emulator.machine.compiler import load_program
 from analogrig_emulator.machine.drawing import patch_drawing
-from tests.browser import Watched
+from tests.browser import VIEWS, Watched
 from tests.harness.reported import empty_run, reported_run, reported_verdict
 from tests.harness.test_campaign_page import drawn_results, results
 from tests.harness.test_session_page import VERDICT
@@ -113,8 +113,8 @@ def test_dark_map_has_no_white_square(browser: Browser, tmp_path: Path) -> None:
     path = tmp_path / "campaign.html"
     write_page(results(), path)
     watched = Watched(browser, path)
-    for scheme in ("light", "dark"):
-        watched.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+    for scheme, _ in VIEWS:
+        watched.page.emulate_media(color_scheme=scheme)
         contrasts = watched.page.evaluate(CONTRASTS)
         assert len(contrasts) == 12
         assert min(contrasts) >= 4.5

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -201,7 +200,7 @@ def _drawn_maps(results: Results) -> str:
         for low, high in found.axes.values()
     ]
     axes = (*map(_axis, found.axes), "")[:2]
-    keys = list(itertools.product(*[*names, [""]][:2]))
+    keys = [(name, other) for name in names[0] for other in (names[1] if len(names) > 1 else [""])]
     sections = []
     for quantity, sums, counts in zip(
         _MAPPED, (found.latency_n, found.missed), (found.detected, found.visible), strict=True
@@ -259,7 +258,7 @@ def _distributions(results: Results) -> str:
 
 def _histogram(caption: str, across: str, up: str, counts: Sequence[int], ends: tuple[str, str]) -> str:
     """Bars over an axis with the title ``across``, of which ``ends`` are the ends; ``up``: what is counted."""
-    most, step = max(max(counts), 1), _BARS_WIDTH / len(counts)
+    most, step = max(1, *counts), _BARS_WIDTH / len(counts)
     top = 22
     parts = [words(_BARS_LEFT, 12, up, is_faint=True)]
     for value in levels(most):

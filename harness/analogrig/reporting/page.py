@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from analogrig.judging.verdict import Verdict
-from analogrig.reporting import tables
 from analogrig.pages import FOLDER, PLOTS, assemble_page
+from analogrig.reporting import tables
 from analogrig.reporting.payload import as_script, payload
 from analogrig.run import Run
 from analogrig.storage import replace_file

@@ -230,7 +230,7 @@ def _trends(runs: Sequence[Entry]) -> str:
 
 
 def _trend(kind: tuple[str, str, str], runs: Sequence[Entry]) -> str:
-    """Plot of the delay in bounds over the runs, in the order of their start; ticks where the build or commit changes."""
+    """Plot of the delay in bounds over the runs, in the order of their start; ticks where build or commit change."""
     most = 1.1 * max([1.0, *(run.ratio for run in runs if run.ratio is not None)])
     step = (_WIDTH - _LEFT - 20) / max(1, len(runs) - 1)
     places = [(run, _LEFT + i * step, _TOP + _HEIGHT * (1.0 - (run.ratio or 0.0) / most)) for i, run in enumerate(runs)]
