@@ -59,7 +59,7 @@ def patch(folder: Path) -> Path:
 
 
 PICTURES: dict[str, tuple[Callable[[Path], Path], str, int]] = {
-    "report": (report, "main", 1500),
+    "report": (report, "main", 4000),
     "campaign": (campaign, "main", 900),
     "thesis": (thesis, "main", 1250),
     "patch": (patch, "svg", 1000),
