@@ -10,7 +10,7 @@ import pytest
 
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program
 from analogrig_emulator.machine.drawing import patch_drawing
-from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Block, Layout, Point, lay_out
+from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Box, PatchLayout, Point, lay_out
 from analogrig_emulator.machine.sheet import inverters
 
 PROGRAMS = Path(__file__).parents[2] / "fixtures" / "programs"
@@ -23,15 +23,15 @@ def program(request: pytest.FixtureRequest) -> PatchedProgram:
     return load_program(request.param)
 
 
-def blocks_of(program: PatchedProgram) -> list[Block]:
-    blocks = [Block(each.node, tuple(cord.node for cord in each.cords)) for each in program.patch]
-    blocks += [Block(each.name.lower(), (each.node,)) for each in inverters(program)]
+def blocks_of(program: PatchedProgram) -> list[Box]:
+    blocks = [Box(each.node, tuple(cord.node for cord in each.cords)) for each in program.patch]
+    blocks += [Box(each.name.lower(), (each.node,)) for each in inverters(program)]
     driven = {each.node for each in blocks}
     sources = dict.fromkeys(node for each in blocks for node in each.pins if node not in driven)
-    return [*map(Block, sources), *blocks]
+    return [*map(Box, sources), *blocks]
 
 
-def reached(layout: Layout, node: str, start: Point) -> set[Point]:
+def reached(layout: PatchLayout, node: str, start: Point) -> set[Point]:
     """Points that a wire joins, directly or over its other lines, with one of its ends."""
     lines, found = set(layout.wires[node].lines), {start}
     while more := {line for line in lines if any(touches(line, point) for point in found)}:

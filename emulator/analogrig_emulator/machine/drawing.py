@@ -12,7 +12,7 @@ from typing import NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
 from analogrig_emulator.machine.compiler import PatchedCord, PatchedElement, PatchedProgram
-from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Block, Point, Wire, lay_out
+from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Box, Point, WirePath, lay_out
 from analogrig_emulator.machine.sheet import Inverter, input_text, inverters, signed
 from analogrig_emulator.machine.stages import StageKind
 
@@ -72,7 +72,7 @@ def patch_drawing(program: PatchedProgram) -> str:
     """
     blocks = [*map(_element, program.patch), *map(_inverter, inverters(program))]
     blocks = [*_sources(program, blocks), *blocks]
-    layout = lay_out([Block(each.node, tuple(pin.node for pin in each.pins)) for each in blocks])
+    layout = lay_out([Box(each.node, tuple(pin.node for pin in each.pins)) for each in blocks])
     title = f"{program.name}: {program.equations.description}" if program.equations.description else program.name
     size = f'width="{layout.width:g}" height="{layout.height:g}"'
     view = f'viewBox="0 0 {layout.width:g} {layout.height:g}"'
@@ -120,7 +120,7 @@ def _sources(program: PatchedProgram, blocks: list[_Drawn]) -> list[_Drawn]:
     return [_Drawn("", node, names.get(node, "reference"), "input" if node in names else "source") for node in nodes]
 
 
-def _wire(node: str, wire: Wire) -> str:
+def _wire(node: str, wire: WirePath) -> str:
     path = "".join(f"M{start.x:g} {start.y:g}L{end.x:g} {end.y:g}" for start, end in wire.lines)
     joints = "".join(f'<circle class="joint" cx="{at.x:g}" cy="{at.y:g}" r="3"/>' for at in wire.joints)
     return f'<g class="net" data-node={quoteattr(node)}><path class="wire" d="{path}"/>{joints}</g>'

@@ -29,7 +29,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Block:
+class Box:
     """Block with its output node, and the nodes at its pins; one without pins is a source."""
 
     node: str
@@ -41,7 +41,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Wire:
+class WirePath:
     """Wire of a node: lines, and the points where three of them meet."""
 
     lines: tuple[tuple[Point, Point], ...]
@@ -49,16 +49,16 @@ class Wire:
 
 
 @dataclass(frozen=True)
-class Layout:
+class PatchLayout:
     """Places of the upper left corners of all blocks, in their order, and wires by node."""
 
     places: tuple[Point, ...]
-    wires: Mapping[str, Wire]
+    wires: Mapping[str, WirePath]
     width: float
     height: float
 
 
-def lay_out(blocks: Sequence[Block]) -> Layout:
+def lay_out(blocks: Sequence[Box]) -> PatchLayout:
     """Layout of blocks; every node at a pin is the output of one of them."""
     columns = _columns(blocks)
     users = _users(blocks)
@@ -92,10 +92,10 @@ def lay_out(blocks: Sequence[Block]) -> Layout:
             wires[block.node] = _wire(ends, {c: tracks[block.node, c] for c in ends}, lane)
     width = x + len(nets[-1]) * _TRACK + _MARGIN
     height = _TOP + highest + _MOST_COLUMNS * STAGGER + lanes * _LANE + _MARGIN
-    return Layout(tuple(places[i] for i in range(len(blocks))), wires, width, height)
+    return PatchLayout(tuple(places[i] for i in range(len(blocks))), wires, width, height)
 
 
-def _users(blocks: Sequence[Block]) -> dict[str, list[tuple[int, int]]]:
+def _users(blocks: Sequence[Box]) -> dict[str, list[tuple[int, int]]]:
     """Blocks and pins at which each node is used."""
     users: dict[str, list[tuple[int, int]]] = {}
     for i, block in enumerate(blocks):
@@ -105,7 +105,7 @@ def _users(blocks: Sequence[Block]) -> dict[str, list[tuple[int, int]]]:
 
 
 def _nets_of_channel(
-    blocks: Sequence[Block],
+    blocks: Sequence[Box],
     users: Mapping[str, Sequence[tuple[int, int]]],
     column_of: Mapping[int, int],
     channel: int,
@@ -118,7 +118,7 @@ def _nets_of_channel(
     ]
 
 
-def _columns(blocks: Sequence[Block]) -> list[list[int]]:
+def _columns(blocks: Sequence[Box]) -> list[list[int]]:
     """Blocks by column: each right of the blocks that feed it, loops cut where a search first closes them."""
     producer = {block.node: i for i, block in enumerate(blocks)}
     feeds = [[producer[node] for node in block.pins] for block in blocks]
@@ -177,7 +177,7 @@ def _ordered(columns: Sequence[Sequence[int]], feeds: Sequence[Sequence[int]]) -
     return out
 
 
-def _wire(ends: Mapping[int, Sequence[Point]], tracks: Mapping[int, float], lane: float | None) -> Wire:
+def _wire(ends: Mapping[int, Sequence[Point]], tracks: Mapping[int, float], lane: float | None) -> WirePath:
     """Wire from its ends by channel over a vertical track in each, and the lane that joins them."""
     lines: list[tuple[Point, Point]] = []
     joints: list[Point] = []
@@ -193,4 +193,4 @@ def _wire(ends: Mapping[int, Sequence[Point]], tracks: Mapping[int, float], lane
         across = sorted(tracks.values())
         lines.append((Point(across[0], lane), Point(across[-1], lane)))
         joints += [Point(x, lane) for x in across[1:-1]]
-    return Wire(tuple(lines), tuple(joints))
+    return WirePath(tuple(lines), tuple(joints))
