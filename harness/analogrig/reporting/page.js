@@ -210,6 +210,10 @@
     return plotOf(ink, caption, curves, estimateRange(found.of, known), [axis("left", `${name} [${unit}]`, 3, ink)]);
   }
 
+  function gainUnit(signals) {
+    return `${signals.displacement.unit}/${signals.force.unit}`;
+  }
+
   function innovation(signals, ink) {
     const caption = "Innovation: the measured displacement less the predicted one";
     const curves = [{ of: signals.innovation.values, label: "innovation", colour: "first", unit: "codes" }];
@@ -239,13 +243,18 @@
 
   function described(signals, ink) {
     return [
-      pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
+      pair(signals, ink, run.segments.length ? "Force on the suspension and its displacement" : "Input (force) and output (displacement)", "force", "displacement"),
       ...(signals.velocity && signals.net_force
         ? [pair(signals, ink, "Velocity and net force", "velocity", "net_force")] : []),
       ...(signals.M ? [ // otherwise the device reports no estimates
         estimate(signals, ink, "M", "Mass: estimate and truth", "kg"),
         estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
         estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),
+      ] : []),
+      ...(signals.resonance ? [ // of an unknown plant
+        estimate(signals, ink, "resonance", "Resonance of the estimate", "Hz"),
+        estimate(signals, ink, "damping", "Damping ratio of the estimate", "1"),
+        estimate(signals, ink, "gain", "Static gain of the estimate", gainUnit(signals)),
       ] : []),
       ...(signals.innovation ? [innovation(signals, ink)] : []),
       ...(signals.statistic ? [statistic(signals, ink)] : []),
