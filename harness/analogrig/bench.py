@@ -161,8 +161,11 @@ class Bench:
         real_time: float | None = None,
         time_limit_s: float | None = None,
         clock: Clock = time.monotonic,
+        builder: Callable[[int, Datasheet], RunBuilder] = RunBuilder,
     ) -> None:
         """Join ``rig`` and ``dut``.
+
+        ``builder`` makes the collector of each run; one that overrides ``add`` watches the run being played.
 
         ``time_limit_s`` is the longest duration of one play, on ``clock``. It bounds every wait for the device. The
         rig is not interrupted: the limit is checked after each of its blocks.
@@ -173,6 +176,7 @@ class Bench:
         self._real_time = real_time
         self._time_limit_s = math.inf if time_limit_s is None else time_limit_s
         self._clock = clock
+        self._builder = builder
         self._scenario: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def play(self, scenario: Scenario, seed: int) -> Run:
@@ -193,7 +197,7 @@ class Bench:
         self.dut.prepare(performance.channels, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
-        builder = RunBuilder(scenario.samples, self.dut.datasheet)
+        builder = self._builder(scenario.samples, self.dut.datasheet)
         faults = (*scenario.caveats, *self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
         conditions = self._final_conditions(initial, performance.hindsight(), faults, builder)
         return builder.build(conditions)

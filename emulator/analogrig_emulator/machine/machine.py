@@ -121,10 +121,8 @@ class AnalogComputer:
             raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
         # First: it rejects a circuit that is too large at once.
         self._nodals = {Mode.OPERATE: analyse(circuit)}
-        if missing := [node for node in readings if node not in circuit.nodes]:
-            raise CircuitError(f"readings: no node is called {missing[0]!r}; there are {', '.join(circuit.nodes)}")
         self._patched = circuit
-        self._readings = tuple(readings)
+        self.read_nodes(readings)
         self._patches = patches(circuit)
         self._initial_v = dict(initial_v or {})
         self._ic_ohm = ic_ohm
@@ -268,6 +266,18 @@ class AnalogComputer:
         self.turn({pot: high})
 
     # ---- operation
+
+    @property
+    def readings(self) -> int:
+        """Number of nodes that run() records."""
+        return len(self._readings)
+
+    def read_nodes(self, readings: Sequence[str]) -> None:
+        """Set the nodes that run() records, from the next restart() on. Raises CircuitError for an unknown node."""
+        if missing := [node for node in readings if node not in self._patched.nodes]:
+            there = ", ".join(self._patched.nodes)
+            raise CircuitError(f"readings: no node is called {missing[0]!r}; there are {there}")
+        self._readings = tuple(readings)
 
     def restart(
         self,

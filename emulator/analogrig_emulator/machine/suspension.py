@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TypeAlias
@@ -78,6 +78,8 @@ class SuspensionComputer:
         self._values = dict(self.program.values)
         self.machine.turn({pot: self._dial(pot, self._values) for pot in self._pots})
         self._plays = 0
+        self.probed: NDArray[np.float64] = np.empty((0, 0))
+        """Volts of the probed nodes in the last block of play_in_steps(): (samples, probes)."""
 
     @property
     def circuit(self) -> Circuit:
@@ -155,25 +157,48 @@ class SuspensionComputer:
         """Play like play(), with turns from plan()."""
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
+        lengths = (min(block_samples, samples - start) for start in range(0, samples, block_samples))
+        return self._begin(excitation, lengths, list(turns), ahead_ticks)
+
+    def play_in_steps(
+        self, excitation: Excitation, lengths: Iterable[int], probes: Sequence[str] = (), ahead_ticks: int = 0
+    ) -> Iterator[NDArray[np.float64]]:
+        """Play from rest like play(), in blocks of these lengths, each drawn when its block is requested.
+
+        Between two blocks set() turns the pots and machine.switch() the relays. probes: nodes to read as well, into
+        `probed`. The volts are those of play() to the bit. Raises ExcitationError, EngineError and CircuitError.
+        """
+        return self._begin(excitation, lengths, [], ahead_ticks, probes)
+
+    # ---- playing
+
+    def _begin(
+        self,
+        excitation: Excitation | RecordedExcitation,
+        lengths: Iterable[int],
+        turns: list[PotTurn],
+        ahead_ticks: int,
+        probes: Sequence[str] = (),
+    ) -> Iterator[NDArray[np.float64]]:
         drives: dict[str, Drive] = {}
         generator = None if isinstance(excitation, RecordedExcitation) else excitation
         if isinstance(excitation, RecordedExcitation):
             drives[SOURCE] = excitation.drive
         else:
             excitation.period_ticks(self.sample_rate_hz)
+        self.machine.read_nodes((*self.program.channel_nodes, *probes))
         self.machine.restart(Mode.OPERATE, ahead_ticks, drives)
         self._plays += 1
-        return self._blocks(self._plays, generator, samples, list(turns), block_samples)
-
-    # ---- playing
+        return self._blocks(self._plays, generator, lengths, turns)
 
     def _blocks(
-        self, play: int, excitation: Excitation | None, samples: int, turns: list[PotTurn], block_samples: int
+        self, play: int, excitation: Excitation | None, lengths: Iterable[int], turns: list[PotTurn]
     ) -> Iterator[NDArray[np.float64]]:
-        for start in range(0, samples, block_samples):
-            stop = min(start + block_samples, samples)
+        stop = 0
+        for length in lengths:
+            stop += length
             parts = []
-            window = self.machine.window(stop - start)
+            window = self.machine.window(length)
             edges = None if excitation is None else excitation.edges(*window, self.sample_rate_hz)
             while play == self._plays and self.machine.recorded < stop:
                 now = [turn for turn in turns if turn.sample < stop]
@@ -195,9 +220,14 @@ class SuspensionComputer:
         trains = {} if edges is None else {SOURCE: edges.within(*self.machine.window(samples))}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
-        by_instant = volts.reshape(samples, -1, len(self._signs))
-        by_instant *= self._signs
-        return volts
+        channels = len(self._signs)
+        readings = self.machine.readings
+        by_instant = volts.reshape(samples, volts.shape[1] // readings, readings)
+        by_instant[..., :channels] *= self._signs
+        if readings == channels:
+            return volts
+        self.probed = by_instant[:, 0, channels:]
+        return by_instant[..., :channels].reshape(samples, -1)
 
     # ---- pots
 

@@ -7,7 +7,7 @@ import dataclasses
 import enum
 import functools
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeGuard
 
@@ -300,6 +300,11 @@ class EmulatorRig(Rig):
     def description(self) -> Mapping[str, Any]:
         return self._table
 
+    @property
+    def card(self) -> Card:
+        """Card of the rig."""
+        return self._card
+
     def in_blocks(self, samples: int) -> EmulatorRig:
         """The same rig with blocks of at most ``samples`` samples. Only the speed differs.
 
@@ -353,6 +358,36 @@ class EmulatorRig(Rig):
             hindsight=lambda: Hindsight(
                 scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(self._card))
             ),
+        )
+
+    def perform_in_steps(
+        self,
+        set_up: SetUp,
+        seed: int,
+        lengths: Iterable[int],
+        probes: Sequence[str],
+        alter: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    ) -> Performance:
+        """Play a set-up without its changes, in blocks of these lengths, each drawn when its block is requested.
+
+        Between two blocks the caller operates ``set_up.computer``, whose ``probed`` has the volts of the nodes
+        ``probes``. ``alter`` changes the volts on their way to the card. The hindsight knows the lamps alone.
+
+        :raises ConfigurationError: the rig cannot be played in steps.
+        """
+        if self._description.computer.noise:
+            raise ConfigurationError(f"{self._description.name}: computer.noise: a play in steps has no such noise")
+        computer = set_up.computer
+        with emulator_errors():
+            machine = _SteppedMachine(computer, lengths, probes_per_sample(self._card), probes)
+            jitter = Stream.APERTURE.generator(seed)
+            volts = acquired(machine, self._card, set_up.excitation, 0, rng=jitter)
+        return Performance(
+            sample_period_s=1.0 / self._card.rate_hz,
+            time_scale=computer.scales.time,
+            channels=self._channels(computer),
+            blocks=_sample(map(alter, volts), self.sampler(Stream.CARD.generator(seed))),
+            hindsight=lambda: Hindsight((), _lit_lamps(computer.machine.lamps, probes_per_sample(self._card))),
         )
 
     def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
@@ -420,6 +455,32 @@ class EmulatorRig(Rig):
             )
             for i, name in enumerate(CHANNELS)
         }
+
+
+@dataclass(frozen=True)
+class _SteppedMachine:
+    """Computer that is played in steps, for ``acquired``."""
+
+    computer: SuspensionComputer
+    lengths: Iterable[int]
+    """Samples of the card in each block."""
+    probes_per_sample: int
+    nodes: Sequence[str]
+
+    @property
+    def sample_rate_hz(self) -> float:
+        return self.computer.sample_rate_hz
+
+    def play(
+        self,
+        excitation: Excitation,
+        samples: int,  # noqa: ARG002 - the lengths decide
+        changes: Sequence[PotTurn] = (),  # noqa: ARG002 - the caller makes them
+        block_samples: int = 0,  # noqa: ARG002
+        ahead_ticks: int = 0,
+    ) -> Iterator[NDArray[np.float64]]:
+        lengths = (length * self.probes_per_sample for length in self.lengths)
+        return self.computer.play_in_steps(excitation, lengths, self.nodes, ahead_ticks)
 
 
 def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:

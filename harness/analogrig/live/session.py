@@ -1,0 +1,571 @@
+"""Live session: a rig and a device that run while a hand operates them. Knows nothing of browsers.
+
+One thread calls ``run``, which plays one take after another through the bench. Any other thread passes commands and
+reads the ring and the state. Commands take effect between two blocks; the session knows the sample.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analogrig import config
+from analogrig.answers import Answers
+from analogrig.bench import Bench
+from analogrig.catalogue import Cause, Change
+from analogrig.devices.device import Device
+from analogrig.errors import AnalogrigError, ConfigurationError
+from analogrig.identity import Identity
+from analogrig.judging import information
+from analogrig.judging.verdict import DIAGNOSABLE
+from analogrig.live import commands
+from analogrig.live.clock import LiveClock, WallClock
+from analogrig.live.commands import Command
+from analogrig.live.desk import CHANGE_N, SteppedDesk, open_desk
+from analogrig.live.knobs import scenario_values
+from analogrig.live.ring import Ring
+from analogrig.live.take import MOST_RECORDED_N, Take, TakeBuilder
+from analogrig.plant import MAX_CHANGES, PARAMETERS, Segment, physical_parameters
+from analogrig.rigs.emulator import emulator_errors
+from analogrig.rigs.rig import Block, Performance, Rig
+from analogrig.run import Conditions, Run
+from analogrig.scenario import PotChange, Scenario
+from analogrig.storage import replace_file
+from analogrig_emulator import EmulatorError
+
+BLOCK_S = 0.0125
+"""Wall-clock length of a block: a hand is felt within two of them."""
+MOST_BLOCK_N = 1024
+LATE_S = 0.25
+"""Lag behind real time at which the session gives up the lost time."""
+MOST_WAITING = 256
+"""Commands that may wait for the next block."""
+
+_LEAD_N = 1500
+"""Samples before a change from which its bound is computed: the plant forgets its start in some hundred."""
+_BOUND_AFTER_N = (64, 256, 1024)
+"""Samples after a change at which its bound is looked for."""
+_MOST_NOTED = 50
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class NotedAlarm:
+    """Alarm of the device, with its latency."""
+
+    take: int
+    sample: int
+    what: str = ""
+    """Names of the changed parameters; empty: no change explains the alarm."""
+    change: int = 0
+    """Sample of the change."""
+    latency_n: int | None = None
+    bound_n: int | None = None
+    searched: int = 0
+    """Number of searches for the bound."""
+
+
+@dataclass(frozen=True)
+class Saved:
+    """Files of one recording."""
+
+    run: Path
+    scenario: Path
+    samples: int
+    alarms: int
+
+
+class Session:
+    """Rig, device, generator, pots and time of one bench, operated by commands."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        scenario: Scenario,
+        device: Device,
+        seed: int,
+        *,
+        folder: Path,
+        clock: LiveClock | None = None,
+        identity: Identity | None = None,
+    ) -> None:
+        """Prepare; nothing is played before ``run``.
+
+        :param folder: receives the recordings.
+        :raises ConfigurationError: the rig cannot be operated by hand, or cannot play the scenario.
+        """
+        self.desk = open_desk(rig, scenario, seed, self._lengths)
+        self.device = device
+        self.seed = seed
+        self.knobs = self.desk.knobs
+        self._folder = folder
+        self._identity = identity
+        self.clock = clock or WallClock()
+        self._lock = threading.Lock()
+        self._woken = threading.Event()
+        self._waiting: deque[tuple[Command, float]] = deque()
+        program = self.desk.computer.program
+        start = scenario_values(self.knobs, program.values) | self.desk.scenario.plant.overrides()
+        fields = {knob.field: name for name, knob in self.knobs.items() if knob.field}
+        self.values = dict(program.values) | {fields[name]: value for name, value in start.items()}
+        """Settings of the pots."""
+        self.excitation = self.desk.scenario.excitation
+        self.is_on = self.desk.is_stepped
+        """True while the generator is on."""
+        self.is_playing = True
+        self.factor = 1.0
+        """Wall-clock time per machine time."""
+        self.overruns_n = 0
+        """Samples by which the session has fallen behind real time."""
+        self.take_number = 0
+        self.take = Take(self.desk.scenario)
+        self.ring = Ring(len(self.desk.amplifiers), device.datasheet.theta_n)
+        self.alarms: deque[NotedAlarm] = deque(maxlen=_MOST_NOTED)
+        self.notices: deque[tuple[int, str]] = deque(maxlen=_MOST_NOTED)
+        self.saved: deque[Saved] = deque(maxlen=_MOST_NOTED)
+        self.felt_s: deque[float] = deque(maxlen=1000)
+        """Times from a turn of a pot to the first answered sample that feels it."""
+        self.diagnosis = ""
+        self.misfit = ""
+        self.counters: Mapping[str, int] = {}
+        self.speed_hz = 0.0
+        """Samples per second of wall-clock time, over the last second."""
+        self.missing_n = 0
+        self.is_recording = False
+        self.version = 0
+        """Number that grows with every change of the state, apart from samples."""
+        self._notice_numbers = itertools.count(1)
+        self._steps = 0
+        self._ends_take = False
+        self._is_closed = False
+        self._pace: tuple[float, int] | None = None
+        """Time and sample from which the pace is counted."""
+        self._speed_from = (0.0, 0)
+        self._turns: dict[str, float] = {}
+        self._ramp_n = 0
+        self._turned_at: list[float] = []
+        self._unfelt: list[tuple[int, float]] = []
+        self._taken = 0
+        """Samples of this take that the rig has been asked for."""
+
+    # ---- from other threads
+
+    def do(self, command: Command) -> None:
+        """Check a command, and let it take effect before the next block.
+
+        :raises ConfigurationError: it is not possible on this bench, or too many commands wait.
+        """
+        self._check(command)
+        with self._lock:
+            if len(self._waiting) >= MOST_WAITING:
+                raise ConfigurationError("too many commands at once: wait for the next block")
+            self._waiting.append((command, self.clock()))
+        self._woken.set()
+
+    def close(self) -> None:
+        """End ``run``; a recording under way is saved."""
+        self._is_closed = True
+        self._woken.set()
+
+    def notify(self, text: str) -> None:
+        """Add a line for people."""
+        self.notices.append((next(self._notice_numbers), text))
+        self.version += 1
+
+    def _check(self, command: Command) -> None:
+        match command:
+            case commands.Turn():
+                if command.name not in self.knobs:
+                    raise ConfigurationError(f"no pot is called {command.name!r}: there are {', '.join(self.knobs)}")
+                knob = self.knobs[command.name]
+                knob.check(command.value)
+                if self.is_recording and not knob.field:
+                    raise ConfigurationError(f"no scenario can change {knob.label}: end the recording first")
+            case commands.Generate():
+                self._refuse_while_recording("the generator")
+                excitation = self._generated(command)
+                self.desk.check(dataclasses.replace(self.desk.scenario, excitation=excitation))
+            case commands.Operate():
+                self._refuse_while_recording("the mode")
+            case commands.Inject() if command.fault not in self.desk.faults:
+                raise ConfigurationError(f"this rig has no fault {command.fault!r} to inject")
+        if not self.desk.is_stepped and isinstance(command, commands.Operate | commands.Step | commands.ClearLamps):
+            raise ConfigurationError("this rig plays whole records: it has no modes and no single step")
+
+    def _refuse_while_recording(self, what: str) -> None:
+        if self.is_recording:
+            raise ConfigurationError(f"{what} cannot change within a recording, which is one scenario: end it first")
+
+    def _generated(self, command: commands.Generate) -> Any:
+        """Excitation with the settings of a command.
+
+        :raises ConfigurationError: a value is out of range.
+        """
+        wanted = {key: value for key, value in dataclasses.asdict(command).items() if value is not None and key != "on"}
+        if wanted.get("shape", self.excitation.shape) != "pulse":
+            wanted["duty"] = 0.5
+        if "drift_ppm" in wanted:
+            wanted["clock"] = "free" if wanted["drift_ppm"] else "card"
+        with emulator_errors():
+            return dataclasses.replace(self.excitation, **wanted)
+
+    # ---- playing
+
+    def run(self) -> None:
+        """Play takes until ``close``."""
+        while not self._is_closed:
+            self._play_take()
+
+    def _play_take(self) -> None:
+        """Play from rest until something demands a new start."""
+        self._begin_take()
+        keeps = self.take.is_recorded
+        bench = Bench(self.desk, self.device, builder=lambda _, sheet: TakeBuilder(sheet, self._watch, keeps=keeps))
+        try:
+            run = bench.play(self.take.scenario, self.seed)
+        except AnalogrigError as error:
+            self._stop_after(str(error))
+            return
+        self.counters = {**run.conditions.counters, **run.conditions.link_counters}
+        if keeps:
+            self._conclude(run)
+        if run.conditions.faults and not self._is_closed and run.conditions.faults != self.take.scenario.caveats:
+            self._stop_after(run.conditions.faults[-1])
+
+    def _begin_take(self) -> None:
+        excitation = self.excitation
+        if not self.is_on:
+            excitation = dataclasses.replace(excitation, low_v=0.0, high_v=0.0)
+        if not self.desk.is_stepped:
+            self._wait_to_play()
+        known = scenario_values(self.knobs, self.values)
+        plant = dataclasses.replace(self.desk.scenario.plant, **known)
+        tweaks: tuple[PotChange, ...] = ()
+        if not self.desk.is_stepped and self._turns:
+            changed = scenario_values(self.knobs, self._turns)
+            tweaks = (PotChange(CHANGE_N, **changed),)
+            self.values |= self._turns
+            self._turns, self._turned_at = {}, []
+        scenario = dataclasses.replace(self.desk.scenario, excitation=excitation, plant=plant, tweaks=tweaks)
+        scenario = dataclasses.replace(scenario, seed=self.seed)
+        self.take_number += 1
+        self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
+        self._ends_take = False
+        self._pace = None
+        self._taken = 0
+        self._unfelt = []
+        self.diagnosis, self.misfit = "", ""
+        self.ring.restart()
+        self.version += 1
+        for fault in self.injected if self.is_recording else ():
+            self._note_fault(fault)
+
+    @property
+    def injected(self) -> set[commands.Fault]:
+        """Faults in force."""
+        return set(self.desk.injected) if isinstance(self.desk, SteppedDesk) else set()
+
+    def _wait_to_play(self) -> None:
+        """For a rig of whole records: apply the commands, and wait while paused."""
+        while True:
+            self._apply_commands()
+            if self.is_playing or self._is_closed:
+                return
+            self._wait(None)
+
+    def _lengths(self) -> Iterator[int]:
+        """Lengths of the blocks, each when it is due; ends with the take."""
+        self._restore_pots()
+        while True:
+            self._apply_commands()
+            if self._ends_take or self._is_closed:
+                return
+            if self._steps:
+                length = min(self._steps, MOST_BLOCK_N)
+                self._steps -= length
+                self._pace = None
+            elif not self.is_playing:
+                self._wait(None)
+                continue
+            else:
+                length = self._paced_length()
+                if not length:
+                    continue
+            if self.take.is_recorded and self._taken + length > MOST_RECORDED_N:
+                self.notify(f"the recording has reached its limit of {MOST_RECORDED_N} samples")
+                self.is_recording, self._ends_take = False, True
+                return
+            self._taken += length
+            yield length
+
+    def _restore_pots(self) -> None:
+        """Settings that no scenario has: those of the take before."""
+        others = {name: value for name, value in self.values.items() if not self.knobs[name].field}
+        if others and isinstance(self.desk, SteppedDesk):
+            self.desk.turn(others, 0)
+
+    def _paced_length(self) -> int:
+        """Length of the next block if it is due; else wait, and return 0."""
+        rate_hz = self.sample_rate_hz / self.factor
+        length = int(min(max(1.0, rate_hz * BLOCK_S), MOST_BLOCK_N))
+        now_s = self.clock()
+        if self._pace is None:
+            self._pace = (now_s, self._taken)
+            self._speed_from = (now_s, self._taken)
+        start_s, start_n = self._pace
+        due_s = start_s + (self._taken + length - start_n) / rate_hz
+        if now_s < due_s:
+            self._wait(due_s - now_s)
+            return 0
+        if now_s - due_s > LATE_S:
+            self.overruns_n += int((now_s - due_s) * rate_hz)
+            self._pace = (now_s, self._taken)
+        return length
+
+    def _wait(self, seconds: float | None) -> None:
+        self.clock.wait(self._woken, seconds)
+        self._woken.clear()
+
+    @property
+    def performance(self) -> Performance | None:
+        """Play under way; None before the first."""
+        return self.desk.performance
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Samples per second of machine time."""
+        return 20e3 if self.performance is None else 1.0 / self.performance.sample_period_s
+
+    # ---- commands
+
+    def _apply_commands(self) -> None:
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    break
+                command, at_s = self._waiting.popleft()
+            try:
+                self._check(command)  # again: the bench may have changed since
+                self._apply(command, at_s)
+            except (AnalogrigError, EmulatorError) as error:
+                self.notify(str(error))
+            self.version += 1
+        if isinstance(self.desk, SteppedDesk):
+            self._turn_pots(self.desk)
+
+    def _apply(self, command: Command, at_s: float) -> None:
+        match command:
+            case commands.Turn():
+                self._turns[command.name] = command.value
+                self._ramp_n = command.ramp_n
+                self._turned_at.append(at_s)
+            case commands.Generate():
+                self.excitation = self._generated(command)
+                self.is_on = self.is_on if command.on is None else command.on
+                self._ends_take = True
+            case commands.Operate() if isinstance(self.desk, SteppedDesk):
+                self.desk.switch(command.mode)
+            case commands.Play():
+                self.is_playing, self._steps, self._pace = command.on, 0, None
+            case commands.Step():
+                self.is_playing, self._steps = False, self._steps + command.samples
+            case commands.Tempo():
+                self.factor, self._pace = command.factor, None
+            case commands.Restart():
+                self._ends_take = True
+            case commands.Inject() if isinstance(self.desk, SteppedDesk):
+                self.desk.inject(command.fault, on=command.on)
+                if command.on:
+                    self._note_fault(command.fault)
+            case commands.Record():
+                self._ends_take = self._ends_take or command.on != self.is_recording
+                self.is_recording = command.on
+            case commands.ClearLamps() if isinstance(self.desk, SteppedDesk):
+                self.desk.clear_lamps()
+
+    def _note_fault(self, fault: commands.Fault) -> None:
+        self.take.caveats.append(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
+
+    def _turn_pots(self, desk: SteppedDesk) -> None:
+        """Turn the pots that the hand has turned, unless one is still turning."""
+        if not self._turns or desk.is_turning:
+            return
+        if self.take.is_recorded and len(self.take.changes) >= MAX_CHANGES:
+            self.notify(f"the recording has reached its limit of {MAX_CHANGES} changes")
+            self.is_recording, self._ends_take = False, True
+            return
+        sample, ramp_n = self._taken - 1, self._ramp_n if self._taken > 1 else 0
+        turns, self._turns = self._turns, {}
+        times_s, self._turned_at = self._turned_at, []
+        turns = {name: value for name, value in turns.items() if value != self.values[name]}
+        if not turns:
+            return
+        try:
+            desk.turn(turns, ramp_n)
+        except AnalogrigError as error:
+            self.notify(str(error))
+            return
+        self.values |= turns
+        self.take.change(sample, scenario_values(self.knobs, turns), ramp_n)
+        self._unfelt += [(sample + 1, at_s) for at_s in times_s]
+        self.version += 1
+
+    # ---- from the bench
+
+    def _watch(self, block: Block, answers: Answers) -> None:
+        """Take note of an answered block."""
+        self.ring.add(block, self.desk.probed(len(block.codes)), answers)
+        now_s = self.clock()
+        end = self.ring.end
+        self.missing_n += int(np.count_nonzero(~block.samples().valid))
+        felt = [at_s for sample, at_s in self._unfelt if sample < end]
+        self.felt_s.extend(now_s - at_s for at_s in felt)
+        self._unfelt = [each for each in self._unfelt if each[0] >= end]
+        since_s, since_n = self._speed_from
+        if now_s - since_s >= 1.0:
+            self.speed_hz, self._speed_from = (self._taken - since_n) / (now_s - since_s), (now_s, self._taken)
+        for alarm in answers.alarms:
+            self._note_alarm(alarm.index)
+        for diagnosis in answers.diagnoses:
+            self.diagnosis = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
+        for misfit in answers.misfits:
+            self.misfit = "" if misfit.cause == Cause.NONE else Cause(misfit.cause).name.lower().replace("_", " ")
+        self._search_bounds(end)
+
+    def _note_alarm(self, sample: int) -> None:
+        alarm = NotedAlarm(self.take_number, sample)
+        plants = self.take.plants()
+        i = max((i for i, (start, _, _) in enumerate(plants) if start < sample), default=0)
+        seen = any(each.take == self.take_number and each.what and each.change == plants[i][0] for each in self.alarms)
+        is_ramp = sample <= plants[i][0] + plants[i][2]
+        if i and (is_ramp or not seen):
+            alarm.what = ", ".join(plants[i - 1][1].changes_to(plants[i][1]))
+            alarm.change = plants[i][0]
+            alarm.latency_n = sample - plants[i][0]
+        self.alarms.append(alarm)
+        self.version += 1
+
+    def _search_bounds(self, end: int) -> None:
+        """Find the information bounds of the changes that were detected."""
+        if self.take.scenario.caveats:
+            return
+        for alarm in self.alarms:
+            is_open = alarm.take == self.take_number and alarm.what and alarm.bound_n is None
+            if not is_open or alarm.searched >= len(_BOUND_AFTER_N):
+                continue
+            if end >= alarm.change + _BOUND_AFTER_N[alarm.searched]:
+                alarm.searched += 1
+                alarm.bound_n = self._bound(alarm.change, min(end, alarm.change + _BOUND_AFTER_N[-1]))
+                self.version += 1
+
+    def _bound(self, change: int, end: int) -> int | None:
+        """Information bound of the change at a sample, from the samples before ``end``; None: not reached."""
+        first = max(self.ring.start, change - _LEAD_N)
+        plants = self.take.plants()
+        begun = max(i for i, (start, _, _) in enumerate(plants) if start <= first)
+        number = next(i for i, (start, _, _) in enumerate(plants) if start == change)
+        end = min([end, *(start for start, _, _ in plants[number + 1 :])])
+        segments = [Segment(0, plants[begun][1])]
+        segments += [Segment(start - first, plant, ramp_n) for start, plant, ramp_n in plants[begun + 1 : number + 1]]
+        try:
+            run = self.window(first, end, segments)
+        except LookupError:
+            return None
+        level = self.device.datasheet.log_arl0(self.take.scenario.expect.arl0)
+        return information.first_at_level(information.change_information(run)[-1], level)
+
+    def window(self, first: int, end: int, segments: list[Segment]) -> Run:
+        """Samples of the ring as a run.
+
+        :raises LookupError: the ring does not hold them.
+        """
+        performance = self.performance
+        if performance is None:
+            raise LookupError("nothing is played yet")
+        columns: Any = {name: self.ring.read(name, first, end) for name in self.ring.columns if name != "probed"}
+        conditions = Conditions(
+            seed=self.seed,
+            samples_asked=end - first,
+            sample_period_s=performance.sample_period_s,
+            time_scale=performance.time_scale,
+            channels=performance.channels,
+            segments=tuple(segments),
+            scenario={},
+            rig={},
+            dut=self.device.description(),
+            link=self.device.link_name,
+        )
+        none = np.zeros(0, np.int64)
+        return Run(
+            conditions,
+            alarm_index=none,
+            alarm_kind=none.astype(np.uint8),
+            alarm_statistic=none.astype(np.float32),
+            **columns,
+        )
+
+    def estimates(self) -> dict[str, float | None]:
+        """Last estimates by parameter; empty if the device reports none."""
+        sheet, performance = self.device.datasheet, self.performance
+        end = self.ring.end
+        if sheet.model is None or not sheet.theta_n or performance is None or not end:
+            return {}
+        try:
+            theta: Any = self.ring.read("theta", end - 1, end)
+        except LookupError:
+            return {}
+        channels = performance.channels
+        found = physical_parameters(
+            theta,
+            sheet.model,
+            n_per_code=channels["force"].lsb,
+            m_per_code=channels["displacement"].lsb,
+            period_s=performance.sample_period_s * performance.time_scale,
+        )[0]
+        return {name: None if np.isnan(value) else float(value) for name, value in zip(PARAMETERS, found, strict=True)}
+
+    # ---- ends of takes
+
+    def _conclude(self, run: Run) -> None:
+        """Save a recorded take, unless it has no samples."""
+        if not run.samples:
+            return
+        concluded = self.take.concluded(run)
+        if self._identity is not None:
+            concluded = concluded.with_identity(dataclasses.replace(self._identity, devices=self.device.files()))
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            number = next(n for n in itertools.count(1) if not self._file(n, "npz").exists())
+            concluded.save(self._file(number, "npz"))
+            table = {k: v for k, v in concluded.conditions.scenario.items() if v != "" and k not in ("name", "rig")}
+            with replace_file(self._file(number, "toml")) as file:
+                file.write(config.to_toml(table).encode())
+        except (AnalogrigError, OSError) as error:
+            self.notify(f"the recording could not be saved: {error}")
+            return
+        saved = Saved(self._file(number, "npz"), self._file(number, "toml"), run.samples, len(run.alarm_index))
+        self.saved.append(saved)
+        self.notify(f"{saved.run}: {run.samples} samples, {saved.alarms} alarms; scenario: {saved.scenario}")
+
+    def _file(self, number: int, suffix: str) -> Path:
+        return self._folder / f"take-{number}.{suffix}"
+
+    def _stop_after(self, reason: str) -> None:
+        """Pause after a failure, with the device ready for the next take."""
+        self.notify(f"stopped: {reason}")
+        self.is_playing, self._steps, self.is_recording = False, 0, False
+        try:
+            self.device.recover()
+            self.device.configure()
+        except AnalogrigError as error:
+            self.notify(str(error))

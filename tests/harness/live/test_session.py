@@ -1,0 +1,231 @@
+"""The live session without a browser, on a simulated clock."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analogrig import cli
+from analogrig.errors import ConfigurationError
+from analogrig.live.commands import (
+    ClearLamps,
+    Generate,
+    Inject,
+    Operate,
+    Play,
+    Record,
+    Restart,
+    Step,
+    Tempo,
+    Turn,
+    command_of,
+)
+from analogrig.live.session import BLOCK_S, Session
+from analogrig.run import Run
+from analogrig.scenario import Scenario
+from tests.harness.live.benches import SEED, scripted_session
+
+RATE_HZ = 20_000
+BLOCK_N = int(RATE_HZ * BLOCK_S)
+
+PLAYED_BY_HAND = (
+    (0.0, Record(on=True)),
+    (0.1, Turn("K_n_per_m", 18000.0)),
+    (0.2, Turn("B_n_s_per_m", 3453.0, 100)),
+    (0.3, Turn("M_kg", 60.0)),
+    (0.4, Record(on=False)),
+    (0.41, Play(on=False)),
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return scripted_session(PLAYED_BY_HAND, tmp_path_factory.mktemp("live"))
+
+
+def test_recording_names_the_sample_of_every_turn(recorded: Session) -> None:
+    (saved,) = recorded.saved
+    run = Run.load(saved.run)
+    assert run.samples == saved.samples == 32 * BLOCK_N - BLOCK_N
+    scenario = Scenario.load(str(saved.scenario))
+    assert [(each.sample % BLOCK_N, each.overrides(), each.ramp_n) for each in scenario.tweaks] == [
+        (BLOCK_N - 1, {"stiffness_n_per_m": 18000.0}, 0),
+        (BLOCK_N - 1, {"damping_n_s_per_m": 3453.0}, 100),
+        (BLOCK_N - 1, {"mass_kg": 60.0}, 0),
+    ]
+    assert [segment.start for segment in run.conditions.segments] == [0, *(each.sample for each in scenario.tweaks)]
+
+
+def test_scenario_of_a_recording_plays_the_same_codes_on_the_emulator(recorded: Session, tmp_path: Path) -> None:
+    (saved,) = recorded.saved
+    out = tmp_path / "again"
+    cli.main(["run", "--scenario", str(saved.scenario), "--rig", "emulator", "--dut", "inproc", "--out", str(out)])
+    again, by_hand = Run.load(out / "run.npz"), Run.load(saved.run)
+    np.testing.assert_array_equal(again.codes, by_hand.codes)
+    np.testing.assert_array_equal(again.theta, by_hand.theta)
+
+
+def test_replay_and_judge_find_the_alarms_that_were_seen_live(
+    recorded: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (saved,) = recorded.saved
+    seen = {alarm.sample: alarm.latency_n for alarm in recorded.alarms if alarm.take == 2}
+    for command in ("replay", "judge"):
+        cli.main([command, str(saved.run), "--out", str(tmp_path / command), "--json"])
+        found = json.loads(capsys.readouterr().out)
+        assert Run.load(tmp_path / command / "run.npz").alarm_index.tolist() == list(seen)
+        live = [alarm for alarm in recorded.alarms if alarm.what]
+        first = {alarm.change: alarm for alarm in reversed(live)}
+        assert [(each["latency"], each["bound"]) for each in found["tweaks"]] == [
+            (first[each["sample"]].latency_n, first[each["sample"]].bound_n) for each in found["tweaks"]
+        ]
+
+
+def test_pot_is_felt_within_one_block(recorded: Session) -> None:
+    assert len(recorded.felt_s) == 3
+    assert max(recorded.felt_s) <= 2 * BLOCK_S
+
+
+def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) -> None:
+    ends: list[int] = []
+
+    def note(session: Session) -> None:
+        ends.append(session.ring.end)
+
+    scripted_session(
+        ((0.0, Play(on=False)), (1.0, note), (2.0, Step(1)), (3.0, note), (4.0, Step(7)), (5.0, note)), tmp_path
+    )
+    assert ends == [0, 1, 8]
+
+
+def test_time_factor_slows_and_hastens_the_session(tmp_path: Path) -> None:
+    ends: list[int] = []
+
+    def note(session: Session) -> None:
+        ends.append(session.ring.end)
+
+    scripted_session(((0.0, Tempo(100.0)), (1.0, note), (1.0, Tempo(0.5)), (1.1, note)), tmp_path)
+    slow, fast = ends[0], ends[1] - ends[0]
+    assert slow == pytest.approx(RATE_HZ / 100, abs=3)
+    assert fast == pytest.approx(0.1 * RATE_HZ / 0.5, abs=2 * 500)
+
+
+def test_hold_keeps_the_outputs_of_the_integrators(tmp_path: Path) -> None:
+    session = scripted_session(((0.1, Operate("HOLD")), (0.2, Play(on=False))), tmp_path)
+    end = session.ring.end
+    held = session.ring.read("probed", end - 500, end)[:, session.desk.amplifiers.index("U3")]
+    assert float(np.ptp(held)) < 0.02  # the edges of the force come through the amplifiers
+    assert session.desk.mode == "HOLD"
+
+
+def test_modes_are_reached_through_the_modes_between(tmp_path: Path) -> None:
+    session = scripted_session(
+        ((0.1, Operate("POT SET")), (0.2, Operate("OPERATE")), (0.3, Operate("POT SET"))), tmp_path
+    )
+    assert session.desk.mode == "POT SET"
+    assert not session.notices
+
+
+def test_generator_that_is_off_gives_no_volts(tmp_path: Path) -> None:
+    session = scripted_session(((0.05, Generate(on=False)), (0.1, Play(on=False))), tmp_path)
+    end = session.ring.end
+    assert np.abs(session.ring.read("probed", end - 500, end)).max() < 0.1
+
+
+def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path: Path) -> None:
+    script = ((0.0, Record(on=True)), (0.1, Inject("stuck", on=True)), (0.2, Record(on=False)), (0.21, Play(on=False)))
+    (saved,) = scripted_session(script, tmp_path).saved
+    run = Run.load(saved.run)
+    assert np.unique(run.codes[2500:, 1]).size <= 12  # the noise of the card alone
+    assert "displacement channel stuck: injected by hand at sample 1750" in run.conditions.faults
+    assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (Turn("X", 1.0), "no pot is called 'X'"),
+        (Turn("K_n_per_m", 1e9), "K must be 24.5 to 29518"),
+        (Turn("K_n_per_m", float("nan")), "K must be"),
+        (Generate(frequency_hz=1e9), "exceeds half the sample rate"),
+        (Generate(low_v=11.0), "must be finite and not below low_v"),
+    ],
+)
+def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
+    command: Turn | Generate, words: str, tmp_path: Path
+) -> None:
+    def refuse(session: Session) -> None:
+        with pytest.raises(ConfigurationError, match=words):
+            session.do(command)
+
+    session = scripted_session(((0.05, refuse),), tmp_path)
+    assert session.values == dict(session.desk.computer.program.values)
+    assert session.take_number == 1
+
+
+def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> None:
+    def refuse(session: Session) -> None:
+        for command in (Generate(high_v=5.0), Operate("HOLD")):
+            with pytest.raises(ConfigurationError, match="within a recording"):
+                session.do(command)
+
+    session = scripted_session(((0.0, Record(on=True)), (0.05, refuse)), tmp_path)
+    assert len(session.saved) == 1  # the end of the session ends the recording too
+
+
+def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
+    session = scripted_session(((0.05, Turn("K_n_per_m", 18000.0)), (0.1, Restart()), (0.15, ClearLamps())), tmp_path)
+    assert session.take_number == 2
+    assert session.ring.end < 0.06 * RATE_HZ
+    assert session.values["K_n_per_m"] == 18000.0
+    assert not session.take.changes
+
+
+def test_ten_minutes_of_machine_time_need_no_more_memory_than_one(tmp_path: Path) -> None:
+    held: list[int] = []
+
+    def note(session: Session) -> None:
+        held.append(sum(column.nbytes for column in session.ring.columns.values()))
+        assert not session.take.changes
+
+    session = scripted_session(((0.0, Tempo(0.001)), (0.01, note), (0.1, note)), tmp_path)
+    assert held[0] == held[1]
+    assert session.ring.end > session.ring.start > 0
+
+
+def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
+    from analogrig.devices.opening import open_dut
+    from analogrig.rigs.description import open_rig
+    from tests.harness.live.benches import ScriptedClock
+
+    clock = ScriptedClock(
+        ((0.02, Turn("K_n_per_m", 18000.0)), (0.05, Play(on=False)), (90.0, Play(on=True)), (90.1, Play(on=False)))
+    )
+    with open_rig("emulator") as rig, open_dut("inproc") as device:
+        session = Session(rig, Scenario.load("thesis"), device, SEED, folder=tmp_path, clock=clock)
+        clock.session = session
+        session.run()
+    assert not session.notices
+    assert session.ring.end > 0.1 * RATE_HZ
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "words"),
+    [
+        ("explode", {}, "no command is called 'explode'"),
+        (7, {}, "no command is called 7"),
+        ("turn", {"name": "K_n_per_m"}, "the key 'value' is lacking"),
+        ("turn", {"name": "K_n_per_m", "value": "much"}, "must be a number"),
+        ("turn", {"name": "K_n_per_m", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
+        ("tempo", {"factor": 0.0}, "factor must be 0.001 to"),
+        ("step", {"samples": 10**9}, "samples must be 1 to"),
+        ("operate", {"mode": "FLY"}, "must be one of"),
+        ("record", {"on": True, "file": "/etc/passwd"}, "unknown key 'file'"),
+    ],
+)
+def test_command_of_a_wrong_message_is_refused(name: object, table: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words):
+        command_of(name, table)
