@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from analogrig.cli import (
+    bench,
     calibrate,
     campaign,
     certify,
@@ -39,6 +40,7 @@ _COMMANDS = (
     playing.add_replay,
     playing.add_judge,
     importing.add,
+    bench.add,
     campaign.add,
     certify.add,
     compare.add,

@@ -42,6 +42,8 @@ class Desk(Rig):
     """Faults that can be injected, with their labels."""
     amplifiers: tuple[str, ...] = ()
     """Amplifiers whose outputs are read."""
+    nodes: tuple[str, ...] = ()
+    """Nodes of their outputs."""
 
     def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
         """Find the limits of the rig's pots.
@@ -62,7 +64,8 @@ class Desk(Rig):
     def _check_settings(self, settings: Mapping[str, float]) -> None:
         """:raises ConfigurationError, EmulatorError: the rig does not accept these settings of pots."""
         names = {setting: name for name, setting in settings_names(self.computer.program).items()}
-        plant = dataclasses.replace(self.scenario.plant, **{names[key]: value for key, value in settings.items()})
+        values: dict[str, Any] = {names[key]: value for key, value in settings.items()}
+        plant = dataclasses.replace(self.scenario.plant, **values)
         self.check(dataclasses.replace(self.scenario, plant=plant))
 
     def check(self, scenario: Scenario) -> None:
@@ -106,7 +109,7 @@ class SteppedDesk(Desk):
         super().__init__(rig, scenario, seed)
         found = patches(self.computer.circuit)
         self.amplifiers = tuple(found)
-        self._nodes = tuple(patch.out for patch in found.values())
+        self.nodes = tuple(patch.out for patch in found.values())
 
     def _check_settings(self, settings: Mapping[str, float]) -> None:
         self.computer.dials_for(**settings)
@@ -125,7 +128,7 @@ class SteppedDesk(Desk):
         for fault in on:
             self._faults.switch(fault, on=True)
         alter = self._faults.alter
-        self.performance = self._emulated.perform_in_steps(set_up, seed, self._lengths(), self._nodes, alter)
+        self.performance = self._emulated.perform_in_steps(set_up, seed, self._lengths(), self.nodes, alter)
         return self.performance
 
     def probed(self, samples: int) -> NDArray[np.float64]:
@@ -156,7 +159,7 @@ class SteppedDesk(Desk):
 
     @property
     def mode(self) -> Mode:
-        return self.computer.machine.mode.value  # type: ignore[return-value]  # the same texts
+        return self.computer.machine.mode.value
 
     def switch(self, mode: Mode) -> None:
         """Switch the relays, through the modes between.

@@ -141,6 +141,7 @@ class Session:
         self.speed_hz = 0.0
         """Samples per second of wall-clock time, over the last second."""
         self.missing_n = 0
+        self.alarm_count = 0
         self.is_recording = False
         self.version = 0
         """Number that grows with every change of the state, apart from samples."""
@@ -148,6 +149,7 @@ class Session:
         self._steps = 0
         self._ends_take = False
         self._is_closed = False
+        self._is_made_safe = False
         self._pace: tuple[float, int] | None = None
         """Time and sample from which the pace is counted."""
         self._speed_from = (0.0, 0)
@@ -170,6 +172,11 @@ class Session:
             if len(self._waiting) >= MOST_WAITING:
                 raise ConfigurationError("too many commands at once: wait for the next block")
             self._waiting.append((command, self.clock()))
+        self._woken.set()
+
+    def make_safe(self) -> None:
+        """Switch the generator off before the next block; a recording under way is saved."""
+        self._is_made_safe = True
         self._woken.set()
 
     def close(self) -> None:
@@ -279,7 +286,7 @@ class Session:
         """For a rig of whole records: apply the commands, and wait while paused."""
         while True:
             self._apply_commands()
-            if self.is_playing or self._is_closed:
+            if (self.is_playing and self.is_on) or self._is_closed:
                 return
             self._wait(None)
 
@@ -349,6 +356,10 @@ class Session:
     # ---- commands
 
     def _apply_commands(self) -> None:
+        if self._is_made_safe:
+            self._is_made_safe = False
+            self.is_on, self.is_recording, self._ends_take = False, False, True
+            self.version += 1
         while True:
             with self._lock:
                 if not self._waiting:
@@ -453,6 +464,7 @@ class Session:
             alarm.change = plants[i][0]
             alarm.latency_n = sample - plants[i][0]
         self.alarms.append(alarm)
+        self.alarm_count += 1
         self.version += 1
 
     def _search_bounds(self, end: int) -> None:
