@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from analogrig.devices.device import Device
     from analogrig.live.session import Session
 
-TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"
+TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
 """Environment variable with the token of the address; by default a random one."""
 
 REPORT_INTERVAL_N = 64
@@ -75,11 +75,13 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.real_time is not None:
         raise ConfigurationError("--real-time: the page sets the time factor")
-    with open_what_to_play(arguments) as (rig, scenario, seed):
-        with _open_device(arguments.dut or scenario.dut or "inproc", arguments) as device:
-            identity = Identity.here(arguments.command_line, arguments.started, device.files())
-            session = Session(rig, scenario, device, seed, folder=arguments.out, identity=identity)
-            return asyncio.run(_serve(session, arguments))
+    with (
+        open_what_to_play(arguments) as (rig, scenario, seed),
+        _open_device(arguments.dut or scenario.dut or "inproc", arguments) as device,
+    ):
+        identity = Identity.here(arguments.command_line, arguments.started, device.files())
+        session = Session(rig, scenario, device, seed, folder=arguments.out, identity=identity)
+        return asyncio.run(_serve(session, arguments))
 
 
 def _open_device(name: str, arguments: argparse.Namespace) -> Device:
@@ -110,7 +112,7 @@ async def _serve(session: Session, arguments: argparse.Namespace) -> int:
     ended = signal_future()
     server = BenchServer(session, token=os.environ.get(TOKEN_VARIABLE, ""), origins=arguments.origin)
     await server.listen(arguments.host, arguments.port)
-    playing = asyncio.create_task(asyncio.to_thread(session.run))
+    playing = asyncio.ensure_future(_play(session))
     try:
         if arguments.json:
             show_json({"address": server.address, "out": str(arguments.out)})
@@ -118,9 +120,17 @@ async def _serve(session: Session, arguments: argparse.Namespace) -> int:
             show(f"bench: {server.address}")
         if not arguments.no_open:
             await asyncio.to_thread(webbrowser.open, server.address)
-        await asyncio.wait({ended, playing}, return_when=asyncio.FIRST_COMPLETED)
-        return playing.result() or PASSED if playing.done() else await ended
+        await asyncio.wait((ended, playing), return_when=asyncio.FIRST_COMPLETED)
+        return (playing if playing.done() else ended).result()
     finally:
         session.close()
         await server.close()
         await asyncio.gather(playing, return_exceptions=True)
+
+
+async def _play(session: Session) -> int:
+    """Play in another thread until the session is closed. Return the exit status."""
+    import asyncio
+
+    await asyncio.to_thread(session.run)
+    return PASSED

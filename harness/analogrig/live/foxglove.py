@@ -64,7 +64,7 @@ class Channel:
 
 def channels_of(session: Session) -> dict[int, Channel]:
     """Channels of a session by number."""
-    signals = {name: _NUMBER for name in signals_of(session)}
+    signals = dict.fromkeys(signals_of(session), _NUMBER)
     alarm = {"take": _NUMBER, "sample": _NUMBER, "what": _TEXT, "latency_n": _NUMBER, "bound_n": _NUMBER}
     state = {"mode": _TEXT, "samples": _NUMBER, "speed": _NUMBER, "take": _NUMBER}
     tables = {"/signals": {"sample": _NUMBER, **signals}, "/alarms": alarm, "/state": state}
@@ -164,7 +164,7 @@ class Viewer:
     async def _publish(self) -> None:
         """Publish what is subscribed to."""
         told: dict[str, float] = {}
-        sent_alarms, end, take = self._session.alarm_count, 0, 0
+        sent_alarms, end, take = self._session.notes.alarm_count, 0, 0
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             while True:
                 await asyncio.sleep(_PERIOD_S)
@@ -174,9 +174,9 @@ class Viewer:
                 last, end = end, session.ring.end
                 for row in self._rows(last, end) if "/signals" in self._topics() else ():
                     await self._send("/signals", row)
-                fresh = min(session.alarm_count - sent_alarms, len(session.alarms))
-                sent_alarms = session.alarm_count
-                for alarm in list(session.alarms)[-fresh:] if fresh else ():
+                fresh = min(session.notes.alarm_count - sent_alarms, len(session.notes.alarms))
+                sent_alarms = session.notes.alarm_count
+                for alarm in list(session.notes.alarms)[-fresh:] if fresh else ():
                     table = {"take": alarm.take, "sample": alarm.sample, "what": alarm.what}
                     await self._send("/alarms", table | {"latency_n": alarm.latency_n, "bound_n": alarm.bound_n})
                 if end != last:

@@ -73,7 +73,7 @@ def state_table(session: Session) -> dict[str, Any]:
     desk, take = session.desk, session.take
     plants = take.plants()
     truth = plants[-1][1].parameters() if not take.scenario.caveats else {}
-    estimates = session.estimates()
+    estimates = session.notes.estimates()
     end = session.ring.end
     return {
         "version": session.version,
@@ -84,7 +84,7 @@ def state_table(session: Session) -> dict[str, Any]:
         "speed": session.speed_hz,
         "rate": session.sample_rate_hz,
         "overruns": session.overruns_n,
-        "missing": session.missing_n,
+        "missing": session.notes.missing_n,
         "mode": desk.mode,
         "lamps": list(desk.lamps),
         "values": dict(session.values),
@@ -93,15 +93,15 @@ def state_table(session: Session) -> dict[str, Any]:
         "estimates": [{"name": name, "estimate": value, "truth": truth.get(name)} for name, value in estimates.items()],
         "statistic": _last(session, "statistic"),
         "volts": _volts(session),
-        "diagnosis": session.diagnosis,
-        "misfit": session.misfit,
+        "diagnosis": session.notes.diagnosis,
+        "misfit": session.notes.misfit,
         "counters": {name: count for name, count in session.counters.items() if count},
-        "alarms": [dataclasses.asdict(alarm) for alarm in list(session.alarms)[-12:]],
-        "alarm_count": session.alarm_count,
+        "alarms": [dataclasses.asdict(alarm) for alarm in list(session.notes.alarms)[-12:]],
+        "alarm_count": session.notes.alarm_count,
         "recording": session.is_recording,
         "saved": [{"run": str(each.run), "scenario": str(each.scenario)} for each in list(session.saved)[-3:]],
         "notices": list(session.notices)[-3:],
-        "felt_ms": round(1e3 * session.felt_s[-1], 1) if session.felt_s else None,
+        "felt_ms": round(1e3 * session.notes.felt_s[-1], 1) if session.notes.felt_s else None,
     }
 
 

@@ -217,7 +217,7 @@ class Screen:
             since = below[at] if at >= 0 else -1
             if since >= 0 and not (crossings[np.searchsorted(crossings, since)] < k):
                 step = signed[k + 1] - signed[k]
-                return first + k + float((level - signed[k]) / step)
+                return float(first + k + (level - signed[k]) / step)
         return None
 
 

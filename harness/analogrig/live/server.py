@@ -21,6 +21,7 @@ import contextlib
 import json
 import logging
 import secrets
+import socket as socketlib
 import time
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 
 MOST_CLIENTS = 16
 MOST_MESSAGE_BYTES = 8192
+BUFFERED_BYTES = 262_144
 SLOW_S = 10.0
 FRAME_S = 1.0 / 45.0
 """Time between two frames."""
@@ -119,6 +121,9 @@ class BenchServer:
             )
         except OSError as error:
             raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror or error}") from error
+        for listening in self._server.sockets:  # accepted connections inherit the options
+            listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_RCVBUF, BUFFERED_BYTES)
+            listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_SNDBUF, BUFFERED_BYTES)
         number = next(iter(self._server.sockets)).getsockname()[1]
         name = f"[{host}]" if ":" in host else host
         self._host = f"{name}:{number}"
@@ -134,20 +139,25 @@ class BenchServer:
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Page, refusal, or None for a WebSocket that may open."""
+        refusal = self._refusal(request)
+        if refusal is not None:
+            return connection.respond(*refusal)
+        return _page_response(self._page) if urlsplit(request.path).path == "/" else None
+
+    def _refusal(self, request: Request) -> tuple[HTTPStatus, str] | None:
+        """Status and reason if the request is refused."""
         url = urlsplit(request.path)
         token = parse_qs(url.query).get("token", [""])[0]
         if _one(request.headers, "Host") not in self._hosts:
-            return connection.respond(HTTPStatus.FORBIDDEN, "this Host is not served\n")
+            return HTTPStatus.FORBIDDEN, "this Host is not served\n"
         if url.path not in ("/", _LIVE, _FOXGLOVE):
-            return connection.respond(HTTPStatus.NOT_FOUND, "there is nothing here\n")
+            return HTTPStatus.NOT_FOUND, "there is nothing here\n"
         if not secrets.compare_digest(token.encode(), self.token.encode()):
-            return connection.respond(HTTPStatus.FORBIDDEN, "open the address that analogrig bench has printed\n")
-        if url.path == "/":
-            return _page_response(self._page)
-        if not self._is_welcome(_one(request.headers, "Origin"), url.path):
-            return connection.respond(HTTPStatus.FORBIDDEN, "this Origin is not served\n")
-        if len(self._clients) + self._viewers >= MOST_CLIENTS:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MOST_CLIENTS} clients already\n")
+            return HTTPStatus.FORBIDDEN, "open the address that analogrig bench has printed\n"
+        if url.path != "/" and not self._is_welcome(_one(request.headers, "Origin"), url.path):
+            return HTTPStatus.FORBIDDEN, "this Origin is not served\n"
+        if url.path != "/" and len(self._clients) + self._viewers >= MOST_CLIENTS:
+            return HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MOST_CLIENTS} clients already\n"
         return None
 
     def _is_welcome(self, origin: str | None, path: str) -> bool:

@@ -16,28 +16,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from analogrig import config
 from analogrig.answers import Answers
 from analogrig.bench import Bench
-from analogrig.catalogue import Cause, Change
 from analogrig.devices.device import Device
 from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.identity import Identity
-from analogrig.judging import information
-from analogrig.judging.verdict import DIAGNOSABLE
 from analogrig.live import commands
 from analogrig.live.clock import LiveClock, WallClock
 from analogrig.live.commands import Command
 from analogrig.live.desk import CHANGE_N, SteppedDesk, open_desk
 from analogrig.live.knobs import scenario_values
+from analogrig.live.notes import Notes
 from analogrig.live.ring import Ring
 from analogrig.live.take import MOST_RECORDED_N, Take, TakeBuilder
-from analogrig.plant import MAX_CHANGES, PARAMETERS, Segment, physical_parameters
+from analogrig.plant import MAX_CHANGES
 from analogrig.rigs.emulator import emulator_errors
 from analogrig.rigs.rig import Block, Performance, Rig
-from analogrig.run import Conditions, Run
+from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 from analogrig.storage import replace_file
 from analogrig_emulator import EmulatorError
@@ -50,29 +46,9 @@ LATE_S = 0.25
 MOST_WAITING = 256
 """Commands that may wait for the next block."""
 
-_LEAD_N = 1500
-"""Samples before a change from which its bound is computed: the plant forgets its start in some hundred."""
-_BOUND_AFTER_N = (64, 256, 1024)
-"""Samples after a change at which its bound is looked for."""
 _MOST_NOTED = 50
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass
-class NotedAlarm:
-    """Alarm of the device, with its latency."""
-
-    take: int
-    sample: int
-    what: str = ""
-    """Names of the changed parameters; empty: no change explains the alarm."""
-    change: int = 0
-    """Sample of the change."""
-    latency_n: int | None = None
-    bound_n: int | None = None
-    searched: int = 0
-    """Number of searches for the bound."""
 
 
 @dataclass(frozen=True)
@@ -114,10 +90,11 @@ class Session:
         self._lock = threading.Lock()
         self._woken = threading.Event()
         self._waiting: deque[tuple[Command, float]] = deque()
-        program = self.desk.computer.program
-        start = scenario_values(self.knobs, program.values) | self.desk.scenario.plant.overrides()
-        fields = {knob.field: name for name, knob in self.knobs.items() if knob.field}
-        self.values = dict(program.values) | {fields[name]: value for name, value in start.items()}
+        overrides = self.desk.scenario.plant.overrides()
+        self.values = {
+            name: overrides.get(self.knobs[name].field, value)
+            for name, value in self.desk.computer.program.values.items()
+        }
         """Settings of the pots."""
         self.excitation = self.desk.scenario.excitation
         self.is_on = self.desk.is_stepped
@@ -130,18 +107,12 @@ class Session:
         self.take_number = 0
         self.take = Take(self.desk.scenario)
         self.ring = Ring(len(self.desk.amplifiers), device.datasheet.theta_n)
-        self.alarms: deque[NotedAlarm] = deque(maxlen=_MOST_NOTED)
+        self.notes = Notes(self.desk, device, self.ring, seed)
         self.notices: deque[tuple[int, str]] = deque(maxlen=_MOST_NOTED)
         self.saved: deque[Saved] = deque(maxlen=_MOST_NOTED)
-        self.felt_s: deque[float] = deque(maxlen=1000)
-        """Times from a turn of a pot to the first answered sample that feels it."""
-        self.diagnosis = ""
-        self.misfit = ""
         self.counters: Mapping[str, int] = {}
         self.speed_hz = 0.0
         """Samples per second of wall-clock time, over the last second."""
-        self.missing_n = 0
-        self.alarm_count = 0
         self.is_recording = False
         self.version = 0
         """Number that grows with every change of the state, apart from samples."""
@@ -156,7 +127,6 @@ class Session:
         self._turns: dict[str, float] = {}
         self._ramp_n = 0
         self._turned_at: list[float] = []
-        self._unfelt: list[tuple[int, float]] = []
         self._taken = 0
         """Samples of this take that the rig has been asked for."""
 
@@ -270,9 +240,8 @@ class Session:
         self._ends_take = False
         self._pace = None
         self._taken = 0
-        self._unfelt = []
-        self.diagnosis, self.misfit = "", ""
         self.ring.restart()
+        self.notes.begin(self.take, self.take_number)
         self.version += 1
         for fault in self.injected if self.is_recording else ():
             self._note_fault(fault)
@@ -384,8 +353,6 @@ class Session:
                 self.excitation = self._generated(command)
                 self.is_on = self.is_on if command.on is None else command.on
                 self._ends_take = True
-            case commands.Operate() if isinstance(self.desk, SteppedDesk):
-                self.desk.switch(command.mode)
             case commands.Play():
                 self.is_playing, self._steps, self._pace = command.on, 0, None
             case commands.Step():
@@ -394,15 +361,23 @@ class Session:
                 self.factor, self._pace = command.factor, None
             case commands.Restart():
                 self._ends_take = True
-            case commands.Inject() if isinstance(self.desk, SteppedDesk):
-                self.desk.inject(command.fault, on=command.on)
-                if command.on:
-                    self._note_fault(command.fault)
             case commands.Record():
                 self._ends_take = self._ends_take or command.on != self.is_recording
                 self.is_recording = command.on
-            case commands.ClearLamps() if isinstance(self.desk, SteppedDesk):
-                self.desk.clear_lamps()
+            case _ if isinstance(self.desk, SteppedDesk):
+                self._operate(self.desk, command)
+
+    def _operate(self, desk: SteppedDesk, command: Command) -> None:
+        """Apply a command that only an emulated computer has."""
+        match command:
+            case commands.Operate():
+                desk.switch(command.mode)
+            case commands.Inject():
+                desk.inject(command.fault, on=command.on)
+                if command.on:
+                    self._note_fault(command.fault)
+            case commands.ClearLamps():
+                desk.clear_lamps()
 
     def _note_fault(self, fault: commands.Fault) -> None:
         self.take.caveats.append(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
@@ -428,123 +403,18 @@ class Session:
             return
         self.values |= turns
         self.take.change(sample, scenario_values(self.knobs, turns), ramp_n)
-        self._unfelt += [(sample + 1, at_s) for at_s in times_s]
+        self.notes.await_turn(sample + 1, times_s)
         self.version += 1
-
-    # ---- from the bench
 
     def _watch(self, block: Block, answers: Answers) -> None:
         """Take note of an answered block."""
-        self.ring.add(block, self.desk.probed(len(block.codes)), answers)
         now_s = self.clock()
-        end = self.ring.end
-        self.missing_n += int(np.count_nonzero(~block.samples().valid))
-        felt = [at_s for sample, at_s in self._unfelt if sample < end]
-        self.felt_s.extend(now_s - at_s for at_s in felt)
-        self._unfelt = [each for each in self._unfelt if each[0] >= end]
+        self.ring.add(block, self.desk.probed(len(block.codes)), answers)
+        if self.notes.watch(block, answers, now_s):
+            self.version += 1
         since_s, since_n = self._speed_from
         if now_s - since_s >= 1.0:
             self.speed_hz, self._speed_from = (self._taken - since_n) / (now_s - since_s), (now_s, self._taken)
-        for alarm in answers.alarms:
-            self._note_alarm(alarm.index)
-        for diagnosis in answers.diagnoses:
-            self.diagnosis = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
-        for misfit in answers.misfits:
-            self.misfit = "" if misfit.cause == Cause.NONE else Cause(misfit.cause).name.lower().replace("_", " ")
-        self._search_bounds(end)
-
-    def _note_alarm(self, sample: int) -> None:
-        alarm = NotedAlarm(self.take_number, sample)
-        plants = self.take.plants()
-        i = max((i for i, (start, _, _) in enumerate(plants) if start < sample), default=0)
-        seen = any(each.take == self.take_number and each.what and each.change == plants[i][0] for each in self.alarms)
-        is_ramp = sample <= plants[i][0] + plants[i][2]
-        if i and (is_ramp or not seen):
-            alarm.what = ", ".join(plants[i - 1][1].changes_to(plants[i][1]))
-            alarm.change = plants[i][0]
-            alarm.latency_n = sample - plants[i][0]
-        self.alarms.append(alarm)
-        self.alarm_count += 1
-        self.version += 1
-
-    def _search_bounds(self, end: int) -> None:
-        """Find the information bounds of the changes that were detected."""
-        if self.take.scenario.caveats:
-            return
-        for alarm in self.alarms:
-            is_open = alarm.take == self.take_number and alarm.what and alarm.bound_n is None
-            if not is_open or alarm.searched >= len(_BOUND_AFTER_N):
-                continue
-            if end >= alarm.change + _BOUND_AFTER_N[alarm.searched]:
-                alarm.searched += 1
-                alarm.bound_n = self._bound(alarm.change, min(end, alarm.change + _BOUND_AFTER_N[-1]))
-                self.version += 1
-
-    def _bound(self, change: int, end: int) -> int | None:
-        """Information bound of the change at a sample, from the samples before ``end``; None: not reached."""
-        first = max(self.ring.start, change - _LEAD_N)
-        plants = self.take.plants()
-        begun = max(i for i, (start, _, _) in enumerate(plants) if start <= first)
-        number = next(i for i, (start, _, _) in enumerate(plants) if start == change)
-        end = min([end, *(start for start, _, _ in plants[number + 1 :])])
-        segments = [Segment(0, plants[begun][1])]
-        segments += [Segment(start - first, plant, ramp_n) for start, plant, ramp_n in plants[begun + 1 : number + 1]]
-        try:
-            run = self.window(first, end, segments)
-        except LookupError:
-            return None
-        level = self.device.datasheet.log_arl0(self.take.scenario.expect.arl0)
-        return information.first_at_level(information.change_information(run)[-1], level)
-
-    def window(self, first: int, end: int, segments: list[Segment]) -> Run:
-        """Samples of the ring as a run.
-
-        :raises LookupError: the ring does not hold them.
-        """
-        performance = self.performance
-        if performance is None:
-            raise LookupError("nothing is played yet")
-        columns: Any = {name: self.ring.read(name, first, end) for name in self.ring.columns if name != "probed"}
-        conditions = Conditions(
-            seed=self.seed,
-            samples_asked=end - first,
-            sample_period_s=performance.sample_period_s,
-            time_scale=performance.time_scale,
-            channels=performance.channels,
-            segments=tuple(segments),
-            scenario={},
-            rig={},
-            dut=self.device.description(),
-            link=self.device.link_name,
-        )
-        none = np.zeros(0, np.int64)
-        return Run(
-            conditions,
-            alarm_index=none,
-            alarm_kind=none.astype(np.uint8),
-            alarm_statistic=none.astype(np.float32),
-            **columns,
-        )
-
-    def estimates(self) -> dict[str, float | None]:
-        """Last estimates by parameter; empty if the device reports none."""
-        sheet, performance = self.device.datasheet, self.performance
-        end = self.ring.end
-        if sheet.model is None or not sheet.theta_n or performance is None or not end:
-            return {}
-        try:
-            theta: Any = self.ring.read("theta", end - 1, end)
-        except LookupError:
-            return {}
-        channels = performance.channels
-        found = physical_parameters(
-            theta,
-            sheet.model,
-            n_per_code=channels["force"].lsb,
-            m_per_code=channels["displacement"].lsb,
-            period_s=performance.sample_period_s * performance.time_scale,
-        )[0]
-        return {name: None if np.isnan(value) else float(value) for name, value in zip(PARAMETERS, found, strict=True)}
 
     # ---- ends of takes
 
