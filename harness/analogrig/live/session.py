@@ -410,7 +410,7 @@ class Session:
         """Take note of an answered block."""
         now_s = self.clock()
         self.ring.add(block, self.desk.probed(len(block.codes)), answers)
-        if self.notes.watch(block, answers, now_s):
+        if self.notes.watch(block, answers, now_s) or not self.is_playing:
             self.version += 1
         since_s, since_n = self._speed_from
         if now_s - since_s >= 1.0:

@@ -421,6 +421,7 @@
       : state.driven
         ? "This page watches: another one drives."
         : "Nobody drives the bench.";
+    $("drive").hidden = state.driven;
     document.documentElement.dataset.role = drives ? "drives" : "watches";
     const mine = "#play, #step, #restart, #tempo, #record, #generator *, #modes button, #faults button, #clear-lamps";
     for (const each of document.querySelectorAll(mine)) each.disabled = !drives;
@@ -717,6 +718,7 @@
   function listen() {
     $("play").onclick = () => send("play", { on: !state.playing });
     $("step").onclick = () => send("step", { samples: 1 });
+    $("drive").onclick = () => send("drive");
     $("restart").onclick = () => send("restart");
     $("tempo").onchange = () => send("tempo", { factor: Number($("tempo").value) });
     $("record").onclick = () => send("record", { on: !state.recording });
