@@ -11,13 +11,13 @@ import contextlib
 import json
 import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed
 
-from analogrig.errors import AnalogrigError
+from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.live.commands import Turn
 from analogrig.live.scope import read_signal, signals_of
 from analogrig.wording import one_line
@@ -127,14 +127,13 @@ class Viewer:
             self._subscribed.pop(number, None)
 
     async def _get_parameters(self, table: Mapping[str, Any]) -> None:
-        await self._tell_parameters(table.get("parameterNames") or (), table.get("id"))
+        await self._tell_parameters(self._named(table), table.get("id"))
 
     async def _set_parameters(self, table: Mapping[str, Any]) -> None:
+        if not self._may_set():
+            raise ConfigurationError("the page drives: close it to set parameters here")
         names = []
         for each in table["parameters"]:
-            if not self._may_set():
-                await self._tell("status", level=_ERROR, message="the page drives: close it to set parameters here")
-                break
             name, value = str(each["name"]), each["value"]
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise TypeError(name)
@@ -142,20 +141,24 @@ class Viewer:
             names.append(name)
         if table.get("id") is not None:
             await asyncio.sleep(2 * _PERIOD_S)  # the pots turn before the next block
-            await self._tell_parameters(names or [str(each["name"]) for each in table["parameters"]], table["id"])
+            await self._tell_parameters(names, table["id"])
 
     async def _watch_parameters(self, table: Mapping[str, Any]) -> None:
-        self._watched |= set(map(str, table["parameterNames"])) & set(self._session.knobs)
+        self._watched |= self._named(table)
 
     async def _unwatch_parameters(self, table: Mapping[str, Any]) -> None:
-        self._watched -= set(map(str, table["parameterNames"]))
+        self._watched -= self._named(table)
 
-    async def _tell_parameters(self, names: Any, number: Any = None) -> None:
-        wanted = set(map(str, names)) or set(self._session.knobs)
+    def _named(self, table: Mapping[str, Any]) -> set[str]:
+        """Parameters that a message names; all if it names none."""
+        known = set(self._session.knobs)
+        return known & set(map(str, table["parameterNames"])) if table["parameterNames"] else known
+
+    async def _tell_parameters(self, names: Collection[str], number: Any = None) -> None:
         values = [
             {"name": name, "value": value, "type": "float64"}
             for name, value in self._session.values.items()
-            if name in wanted
+            if name in names
         ]
         await self._tell("parameterValues", parameters=values, **({} if number is None else {"id": str(number)}))
 
