@@ -31,6 +31,7 @@ from . import (
     bench_fit,
     bench_isolation,
     bench_link,
+    bench_live,
     bench_onset,
     bench_properties,
     bench_reality,
@@ -47,6 +48,7 @@ RESULTS = Path("build/bench.json")
 BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "engine": bench_engine.figures,
     "link": bench_link.figures,
+    "live": bench_live.figures,
     "adapters": bench_adapters.figures,
     "detection": bench_detection.figures,
     "statistics": bench_statistics.figures,
@@ -64,7 +66,7 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "silverbox": bench_silverbox.figures,
 }
 
-OPTIONED = {"campaign", "reality", "statistics"}
+OPTIONED = {"campaign", "live", "reality", "statistics"}
 """Benchmarks that take options."""
 
 

@@ -6,13 +6,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_campaign, bench_certificates, bench_detectors, bench_reality, bench_silverbox
+from . import bench_campaign, bench_certificates, bench_detectors, bench_live, bench_reality, bench_silverbox
 
 FOLDER = Path("harness/docs/evidence")
 
 TITLES: Mapping[str, str] = {
     "engine": "Speed of the engine, beside ngspice",
     "link": "Speed of the links",
+    "live": "The live bench in real time, and under hostile clients",
     "adapters": "Speed of the adapters",
     "detection": "Detection on the thesis's profile",
     "statistics": "Detection delay and false alarms of simulated plants",
@@ -38,6 +39,7 @@ NOTES: Mapping[str, str] = {
     "campaign": bench_campaign.NOTE,
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
+    "live": bench_live.NOTE,
     "reality": bench_reality.NOTE,
     "silverbox": bench_silverbox.NOTE,
 }

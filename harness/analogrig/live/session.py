@@ -216,6 +216,7 @@ class Session:
         self.counters = {**run.conditions.counters, **run.conditions.link_counters}
         if keeps:
             self._conclude(run)
+            self.is_recording = self.is_recording and self.desk.is_stepped  # other rigs record one record
         if run.conditions.faults and not self._is_closed and run.conditions.faults != self.take.scenario.caveats:
             self._stop_after(run.conditions.faults[-1])
 

@@ -476,7 +476,7 @@
     rows($("alarms"), alarms, (row, alarm) => {
       cell(row, alarm.take);
       cell(row, alarm.sample, "number");
-      cell(row, alarm.what || "none", alarm.what ? "" : "bad");
+      cell(row, alarm.what || "none", alarm.what ? "text" : "text bad");
       cell(row, alarm.latency_n ?? "–", "number");
       cell(row, alarm.bound_n ?? "–", "number");
     });
