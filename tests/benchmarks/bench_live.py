@@ -23,13 +23,13 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
 from analogrig.live.commands import Tempo
-from analogrig.live.session import Session
+from analogrig.live.session import LiveSession
 from analogrig.run import Run
 from tests.harness.live.benches import scripted_session
 
@@ -70,7 +70,7 @@ class _Process:
         assert self._process.stdout is not None
         self.address = json.loads(self._process.stdout.readline())["address"]
 
-    def __enter__(self) -> _Process:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -224,7 +224,7 @@ def _memory(minutes: float) -> Iterator[Figure]:
     """Growth of this process while a session plays so many minutes of machine time, after the first."""
     seen: list[float] = []
 
-    def note(_: Session) -> None:
+    def note(_: LiveSession) -> None:
         lines = Path("/proc/self/status").read_text().splitlines()
         seen.append(next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")))
 

@@ -21,7 +21,7 @@ from analogrig.cli.terminal import PASSED, show, show_json
 
 if TYPE_CHECKING:
     from analogrig.devices.device import Device
-    from analogrig.live.session import Session
+    from analogrig.live.session import LiveSession
 
 TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
 """Environment variable with the token of the address; by default a random one."""
@@ -71,7 +71,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     from analogrig.errors import ConfigurationError
     from analogrig.identity import Identity
-    from analogrig.live.session import Session
+    from analogrig.live.session import LiveSession
 
     if arguments.real_time is not None:
         raise ConfigurationError("--real-time: the page sets the time factor")
@@ -80,7 +80,7 @@ def _run(arguments: argparse.Namespace) -> int:
         _open_device(arguments.dut or scenario.dut or "inproc", arguments) as device,
     ):
         identity = Identity.here(arguments.command_line, arguments.started, device.files())
-        session = Session(rig, scenario, device, seed, folder=arguments.out, identity=identity)
+        session = LiveSession(rig, scenario, device, seed, folder=arguments.out, identity=identity)
         return asyncio.run(_serve(session, arguments))
 
 
@@ -101,7 +101,7 @@ def _open_device(name: str, arguments: argparse.Namespace) -> Device:
     return open_dut(name, allow=trust, **changes)
 
 
-async def _serve(session: Session, arguments: argparse.Namespace) -> int:
+async def _serve(session: LiveSession, arguments: argparse.Namespace) -> int:
     """Serve the page, and play in another thread, until a signal ends the command."""
     import asyncio
     import webbrowser
@@ -128,7 +128,7 @@ async def _serve(session: Session, arguments: argparse.Namespace) -> int:
         await asyncio.gather(playing, return_exceptions=True)
 
 
-async def _play(session: Session) -> int:
+async def _play(session: LiveSession) -> int:
     """Play in another thread until the session is closed. Return the exit status."""
     import asyncio
 

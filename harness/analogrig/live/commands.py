@@ -52,7 +52,7 @@ class Operate:
 
 
 @dataclass(frozen=True)
-class Play:
+class SetPlaying:
     """Run, or pause."""
 
     on: bool
@@ -93,7 +93,7 @@ class Inject:
 
 
 @dataclass(frozen=True)
-class Record:
+class SetRecording:
     """Start a recording, from rest, or end and save it."""
 
     on: bool
@@ -104,18 +104,18 @@ class ClearLamps:
     """Put the overload lamps out."""
 
 
-Command = Turn | Generate | Operate | Play | Step | Tempo | Restart | Inject | Record | ClearLamps
+Command = Turn | Generate | Operate | SetPlaying | Step | Tempo | Restart | Inject | SetRecording | ClearLamps
 
 _COMMANDS: Mapping[str, type[Command]] = {
     "turn": Turn,
     "generate": Generate,
     "operate": Operate,
-    "play": Play,
+    "play": SetPlaying,
     "step": Step,
     "tempo": Tempo,
     "restart": Restart,
     "inject": Inject,
-    "record": Record,
+    "record": SetRecording,
     "clear lamps": ClearLamps,
 }
 """Commands by their names in messages."""

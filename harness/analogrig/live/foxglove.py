@@ -25,7 +25,7 @@ from analogrig.wording import one_line
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
-    from analogrig.live.session import Session
+    from analogrig.live.session import LiveSession
 
 SUBPROTOCOL = "foxglove.websocket.v1"
 
@@ -42,8 +42,8 @@ _TEXT: Mapping[str, Any] = {"type": "string"}
 
 
 @dataclass(frozen=True)
-class Channel:
-    """Channel of messages in JSON."""
+class Topic:
+    """Topic of messages in JSON."""
 
     number: int
     topic: str
@@ -62,19 +62,19 @@ class Channel:
         }
 
 
-def channels_of(session: Session) -> dict[int, Channel]:
+def channels_of(session: LiveSession) -> dict[int, Topic]:
     """Channels of a session by number."""
     signals = dict.fromkeys(signals_of(session), _NUMBER)
     alarm = {"take": _NUMBER, "sample": _NUMBER, "what": _TEXT, "latency_n": _NUMBER, "bound_n": _NUMBER}
     state = {"mode": _TEXT, "samples": _NUMBER, "speed": _NUMBER, "take": _NUMBER}
     tables = {"/signals": {"sample": _NUMBER, **signals}, "/alarms": alarm, "/state": state}
-    return {number: Channel(number, topic, table) for number, (topic, table) in enumerate(tables.items(), 1)}
+    return {number: Topic(number, topic, table) for number, (topic, table) in enumerate(tables.items(), 1)}
 
 
 class Viewer:
     """One viewer at its connection."""
 
-    def __init__(self, socket: ServerConnection, session: Session, *, may_set: Callable[[], bool]) -> None:
+    def __init__(self, socket: ServerConnection, session: LiveSession, *, may_set: Callable[[], bool]) -> None:
         """:param may_set: true while a viewer may set parameters."""
         self._socket = socket
         self._session = session

@@ -7,12 +7,12 @@ from typing import Any
 
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.scope import signals_of
-from analogrig.live.session import Session
+from analogrig.live.session import LiveSession
 from analogrig_emulator import Capacitor, Pot, Resistor
 from analogrig_emulator.machine.patching import patches
 
 
-def bench_table(session: Session) -> dict[str, Any]:
+def bench_table(session: LiveSession) -> dict[str, Any]:
     """Names, limits and drawing of the bench."""
     desk, device = session.desk, session.device
     return {
@@ -33,7 +33,7 @@ def bench_table(session: Session) -> dict[str, Any]:
     }
 
 
-def patch_rows(session: Session) -> list[dict[str, Any]]:
+def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
     """Amplifiers of the patch: kind, output node and quantity, and for each input its node, pot and resistor."""
     desk = session.desk
     if not isinstance(desk, SteppedDesk):
@@ -68,7 +68,7 @@ def patch_rows(session: Session) -> list[dict[str, Any]]:
     return out
 
 
-def state_table(session: Session) -> dict[str, Any]:
+def state_table(session: LiveSession) -> dict[str, Any]:
     """State of the bench."""
     desk, take = session.desk, session.take
     plants = take.plants()
@@ -105,7 +105,7 @@ def state_table(session: Session) -> dict[str, Any]:
     }
 
 
-def _last(session: Session, column: str) -> float | None:
+def _last(session: LiveSession, column: str) -> float | None:
     """Last value of a column of the ring."""
     end = session.ring.end
     try:
@@ -114,7 +114,7 @@ def _last(session: Session, column: str) -> float | None:
         return None
 
 
-def _volts(session: Session) -> dict[str, float]:
+def _volts(session: LiveSession) -> dict[str, float]:
     """Last volts of the amplifiers."""
     end = session.ring.end
     try:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.live.ring import RING_N
-from analogrig.live.session import Session
+from analogrig.live.session import LiveSession
 from analogrig.plant import PARAMETERS, physical_parameters
 from analogrig.run import CHANNELS
 
@@ -82,7 +82,7 @@ class View:
         config.check_range(self, "columns", 10, MOST_COLUMNS)
 
 
-def signals_of(session: Session) -> dict[str, Signal]:
+def signals_of(session: LiveSession) -> dict[str, Signal]:
     """Signals of a session, by their ids."""
     desk, sheet = session.desk, session.device.datasheet
     program = desk.computer.program
@@ -106,7 +106,7 @@ def signals_of(session: Session) -> dict[str, Signal]:
     return {signal.id: signal for signal in out}
 
 
-def read_signal(session: Session, name: str, first: int, end: int) -> Values:
+def read_signal(session: LiveSession, name: str, first: int, end: int) -> Values:
     """Values of a signal: volts of channels and amplifiers, the device's own numbers otherwise; (n,).
 
     :raises LookupError: the ring does not hold the samples, or there is no such signal.
@@ -153,7 +153,7 @@ class Screen:
         self.view = view
         self._shown = None
 
-    def frame(self, session: Session) -> bytes | None:
+    def frame(self, session: LiveSession) -> bytes | None:
         """Next frame; None if there is nothing new to show."""
         view, ring = self.view, session.ring
         if view.trigger.mode == "single" and not self._is_waiting:
@@ -166,7 +166,7 @@ class Screen:
         except LookupError:  # the ring has moved on, or the take has ended
             return None
 
-    def _frame(self, session: Session, take: int, end: int) -> bytes | None:
+    def _frame(self, session: LiveSession, take: int, end: int) -> bytes | None:
         view = self.view
         samples = min(view.samples, end)
         found = None if view.kind == "fft" else self._find_trigger(session, end, samples)
@@ -198,7 +198,7 @@ class Screen:
         header |= {"points": len(columns[0]), "per": per}
         return packed(header, columns)
 
-    def _find_trigger(self, session: Session, end: int, samples: int) -> float | None:
+    def _find_trigger(self, session: LiveSession, end: int, samples: int) -> float | None:
         """Last instant of a trigger after which the screen is full, in samples; None if there is none."""
         trigger = self.view.trigger
         before = round(trigger.position * samples)

@@ -45,7 +45,7 @@ from analogrig.pages import PLOTS, assemble_page
 from analogrig.wording import one_line
 
 if TYPE_CHECKING:
-    from analogrig.live.session import Session
+    from analogrig.live.session import LiveSession
 
 MOST_CLIENTS = 16
 MOST_MESSAGE_BYTES = 8192
@@ -62,7 +62,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
-class _Client:
+class _PageClient:
     """Client of the page."""
 
     socket: ServerConnection
@@ -75,7 +75,7 @@ class BenchServer:
     """Server of one session for the clients of its page and for other viewers."""
 
     def __init__(
-        self, session: Session, *, token: str = "", origins: Collection[str] = (), slow_s: float = SLOW_S
+        self, session: LiveSession, *, token: str = "", origins: Collection[str] = (), slow_s: float = SLOW_S
     ) -> None:
         """Prepare the page.
 
@@ -87,9 +87,9 @@ class BenchServer:
         self.token = token or secrets.token_urlsafe(16)
         self._origins = frozenset(origins)
         self._slow_s = slow_s
-        self._clients: list[_Client] = []
+        self._clients: list[_PageClient] = []
         self._viewers = 0
-        self._driver: _Client | None = None
+        self._driver: _PageClient | None = None
         self._server: Server | None = None
         self._hosts: frozenset[str] = frozenset()
         self._page = page()
@@ -174,11 +174,11 @@ class BenchServer:
                 finally:
                     self._viewers -= 1
             else:
-                await self._serve_client(_Client(socket))
+                await self._serve_client(_PageClient(socket))
 
     # ---- clients of the page
 
-    async def _serve_client(self, client: _Client) -> None:
+    async def _serve_client(self, client: _PageClient) -> None:
         self._clients.append(client)
         self._appoint(client)
         sending = asyncio.create_task(self._send_all(client))
@@ -194,7 +194,7 @@ class BenchServer:
                 self.session.make_safe()
             self._call_all()
 
-    def _appoint(self, client: _Client) -> None:
+    def _appoint(self, client: _PageClient) -> None:
         """Let a client drive if nobody does."""
         if self._driver is None:
             self._driver = client
@@ -204,7 +204,7 @@ class BenchServer:
         for client in self._clients:
             client.changed.set()
 
-    def _reply(self, client: _Client, message: str | bytes) -> dict[str, Any]:
+    def _reply(self, client: _PageClient, message: str | bytes) -> dict[str, Any]:
         """Carry a message out, and return the answer."""
         number: Any = None
         try:
@@ -215,7 +215,7 @@ class BenchServer:
             return {"re": number, "error": one_line(str(error))}
         return {"re": number, "ok": True}
 
-    def _carry_out(self, client: _Client, name: object, table: dict[str, Any]) -> None:
+    def _carry_out(self, client: _PageClient, name: object, table: dict[str, Any]) -> None:
         """:raises ConfigurationError: the message is wrong, or this client does not drive."""
         if name == "view":
             view = config.build(View, table, "view")
@@ -234,7 +234,7 @@ class BenchServer:
             self.session.do(command_of(name, table))
             self._call_all()
 
-    async def _send_all(self, client: _Client) -> None:
+    async def _send_all(self, client: _PageClient) -> None:
         """Send the bench, then frames and states as fast as the client takes them."""
         try:
             await self._send(client, json.dumps({"bench": bench_table(self.session)}))
@@ -257,11 +257,11 @@ class BenchServer:
             _log.info("a client takes nothing: dropped")
             client.socket.transport.abort()
 
-    def _state(self, client: _Client) -> dict[str, Any]:
+    def _state(self, client: _PageClient) -> dict[str, Any]:
         roles = {"drives": client is self._driver, "driven": self._driver is not None, "clients": len(self._clients)}
         return state_table(self.session) | roles
 
-    async def _send(self, client: _Client, message: str | bytes) -> None:
+    async def _send(self, client: _PageClient, message: str | bytes) -> None:
         """:raises TimeoutError: the client takes nothing."""
         async with asyncio.timeout(self._slow_s):
             await client.socket.send(message)

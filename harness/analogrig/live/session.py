@@ -61,7 +61,7 @@ class Saved:
     alarms: int
 
 
-class Session:
+class LiveSession:
     """Rig, device, generator, pots and time of one bench, operated by commands."""
 
     def __init__(
@@ -354,7 +354,7 @@ class Session:
                 self.excitation = self._generated(command)
                 self.is_on = self.is_on if command.on is None else command.on
                 self._ends_take = True
-            case commands.Play():
+            case commands.SetPlaying():
                 self.is_playing, self._steps, self._pace = command.on, 0, None
             case commands.Step():
                 self.is_playing, self._steps = False, self._steps + command.samples
@@ -362,7 +362,7 @@ class Session:
                 self.factor, self._pace = command.factor, None
             case commands.Restart():
                 self._ends_take = True
-            case commands.Record():
+            case commands.SetRecording():
                 self._ends_take = self._ends_take or command.on != self.is_recording
                 self.is_recording = command.on
             case _ if isinstance(self.desk, SteppedDesk):

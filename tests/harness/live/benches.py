@@ -12,20 +12,20 @@ from typing import Any
 from analogrig.devices.registry import describe
 from analogrig.live.commands import Command
 from analogrig.live.server import BenchServer
-from analogrig.live.session import Session
+from analogrig.live.session import LiveSession
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 
 SEED = 7
 
-Action = Command | Callable[[Session], None]
+Action = Command | Callable[[LiveSession], None]
 
 
 class ScriptedClock:
     """Clock that stands still but in waits, and acts when its time has come. The session ends after the last action."""
 
     def __init__(self, script: Sequence[tuple[float, Action]]) -> None:
-        self.session: Session | None = None
+        self.session: LiveSession | None = None
         self.now_s = 0.0
         self._script = list(script)
 
@@ -53,12 +53,12 @@ class ScriptedClock:
 
 def scripted_session(
     script: Sequence[tuple[float, Action]], folder: Path, *, rig: str = "emulator", dut: str = "inproc"
-) -> Session:
+) -> LiveSession:
     """Session that has played a script to its end; time is that of the machine."""
     clock = ScriptedClock(script)
     description = describe(dut)
     with open_rig(rig) as opened, description.direct() as device:
-        session = Session(opened, Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
+        session = LiveSession(opened, Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
         clock.session = session
         session.run()
     return session
@@ -91,7 +91,7 @@ class LiveBench:
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         with open_rig("emulator") as rig, describe(self._dut).direct() as device:
-            session = Session(rig, Scenario.load("thesis"), device, SEED, folder=self._folder)
+            session = LiveSession(rig, Scenario.load("thesis"), device, SEED, folder=self._folder)
             playing = asyncio.create_task(asyncio.to_thread(session.run))
             try:
                 server = BenchServer(session, **self._settings)

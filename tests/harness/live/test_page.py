@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from analogrig import cli
-from analogrig.live.commands import Play, Restart, Step
+from analogrig.live.commands import Restart, SetPlaying, Step
 from analogrig.live.server import BenchServer
 from analogrig.run import Run
 from tests.browser import Watched
@@ -60,7 +60,7 @@ def test_scope_moves_without_a_complaint_or_a_request_elsewhere(opened: Watched,
 
 def test_pot_turned_by_the_keyboard_raises_an_alarm_within_twice_its_bound(opened: Watched, bench: BenchServer) -> None:
     session, page = bench.session, opened.page
-    for command in (Play(on=False), Restart(), Step(1700)):
+    for command in (SetPlaying(on=False), Restart(), Step(1700)):
         session.do(command)
     expect(page.locator("#clock")).to_contain_text("take 2, 85 ms, 1700 samples")
     page.locator(K).press("PageDown")
@@ -179,13 +179,14 @@ def test_second_page_watches_and_drives_when_the_first_is_closed(browser: Browse
 
 
 def test_page_connects_again_when_the_server_has_been_restarted(browser: Browser, tmp_path: Path) -> None:
-    with LiveBench(tmp_path, token="again") as server:
+    settings = {"token": "again"}
+    with LiveBench(tmp_path, **settings) as server:
         watched = opened_at(browser, server)
         port = int(server.address.split(":")[2].partition("/")[0])
     page = watched.page
     page.wait_for_selector("html:not([data-connected])")
     expect(page.locator("#trouble")).to_contain_text("does not answer")
-    with LiveBench(tmp_path, token="again", port=port):
+    with LiveBench(tmp_path, port=port, **settings):
         page.wait_for_selector("html[data-connected]")
         wait_for_frames(page, frames_of(page) + 3)
         expect(page.locator("#trouble")).to_be_hidden()

@@ -15,15 +15,15 @@ from analogrig.live.commands import (
     Generate,
     Inject,
     Operate,
-    Play,
-    Record,
     Restart,
+    SetPlaying,
+    SetRecording,
     Step,
     Tempo,
     Turn,
     command_of,
 )
-from analogrig.live.session import BLOCK_S, Session
+from analogrig.live.session import BLOCK_S, LiveSession
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from tests.harness.live.benches import SEED, scripted_session
@@ -32,21 +32,21 @@ RATE_HZ = 20_000
 BLOCK_N = int(RATE_HZ * BLOCK_S)
 
 PLAYED_BY_HAND = (
-    (0.0, Record(on=True)),
+    (0.0, SetRecording(on=True)),
     (0.1, Turn("K_n_per_m", 18000.0)),
     (0.2, Turn("B_n_s_per_m", 3453.0, 100)),
     (0.3, Turn("M_kg", 60.0)),
-    (0.4, Record(on=False)),
-    (0.41, Play(on=False)),
+    (0.4, SetRecording(on=False)),
+    (0.41, SetPlaying(on=False)),
 )
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Session:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> LiveSession:
     return scripted_session(PLAYED_BY_HAND, tmp_path_factory.mktemp("live"))
 
 
-def test_recording_names_the_sample_of_every_turn(recorded: Session) -> None:
+def test_recording_names_the_sample_of_every_turn(recorded: LiveSession) -> None:
     (saved,) = recorded.saved
     run = Run.load(saved.run)
     assert run.samples == saved.samples == 32 * BLOCK_N - BLOCK_N
@@ -59,7 +59,7 @@ def test_recording_names_the_sample_of_every_turn(recorded: Session) -> None:
     assert [segment.start for segment in run.conditions.segments] == [0, *(each.sample for each in scenario.tweaks)]
 
 
-def test_scenario_of_a_recording_plays_the_same_codes_on_the_emulator(recorded: Session, tmp_path: Path) -> None:
+def test_scenario_of_a_recording_plays_the_same_codes_on_the_emulator(recorded: LiveSession, tmp_path: Path) -> None:
     (saved,) = recorded.saved
     out = tmp_path / "again"
     cli.main(["run", "--scenario", str(saved.scenario), "--rig", "emulator", "--dut", "inproc", "--out", str(out)])
@@ -69,7 +69,7 @@ def test_scenario_of_a_recording_plays_the_same_codes_on_the_emulator(recorded: 
 
 
 def test_replay_and_judge_find_the_alarms_that_were_seen_live(
-    recorded: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recorded: LiveSession, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (saved,) = recorded.saved
     seen = {alarm.sample: alarm.latency_n for alarm in recorded.notes.alarms if alarm.take == 2}
@@ -84,7 +84,7 @@ def test_replay_and_judge_find_the_alarms_that_were_seen_live(
         ]
 
 
-def test_pot_is_felt_within_one_block(recorded: Session) -> None:
+def test_pot_is_felt_within_one_block(recorded: LiveSession) -> None:
     assert len(recorded.notes.felt_s) == 3
     assert max(recorded.notes.felt_s) <= 2 * BLOCK_S
 
@@ -92,11 +92,11 @@ def test_pot_is_felt_within_one_block(recorded: Session) -> None:
 def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) -> None:
     ends: list[int] = []
 
-    def note(session: Session) -> None:
+    def note(session: LiveSession) -> None:
         ends.append(session.ring.end)
 
     scripted_session(
-        ((0.0, Play(on=False)), (1.0, note), (2.0, Step(1)), (3.0, note), (4.0, Step(7)), (5.0, note)), tmp_path
+        ((0.0, SetPlaying(on=False)), (1.0, note), (2.0, Step(1)), (3.0, note), (4.0, Step(7)), (5.0, note)), tmp_path
     )
     assert ends == [0, 1, 8]
 
@@ -104,7 +104,7 @@ def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) 
 def test_time_factor_slows_and_hastens_the_session(tmp_path: Path) -> None:
     ends: list[int] = []
 
-    def note(session: Session) -> None:
+    def note(session: LiveSession) -> None:
         ends.append(session.ring.end)
 
     scripted_session(((0.0, Tempo(100.0)), (1.0, note), (1.0, Tempo(0.5)), (1.1, note)), tmp_path)
@@ -114,7 +114,7 @@ def test_time_factor_slows_and_hastens_the_session(tmp_path: Path) -> None:
 
 
 def test_hold_keeps_the_outputs_of_the_integrators(tmp_path: Path) -> None:
-    session = scripted_session(((0.1, Operate("HOLD")), (0.2, Play(on=False))), tmp_path)
+    session = scripted_session(((0.1, Operate("HOLD")), (0.2, SetPlaying(on=False))), tmp_path)
     end = session.ring.end
     held = session.ring.read("probed", end - 500, end)[:, session.desk.amplifiers.index("U3")]
     assert float(np.ptp(held)) < 0.02  # the edges of the force come through the amplifiers
@@ -130,13 +130,18 @@ def test_modes_are_reached_through_the_modes_between(tmp_path: Path) -> None:
 
 
 def test_generator_that_is_off_gives_no_volts(tmp_path: Path) -> None:
-    session = scripted_session(((0.05, Generate(on=False)), (0.1, Play(on=False))), tmp_path)
+    session = scripted_session(((0.05, Generate(on=False)), (0.1, SetPlaying(on=False))), tmp_path)
     end = session.ring.end
     assert np.abs(session.ring.read("probed", end - 500, end)).max() < 0.1
 
 
 def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path: Path) -> None:
-    script = ((0.0, Record(on=True)), (0.1, Inject("stuck", on=True)), (0.2, Record(on=False)), (0.21, Play(on=False)))
+    script = (
+        (0.0, SetRecording(on=True)),
+        (0.1, Inject("stuck", on=True)),
+        (0.2, SetRecording(on=False)),
+        (0.21, SetPlaying(on=False)),
+    )
     (saved,) = scripted_session(script, tmp_path).saved
     run = Run.load(saved.run)
     assert np.unique(run.codes[2500:, 1]).size <= 12  # the noise of the card alone
@@ -157,7 +162,7 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
 def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
     command: Turn | Generate, words: str, tmp_path: Path
 ) -> None:
-    def refuse(session: Session) -> None:
+    def refuse(session: LiveSession) -> None:
         with pytest.raises(ConfigurationError, match=words):
             session.do(command)
 
@@ -167,12 +172,12 @@ def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
 
 
 def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> None:
-    def refuse(session: Session) -> None:
+    def refuse(session: LiveSession) -> None:
         for command in (Generate(high_v=5.0), Operate("HOLD")):
             with pytest.raises(ConfigurationError, match="within a recording"):
                 session.do(command)
 
-    session = scripted_session(((0.0, Record(on=True)), (0.05, refuse)), tmp_path)
+    session = scripted_session(((0.0, SetRecording(on=True)), (0.05, refuse)), tmp_path)
     assert len(session.saved) == 1  # the end of the session ends the recording too
 
 
@@ -187,7 +192,7 @@ def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
 def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None:
     held: list[int] = []
 
-    def note(session: Session) -> None:
+    def note(session: LiveSession) -> None:
         held.append(sum(column.nbytes for column in session.ring.columns.values()))
         assert not session.take.changes
 
@@ -202,10 +207,15 @@ def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> No
     from tests.harness.live.benches import ScriptedClock
 
     clock = ScriptedClock(
-        ((0.02, Turn("K_n_per_m", 18000.0)), (0.05, Play(on=False)), (90.0, Play(on=True)), (90.1, Play(on=False)))
+        (
+            (0.02, Turn("K_n_per_m", 18000.0)),
+            (0.05, SetPlaying(on=False)),
+            (90.0, SetPlaying(on=True)),
+            (90.1, SetPlaying(on=False)),
+        )
     )
     with open_rig("emulator") as rig, open_dut("inproc") as device:
-        session = Session(rig, Scenario.load("thesis"), device, SEED, folder=tmp_path, clock=clock)
+        session = LiveSession(rig, Scenario.load("thesis"), device, SEED, folder=tmp_path, clock=clock)
         clock.session = session
         session.run()
     assert not session.notices
