@@ -49,6 +49,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("bench",),
     ("recordings",),
     ("campaigns", "testing", "hardware", "reporting", "analogrig"),
+    ("live",),
     ("cli", "device_program"),
 )
 """Modules and folders of ``analogrig``, lowest level first. An import to a higher level runs upwards."""

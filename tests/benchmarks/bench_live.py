@@ -180,7 +180,7 @@ async def _hostile(path: str, seconds: float) -> list[Figure]:
             before_mb = bench.memory_mb("VmRSS")
             until_s = time.monotonic() + seconds
             attacks = [asyncio.create_task(_attack(bench, path, seed, until_s)) for seed in range(6)]
-            answers_ms = []
+            answers_ms: list[float] = []
             while time.monotonic() < until_s:
                 began_s = time.monotonic()
                 await _tell(socket, "turn", name="K_n_per_m", value=20000.0, id=len(answers_ms))

@@ -18,6 +18,7 @@ from tests.harness.live.benches import LiveBench
 
 expect.set_options(timeout=60_000)
 
+TOKEN = "again"  # noqa: S105 - of a server that lives for one test
 K = '[data-setting="K_n_per_m"]'
 
 
@@ -179,14 +180,13 @@ def test_second_page_watches_and_drives_when_the_first_is_closed(browser: Browse
 
 
 def test_page_connects_again_when_the_server_has_been_restarted(browser: Browser, tmp_path: Path) -> None:
-    settings = {"token": "again"}
-    with LiveBench(tmp_path, **settings) as server:
+    with LiveBench(tmp_path, token=TOKEN) as server:
         watched = opened_at(browser, server)
         port = int(server.address.split(":")[2].partition("/")[0])
     page = watched.page
     page.wait_for_selector("html:not([data-connected])")
     expect(page.locator("#trouble")).to_contain_text("does not answer")
-    with LiveBench(tmp_path, port=port, **settings):
+    with LiveBench(tmp_path, token=TOKEN, port=port):
         page.wait_for_selector("html[data-connected]")
         wait_for_frames(page, frames_of(page) + 3)
         expect(page.locator("#trouble")).to_be_hidden()
