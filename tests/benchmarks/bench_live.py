@@ -66,7 +66,7 @@ class _Process:
 
     def __init__(self, folder: Path) -> None:
         command = [sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--json", "--out", str(folder)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         self.address = json.loads(self._process.stdout.readline())["address"]
 

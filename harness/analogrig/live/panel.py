@@ -70,7 +70,7 @@ def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
 
 def state_table(session: LiveSession) -> dict[str, Any]:
     """State of the bench."""
-    desk, take = session.desk, session.take
+    take = session.take
     plants = take.plants()
     truth = plants[-1][1].parameters() if not take.scenario.caveats else {}
     estimates = session.notes.estimates()
@@ -85,8 +85,8 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "rate": session.sample_rate_hz,
         "overruns": session.overruns_n,
         "missing": session.notes.missing_n,
-        "mode": desk.mode,
-        "lamps": list(desk.lamps),
+        "mode": session.mode,
+        "lamps": list(session.lamps),
         "values": dict(session.values),
         "generator": {"on": session.is_on, **dataclasses.asdict(session.excitation)},
         "faults": sorted(session.injected),

@@ -182,12 +182,15 @@ class BenchServer:
         self._clients.append(client)
         self._appoint(client)
         sending = asyncio.create_task(self._send_all(client))
+        sending.add_done_callback(lambda _: client.socket.transport.abort())
         try:
             async for message in client.socket:
                 await self._send(client, json.dumps(self._reply(client, message)))
         finally:
             sending.cancel()
-            await asyncio.gather(sending, return_exceptions=True)
+            for error in await asyncio.gather(sending, return_exceptions=True):
+                if isinstance(error, Exception):
+                    _log.error("frames have ended", exc_info=error)
             self._clients.remove(client)
             if client is self._driver:
                 self._driver = None
@@ -255,7 +258,6 @@ class BenchServer:
             pass
         except TimeoutError:
             _log.info("a client takes nothing: dropped")
-            client.socket.transport.abort()
 
     def _state(self, client: _PageClient) -> dict[str, Any]:
         roles = {"drives": client is self._driver, "driven": self._driver is not None, "clients": len(self._clients)}

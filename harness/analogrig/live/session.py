@@ -99,6 +99,8 @@ class LiveSession:
         self.excitation = self.desk.scenario.excitation
         self.is_on = self.desk.is_stepped
         """True while the generator is on."""
+        self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
+        """Mode and lit lamps after the last block. The machine itself belongs to the thread that plays."""
         self.is_playing = True
         self.factor = 1.0
         """Wall-clock time per machine time."""
@@ -379,6 +381,7 @@ class LiveSession:
                     self._note_fault(command.fault)
             case commands.ClearLamps():
                 desk.clear_lamps()
+        self.mode, self.lamps = desk.mode, tuple(desk.lamps)
 
     def _note_fault(self, fault: commands.Fault) -> None:
         self.take.caveats.append(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
@@ -410,6 +413,7 @@ class LiveSession:
     def _watch(self, block: Block, answers: Answers) -> None:
         """Take note of an answered block."""
         now_s = self.clock()
+        self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
         self.ring.add(block, self.desk.probed(len(block.codes)), answers)
         if self.notes.watch(block, answers, now_s) or not self.is_playing:
             self.version += 1

@@ -16,7 +16,7 @@ from analogrig.run import Run
 from tests.browser import Watched
 from tests.harness.live.benches import LiveBench
 
-expect.set_options(timeout=60_000)
+expect.set_options(timeout=600_000)
 
 TOKEN = "again"  # noqa: S105 - of a server that lives for one test
 K = '[data-setting="K_n_per_m"]'
@@ -37,7 +37,7 @@ def opened(browser: Browser, bench: BenchServer) -> Iterator[Watched]:
 
 def opened_at(browser: Browser, bench: BenchServer, width: int = 1200) -> Watched:
     watched = Watched(browser, bench.address, width=width)
-    watched.page.set_default_timeout(60_000)
+    watched.page.set_default_timeout(600_000)
     watched.page.wait_for_selector("html[data-connected][data-role]")
     return watched
 
