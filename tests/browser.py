@@ -27,9 +27,9 @@ PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimat
 class Watched:
     """A page of the browser, with everything it complained of and asked for."""
 
-    def __init__(self, browser: Browser, place: Path | str, *, width: int = 1200) -> None:
+    def __init__(self, browser: Browser, place: Path | str) -> None:
         """Open a file or an address."""
-        self.page: Page = browser.new_page(viewport={"width": width, "height": 1000})
+        self.page: Page = browser.new_page(viewport={"width": 1200, "height": 1000})
         self.complaints: list[str] = []
         self.requests: list[str] = []
         self.page.on("console", lambda message: self.complaints.append(message.text))
@@ -37,15 +37,6 @@ class Watched:
         self.page.on("requestfailed", lambda request: self.complaints.append(request.url))
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(place if isinstance(place, str) else place.as_uri())
-
-    def serious(self) -> list[str]:
-        """Serious and critical findings of axe-core, with the elements."""
-        found = Axe().run(self.page).response["violations"]
-        return [
-            f"{each['id']}: {', '.join(node['html'][:100] for node in each['nodes'])}"
-            for each in found
-            if each["impact"] in ("serious", "critical")
-        ]
 
     def faults(self) -> list[str]:
         """Complaints, what is wider than the window, and what axe-core finds: light and dark, wide and narrow."""

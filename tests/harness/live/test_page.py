@@ -35,8 +35,8 @@ def opened(browser: Browser, bench: BenchServer) -> Iterator[Watched]:
     watched.page.close()
 
 
-def opened_at(browser: Browser, bench: BenchServer, width: int = 1200) -> Watched:
-    watched = Watched(browser, bench.address, width=width)
+def opened_at(browser: Browser, bench: BenchServer) -> Watched:
+    watched = Watched(browser, bench.address)
     watched.page.set_default_timeout(600_000)
     watched.page.wait_for_selector("html[data-connected][data-role]")
     return watched
@@ -193,15 +193,6 @@ def test_page_connects_again_when_the_server_has_been_restarted(browser: Browser
         page.close()
 
 
-def test_narrow_page_needs_no_sideways_scrolling(browser: Browser, bench: BenchServer) -> None:
-    watched = opened_at(browser, bench, width=390)
-    wait_for_frames(watched.page, 2)
-    assert watched.page.evaluate("document.documentElement.scrollWidth") <= 390
-    watched.page.close()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing_serious(opened: Watched, scheme: str) -> None:
-    opened.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]  # one of two texts
+def test_page_has_no_faults_light_and_dark_wide_and_narrow(opened: Watched) -> None:
     wait_for_frames(opened.page, 2)
-    assert opened.serious() == []
+    assert opened.faults() == []
