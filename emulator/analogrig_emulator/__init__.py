@@ -48,9 +48,10 @@ from analogrig_emulator.errors import (
     ProgramError,
     SamplerError,
 )
-from analogrig_emulator.machine.compiler import PatchedProgram, load_program
+from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
+from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
 from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, BumpStop, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
@@ -93,6 +94,7 @@ __all__ = [
     "EmulatorError",
     "Engine",
     "EngineError",
+    "Equations",
     "Excitation",
     "ExcitationError",
     "ForceLaw",
@@ -118,6 +120,7 @@ __all__ = [
     "PotTurn",
     "Program",
     "ProgramError",
+    "ProgramParameter",
     "Repeat",
     "RepeatedPlay",
     "Resistor",
@@ -137,10 +140,12 @@ __all__ = [
     "ahead_ticks",
     "drawn_levels",
     "drawn_offsets_v",
+    "equations_of",
     "is_repeatable",
     "load_program",
     "piecewise_linear",
     "preset",
     "probes_per_sample",
     "to_spice",
+    "wired",
 ]

@@ -54,10 +54,10 @@ class Effect:
 
 
 _FRONT_CHANGES: Sequence[PotTurn] = (
-    PotTurn(200, {"K_n_per_m": 18000.0}),
-    PotTurn(400, {"B_n_s_per_m": 3453.0}),
-    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotTurn(600, {"M_kg": 30.0}),
+    PotTurn(200, {"K": 18000.0}),
+    PotTurn(400, {"B": 3453.0}),
+    PotTurn(500, {"B": 2123.0, "K": 20000.0}),
+    PotTurn(600, {"M": 30.0}),
 )
 
 
@@ -74,7 +74,7 @@ _SLOW_CHANGE_N = 100
 """Samples of the ramp of K to four fifths, for effects of a turning pot."""
 
 _Operator = Callable[[SuspensionComputer, Mapping[str, float], np.random.Generator], Mapping[str, float]]
-"""Operator: maps wanted values of M_kg, B_n_s_per_m, K_n_per_m to the settings made."""
+"""Operator: maps wanted values of M, B, K to the settings made."""
 
 
 def _set_exactly(
@@ -139,7 +139,7 @@ class _Setup:
 
     def _changes(self, program: Program) -> Sequence[PotTurn]:
         if self.turning:
-            return [PotTurn(200, {"K_n_per_m": 0.8 * program.values["K_n_per_m"]}, _SLOW_CHANGE_N)]
+            return [PotTurn(200, {"K": 0.8 * program.values["K"]}, _SLOW_CHANGE_N)]
         return _CHANGES[program.name]
 
 

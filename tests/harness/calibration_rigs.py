@@ -123,8 +123,8 @@ def thesis_profile(program: Program) -> Scenario:
     if program == "front":
         return thesis
     front, shock = PROGRAMS["front"].values, PROGRAMS["shock"].values
-    b = shock["B_n_s_per_m"] / front["B_n_s_per_m"]
-    k = shock["K_n_per_m"] / front["K_n_per_m"]
+    b = shock["B"] / front["B"]
+    k = shock["K"] / front["K"]
     return Scenario(
         samples=thesis.samples,
         excitation=thesis.excitation,

@@ -161,7 +161,7 @@ def test_interval_on_a_finer_card_allows_for_real_components() -> None:
         sample, lsb_v = 1500 + 17 * seed, 20.0 / 65536
         drawn = dataclasses.replace(COMPONENTS["polyester"], seed=seed)
         computer = SuspensionComputer("front", rng=np.random.default_rng(seed), components=drawn)
-        turned = [PotTurn(sample, {"B_n_s_per_m": 2123.0}), PotTurn(sample + 112, {"K_n_per_m": 20000.0})]
+        turned = [PotTurn(sample, {"B": 2123.0}), PotTurn(sample + 112, {"K": 20000.0})]
         blocks = list(computer.play(Excitation(low_v=0.1, high_v=9.9), 3500, turned))
         volts = np.concatenate(blocks)[:, :2]
         volts = lsb_v * np.rint(volts / lsb_v + np.random.default_rng(seed).normal(size=volts.shape))

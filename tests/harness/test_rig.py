@@ -92,7 +92,7 @@ def test_pot_beyond_its_track_is_refused_before_the_run() -> None:
     scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, mass_kg=20.0),))
     with (
         open_rig("emulator") as rig,
-        pytest.raises(ConfigurationError, match=r"healthy: tweaks\[0\] at sample 50: pot M: .*M_kg = 20"),
+        pytest.raises(ConfigurationError, match=r"healthy: tweaks\[0\] at sample 50: pot M: .*M = 20"),
     ):
         rig.perform(scenario, 1)
 

@@ -122,9 +122,9 @@ class SuspensionProgram(Program):
         by_b, by_k = parts.rb_ohm / parts.rfb_ohm, parts.rk_ohm / parts.rfb_ohm
         displacement_m = self.scales.full("displacement")
         return {
-            "M_kg": Mass("M", "R1", self.M_kg, mass, velocity_m_per_s),
-            "B_n_s_per_m": ForceLaw("B", "RB", self.B_n_s_per_m, velocity_m_per_s, force_n, by_b),
-            "K_n_per_m": ForceLaw("K", "RK", self.K_n_per_m, displacement_m, force_n, by_k),
+            "M": Mass("M", "R1", self.M_kg, mass, velocity_m_per_s),
+            "B": ForceLaw("B", "RB", self.B_n_s_per_m, velocity_m_per_s, force_n, by_b),
+            "K": ForceLaw("K", "RK", self.K_n_per_m, displacement_m, force_n, by_k),
         }
 
     @property

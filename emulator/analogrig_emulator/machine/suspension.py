@@ -99,7 +99,7 @@ class SuspensionComputer:
         return {pot: self._pots[pot].coefficient(dial) for pot, dial in self.dials.items()}
 
     def set(self, ramp_n: int = 0, /, **settings: float) -> None:
-        """Set pots by value (front: M_kg, B_n_s_per_m, K_n_per_m) or by dial (M_dial, B_dial, K_dial, 0..1).
+        """Set pots by value (front: M, B, K) or by dial (M_dial, B_dial, K_dial, 0..1).
 
         Values set the coefficient under load, as in pot-set mode. A running machine keeps its voltages. With ramp_n
         the pots arrive so many samples after the last one taken.

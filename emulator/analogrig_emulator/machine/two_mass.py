@@ -119,12 +119,12 @@ class TwoMassProgram(Program):
             return ForceLaw(pot, f"R{pot}", value, full(quantity), full(total), gain)
 
         return {
-            "M2_kg": Mass("M2", "RM2", plant.M2_kg, m2, full("velocity")),
-            "B2_n_s_per_m": force("B2", plant.B2_n_s_per_m, "compression_rate", "suspension_force", parts.r_b2_ohm),
-            "K2_n_per_m": force("K2", plant.K2_n_per_m, "compression", "suspension_force", parts.r_k2_ohm),
-            "M1_kg": Mass("M1", "RM1", plant.M1_kg, m1, full("tyre_velocity")),
-            "B1_n_s_per_m": force("B1", plant.B1_n_s_per_m, "tyre_velocity", "tyre_net_force", parts.r_b1_ohm),
-            "K1_n_per_m": force("K1", plant.K1_n_per_m, "tyre_displacement", "tyre_net_force", parts.r_k1_ohm),
+            "M2": Mass("M2", "RM2", plant.M2_kg, m2, full("velocity")),
+            "B2": force("B2", plant.B2_n_s_per_m, "compression_rate", "suspension_force", parts.r_b2_ohm),
+            "K2": force("K2", plant.K2_n_per_m, "compression", "suspension_force", parts.r_k2_ohm),
+            "M1": Mass("M1", "RM1", plant.M1_kg, m1, full("tyre_velocity")),
+            "B1": force("B1", plant.B1_n_s_per_m, "tyre_velocity", "tyre_net_force", parts.r_b1_ohm),
+            "K1": force("K1", plant.K1_n_per_m, "tyre_displacement", "tyre_net_force", parts.r_k1_ohm),
         }
 
     @property

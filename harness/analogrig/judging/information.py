@@ -7,7 +7,7 @@ in which
 
 reaches ln ARL0 (Lorden 1971; Lai 1998). This is an asymptotic bound as ARL0 grows. At an ARL0 of 1e5, a window-limited
 GLR test that knows both plants has 0.962 of it. A single delay may be shorter still. I(n) compares the plant before and
-after the change. It depends on the phase of the excitation, so it is computed for each change in each run.
+after the change, which must be linear. It depends on the phase of the excitation, so it is computed for each change in each run.
 
 Isolation: the changed parameter is known with 95 % confidence once I(n) between the true plant and its best rival
 reaches ln 20. A rival is a plant with one other parameter changed.
@@ -15,7 +15,6 @@ reaches ln 20. A rival is a plant with one other parameter changed.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,9 +23,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, discretise
-from analogrig.run import CHUNK_SAMPLES, Run
-from analogrig_emulator import PROGRAMS, TICKS_PER_SAMPLE, Edges
+from analogrig.errors import ConfigurationError
+from analogrig.plant import Plant, SampledPlant, State, discretise
+from analogrig.run import CHUNK_SAMPLES, INPUT, Run
+from analogrig_emulator import TICKS_PER_SAMPLE, Edges
 
 if TYPE_CHECKING:
     from analogrig.scenario import Scenario
@@ -56,18 +56,20 @@ class _Change:
     """Plant in each sample period of the ramp; empty for a jump."""
     state: State
     """State of the plant at the change."""
-    force_n: NDArray[np.float64]
-    """(n,) measured force in newtons."""
+    driven: NDArray[np.float64]
+    """(n,) measured input."""
     weight: NDArray[np.float64]
-    """(n,) information per squared metre of displacement after each force; 0 for a missing sample."""
+    """(n,) information per squared unit of the output after each input; 0 for a missing sample."""
 
 
 def change_information(run: Run) -> list[NDArray[np.float64]]:
-    """I(1), I(2), ... of each change of ``run``, up to the next change or the end: float64 arrays.
+    """I(1), I(2), ... of each change of ``run``, up to the next change or the end: float64 arrays; empty if unknown.
 
-    Both plants start from the true state at the change and follow the measured force. Samples that the device could
-    not use carry no information.
+    Both plants start from the true state at the change and follow the measured input. Samples that the device could
+    not use carry no information. It is unknown for a program that is not linear.
     """
+    if not run.conditions.program.is_linear:
+        return [np.zeros(0) for _ in run.segments[1:]]
     period_s = run.conditions.sample_period_problem_s
     return [_information(change, period_s) for change in _run_changes(run)]
 
@@ -75,51 +77,51 @@ def change_information(run: Run) -> list[NDArray[np.float64]]:
 def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
     """I(1), I(2), ... of one change, float64."""
     changed = _Motion.of_change(change, period_s)
-    unchanged = _Motion(change.state, itertools.repeat(SampledPlant.from_plant(change.before, period_s)))
-    out = np.empty(len(change.force_n))
+    unchanged = _Motion(change.state, (), SampledPlant.from_plant(change.before, period_s))
+    out = np.empty(len(change.driven))
     gathered = 0.0
     for first in range(0, len(out), CHUNK_SAMPLES):
         part = slice(first, first + CHUNK_SAMPLES)
-        difference_m = changed.displacement_m(change.force_n[part]) - unchanged.displacement_m(change.force_n[part])
-        out[part] = np.cumsum(np.append(gathered, difference_m**2 * change.weight[part]))[1:]
+        difference = changed.outputs(change.driven[part]) - unchanged.outputs(change.driven[part])
+        out[part] = np.cumsum(np.append(gathered, difference**2 * change.weight[part]))[1:]
         gathered = float(out[part][-1])
     return out
 
 
 class _Motion:
-    """Simulation of a plant under a force, chunk by chunk."""
+    """Simulation of a plant under an input, chunk by chunk."""
 
-    def __init__(self, state: State, steps: Iterator[SampledPlant]) -> None:
-        """Start from ``state``; ``steps`` yields the plant of each sample period."""
+    def __init__(self, state: State, ramp: Iterable[SampledPlant], settled: SampledPlant) -> None:
+        """Start from ``state``; ``ramp`` yields the plant of each of the first sample periods."""
         self.state = state
-        self._steps = steps
+        self._ramp = iter(ramp)
+        self._settled = settled
 
     @classmethod
     def of_change(cls, change: _Change, period_s: float) -> _Motion:
         """Motion of the true plant from the change on."""
-        settled = itertools.repeat(SampledPlant.from_plant(change.after, period_s))
-        return cls(change.state, itertools.chain(change.ramp, settled))
+        return cls(change.state, change.ramp, SampledPlant.from_plant(change.after, period_s))
 
-    def displacement_m(self, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement after each of the next n forces, (n,) metres."""
-        state = self.state
-        out = np.empty(len(force_n))
-        for k, (force, step) in enumerate(zip(force_n.tolist(), self._steps, strict=False)):
-            state = step.next(state, force)
-            out[k] = state[0]
-        self.state = state
-        return out
+    def outputs(self, driven: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Output after each of the next n inputs, (n,)."""
+        ramped = []
+        for value, step in zip(driven.tolist(), self._ramp, strict=False):
+            self.state = step.next(self.state, value)
+            ramped.append(step.output(self.state))
+        out, self.state = self._settled.play(self.state, driven[len(ramped) :])
+        return np.append(ramped, out) if ramped else out
 
 
 def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096) -> bool:
     """True if every change of a scenario is detectable before the next one: its information I(n) reaches ln ARL0.
 
     A prediction from the plant and the excitation of the scenario, with its own phase even if the seed draws one. The
-    bounds of a run come from the measured force.
+    bounds of a run come from the measured input.
 
     :param arl0: average run length between false alarms, in samples.
-    :param noise_lsb: noise of the displacement channel, rms in LSB.
-    :param lsb_v: resolution of the displacement channel, in volts.
+    :param noise_lsb: noise of the output's channel, rms in LSB.
+    :param lsb_v: resolution of the output's channel, in volts.
+    :raises ConfigurationError: the program is not linear.
     """
     return all(bound is not None for bound in predicted_bounds(scenario, arl0, noise_lsb=noise_lsb, lsb_v=lsb_v))
 
@@ -131,11 +133,14 @@ def predicted_bounds(
 
     Parameters as ``detectable``.
     """
-    scales = PROGRAMS[scenario.plant.set].scales
-    lsb_m = lsb_v / scales.volts("displacement")
-    weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb_m**2))
+    program = scenario.program
+    if not program.is_linear:
+        raise ConfigurationError(f"program {program.name} is not linear: its information bounds are unknown")
+    scales, (driven, output) = program.circuit.scales, program.measured
+    lsb = lsb_v / scales.volts(output)
+    weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb**2))
     volts = _mean_levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, _RATE_HZ), scenario.samples)
-    force_n = volts / scales.volts("force")
+    inputs = volts / scales.volts(driven)
     segments = scenario.segments()
     ends = [*(segment.start for segment in segments[1:]), scenario.samples]
     stretches = [(segment.start, end, segment.plant) for segment, end in zip(segments, ends, strict=True)]
@@ -143,7 +148,7 @@ def predicted_bounds(
     period_s = scales.time / _RATE_HZ
     return [
         first_at_level(_information(change, period_s), math.log(arl0))
-        for change in _changes_between(stretches, ramps_n, force_n, weight, period_s)
+        for change in _changes_between(stretches, ramps_n, inputs, weight, period_s)
     ]
 
 
@@ -157,8 +162,11 @@ def _mean_levels(edges: Edges, samples: int) -> NDArray[np.float64]:
 def isolation_bounds(run: Run) -> list[int | None]:
     """Isolation bound of each change of ``run`` in samples; None: not before the next change or the end.
 
-    The rival hypotheses are changes of one other parameter by any factor from 1/4 to 4.
+    The rival hypotheses are changes of one other parameter by any factor from 1/4 to 4. The bound is unknown for a
+    program that is not linear.
     """
+    if not run.conditions.program.is_linear:
+        return [None for _ in run.segments[1:]]
     period_s = run.conditions.sample_period_problem_s
     out: list[int | None] = []
     for (start, _, _), change in zip(run.segments[1:], _run_changes(run), strict=True):
@@ -166,11 +174,11 @@ def isolation_bounds(run: Run) -> list[int | None]:
             out.append(None)  # the device restarts with each record and has nothing to isolate
             continue
         changed = tuple(change.before.changes_to(change.after))
-        course = _Motion.of_change(change, period_s).displacement_m(change.force_n[:ISOLATION_HORIZON_N])
+        course = _Motion.of_change(change, period_s).outputs(change.driven[:ISOLATION_HORIZON_N])
         least = np.full(len(course), np.inf)
-        for name in PARAMETERS:
+        for name in change.before.parameters():
             if changed != (name,):
-                apart = (_rival_displacements(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
+                apart = (_rival_outputs(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
                 least = np.minimum(least, _interpolate_minimum(np.cumsum(apart, axis=1)))
         out.append(first_at_level(least, ISOLATION_INFORMATION))
     return out
@@ -179,38 +187,37 @@ def isolation_bounds(run: Run) -> list[int | None]:
 def _run_changes(run: Run) -> Iterator[_Change]:
     """Changes of the plant in ``run``, including those at the start of a record."""
     conditions = run.conditions
-    force_n = run.channel("force")
-    displacement = conditions.channels["displacement"]
-    variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
-    weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
+    driven, output = run.channel(conditions.program.channels[INPUT]), conditions.output
+    variance = (output.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * output.lsb**2
+    weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance))
     ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
     return _changes_between(
-        run.segments, ramps_n, force_n, weight, conditions.sample_period_problem_s, records=conditions.records
+        run.segments, ramps_n, driven, weight, conditions.sample_period_problem_s, records=conditions.records
     )
 
 
 def _changes_between(
     stretches: Iterable[tuple[int, int, Plant]],
     ramps_n: Mapping[int, int],
-    force_n: NDArray[np.float64],
+    driven: NDArray[np.float64],
     weight: NDArray[np.float64],
     period_s: float,
     records: Sequence[int] = (0,),
 ) -> Iterator[_Change]:
-    """Changes between stretches (start, end, plant) under a force. The plant is at rest at the start of each record."""
-    state = AT_REST
+    """Changes between stretches (start, end, plant) under an input. The plant is at rest at the start of each record."""
+    state: State = ()
     before: Plant | None = None
     for start, end, plant in stretches:
         if start in records:
-            state = AT_REST
+            state = SampledPlant.from_plant(plant, period_s).at_rest
         ramp = _ramp_plants(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
-        change = _Change(before or plant, plant, ramp, state, force_n[start : end - 1], weight[start + 1 : end])
+        change = _Change(before or plant, plant, ramp, state, driven[start : end - 1], weight[start + 1 : end])
         if before is not None:
             yield change
-        if end < len(force_n):
+        if end < len(driven):
             motion = _Motion.of_change(change, period_s)
             for first in range(start, end, CHUNK_SAMPLES):
-                motion.displacement_m(force_n[first : min(first + CHUNK_SAMPLES, end)])
+                motion.outputs(driven[first : min(first + CHUNK_SAMPLES, end)])
             state = motion.state
         before = plant
 
@@ -228,17 +235,18 @@ def first_at_level(information: Sequence[float] | NDArray[np.float64], level: fl
     return int(reached[0]) + 1 if len(reached) else None
 
 
-def _rival_displacements(change: _Change, name: str, period_s: float) -> NDArray[np.float64]:
-    """Displacement if only the parameter ``name`` had changed, for each rival factor: (f, n) metres, to the horizon."""
-    plants = np.tile(list(change.before.parameters().values()), (len(_RIVAL_FACTORS), 1))
-    plants[:, PARAMETERS.index(name)] *= _RIVAL_FACTORS
-    (xx, xv, xf), (vx, vv, vf) = discretise(plants, period_s).transpose(1, 2, 0)
-    x, v = (np.full(len(plants), value) for value in change.state)
-    forces = change.force_n[:ISOLATION_HORIZON_N].tolist()
-    out = np.empty((len(plants), len(forces)))
-    for k, force in enumerate(forces):
-        x, v = xx * x + xv * v + xf * force, vx * x + vv * v + vf * force
-        out[:, k] = x
+def _rival_outputs(change: _Change, name: str, period_s: float) -> NDArray[np.float64]:
+    """Output if only the parameter ``name`` had changed, for each rival factor: (f, n), to the horizon."""
+    program = change.before.program
+    plants = np.tile(change.before.values, (len(_RIVAL_FACTORS), 1))
+    plants[:, list(program.parameters).index(name)] *= _RIVAL_FACTORS
+    sampled, readouts = discretise(program, plants, period_s), program.generators(plants)[:, -1, :-1]
+    states = np.tile(change.state, (len(plants), 1))
+    inputs = change.driven[:ISOLATION_HORIZON_N].tolist()
+    out = np.empty((len(plants), len(inputs)))
+    for k, value in enumerate(inputs):
+        states = np.einsum("fij,fj->fi", sampled[:, :, :-1], states) + sampled[:, :, -1] * value
+        out[:, k] = (readouts * states).sum(axis=1)
     return out
 
 

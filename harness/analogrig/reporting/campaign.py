@@ -17,7 +17,6 @@ from analogrig.campaigns.summary import CONFIDENCE, DRAWN_BINS, ERROR_BINS, ERRO
 from analogrig.errors import ConfigurationError
 from analogrig.identity import Identity
 from analogrig.judging.bursts import BURST
-from analogrig.plant import PARAMETERS
 from analogrig.reporting.page import FOLDER, assemble_page
 from analogrig.reporting.tables import provenance
 from analogrig.storage import replace_file
@@ -145,7 +144,7 @@ def as_json(results: Results) -> dict[str, Any]:
         },
         "errors": {
             "step": ERROR_STEP,
-            "counts": dict(zip(PARAMETERS, found.errors.tolist(), strict=True)),
+            "counts": dict(zip(results.plan.estimates, found.errors.tolist(), strict=False)),
         },
         "drawn": {
             "axes": {axis: list(ends) for axis, ends in found.axes.items()},
@@ -220,7 +219,7 @@ def render(results: Results) -> str:
 
 def _maps(results: Results) -> str:
     """Maps of each quantity, one for every combination of the values that are not on the axes."""
-    axes = [axis for axis, values in results.plan.spec.grid.axes().items() if len(values) > 1][:2]
+    axes = [axis for axis, values in results.plan.spec.grid.items() if len(values) > 1][:2]
     if not axes:
         return ""
     across, down = axes[0], axes[1] if len(axes) > 1 else None
@@ -285,7 +284,7 @@ def _drawn_maps(results: Results) -> str:
 
 
 def _distributions(results: Results) -> str:
-    """Histograms of the detection delay and of the errors of M, B, K."""
+    """Histograms of the detection delay and of the errors of the estimates."""
     delays = results.latencies
     bars = []
     if len(delays.values):
@@ -293,7 +292,7 @@ def _distributions(results: Results) -> str:
         counts = np.add.reduceat(delays.counts, np.searchsorted(delays.values, edges[:-1]))
         counts[np.searchsorted(delays.values, edges[:-1]) == np.searchsorted(delays.values, edges[1:])] = 0
         bars.append(_histogram("Detection delay [samples]", counts.tolist(), (f"{edges[0]}", f"{edges[-1] - 1}")))
-    for name, row in zip(PARAMETERS, results.distribution.errors, strict=True):
+    for name, row in zip(results.plan.estimates, results.distribution.errors, strict=False):
         inner = row[1:-1]
         if row.any():
             wide = max((abs(i - ERROR_BINS // 2 + 0.5) for i in np.flatnonzero(inner).tolist()), default=0.0)

@@ -18,10 +18,10 @@ from analogrig.judging.verdict import (
     Verdict,
     missing_text,
 )
-from analogrig.plant import PARAMETERS, UNITS
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
 from analogrig.reporting.payload import is_thinned, marked_alarms
+from analogrig.program import Program
 from analogrig.reporting.summary import change_text, lamps_text, load_text
 from analogrig.run import Run
 from analogrig.wording import number_of
@@ -98,7 +98,7 @@ def provenance(identity: Identity | None) -> list[tuple[str, str]]:
     ]
 
 
-def tweaks(verdict: Verdict) -> str:
+def tweaks(run: Run, verdict: Verdict) -> str:
     """Table of the changes of the plant, with latency, bound and result."""
     if not verdict.tweaks:
         return "<p>The plant did not change in this run.</p>"
@@ -107,7 +107,7 @@ def tweaks(verdict: Verdict) -> str:
     if any(tweak.alternatives for tweak in verdict.tweaks):
         caption += "; a range if the instant was estimated from the samples"
     head = heading(("Sample", "Change"), ("Latency", "Bound", "Latency / bound"), ("Result",))
-    return table(caption, head, (_change_row(tweak) for tweak in verdict.tweaks))
+    return table(caption, head, (_change_row(tweak, run.conditions.program) for tweak in verdict.tweaks))
 
 
 def diagnoses(verdict: Verdict) -> str:
@@ -164,15 +164,18 @@ def fit(verdict: Verdict) -> str:
     return table(caption, head, (_misfit_row(period) for period in verdict.fit[:_MAX_MISFITS]))
 
 
-def estimates(verdict: Verdict) -> str:
-    """Table of M, B and K at the end of each segment, compared with the truth."""
+def estimates(run: Run, verdict: Verdict) -> str:
+    """Table of the estimated parameters at the end of each segment, compared with the truth."""
+    program = run.conditions.program
+    if not program.estimates:
+        return f"<p>Not judged: the program {text(program.name)} relates no estimate to its parameters.</p>"
     if ESTIMATES in verdict.not_judged:
         return "<p>Not judged: the device does not report estimates of them.</p>"
     if not verdict.estimates:
         return "<p>The rig does not know the truth about its plant.</p>"
-    groups = [f'<th scope="colgroup" colspan="3">{name} [{text(UNITS[name])}]</th>' for name in PARAMETERS]
+    groups = [f'<th scope="colgroup" colspan="3">{name} [{text(program.unit(name))}]</th>' for name in program.estimates]
     head = row(['<th scope="col" rowspan="2">Samples</th>', *groups])
-    head += heading((), ("estimate", "truth", "error") * len(PARAMETERS))
+    head += heading((), ("estimate", "truth", "error") * len(program.estimates))
     rows = (_segment_row(segment) for segment in verdict.estimates)
     return table("The estimate after the last sample of each segment", head, rows)
 
@@ -238,14 +241,15 @@ def _samples(run: Run, verdict: Verdict) -> str:
     return f"{played}; {verdict.missing_n:,} {missing_text(run)}"
 
 
-def _change_row(tweak: ChangeVerdict) -> str:
+def _change_row(tweak: ChangeVerdict, program: Program) -> str:
     exact = not tweak.alternatives and tweak.latency_n is not None and tweak.bound_n
     ratio = (tweak.latency_n or 0) / (tweak.bound_n or 1) if exact else None
     word, kind = _result(tweak)
     low, high = tweak.between
     instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
     latency = "–" if tweak.latencies_n is None else tweak.latency_text.replace("-", "–")
-    cells = [instant, cell(change_text(tweak).replace("->", "→")), cell(latency, "number"), number(tweak.bound_n)]
+    cells = [instant, cell(change_text(tweak, program).replace("->", "→"))]
+    cells += [cell(latency, "number"), cell("?", "number") if not tweak.is_bounded else number(tweak.bound_n)]
     return row([*cells, number(ratio, ".2f"), cell(word, f"text {kind}")])
 
 
@@ -286,7 +290,7 @@ def _result(tweak: ChangeVerdict) -> tuple[str, str]:
 
 def _segment_row(segment: SegmentEstimate) -> str:
     cells = [_zoom(segment.start, segment.end - 1)]
-    for name in PARAMETERS:
+    for name in segment.truth:
         estimate = None if segment.estimate is None else segment.estimate[name]
         error = None if estimate is None else round(segment.error[name], 4) + 0.0  # never a negative zero
         cells += [number(estimate, ".5g"), number(segment.truth[name], ".6g"), number(error, "+.2%")]
