@@ -51,8 +51,8 @@ from analogrig_emulator.errors import (
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
-from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
 from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
+from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, BumpStop, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v

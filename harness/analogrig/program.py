@@ -185,4 +185,6 @@ def _check_channels(equations: Equations) -> None:
     if not 2 <= len(channels) <= MOST_CHANNELS:
         raise ProgramError(f"channels: {len(channels)} of them; name the input, the output and at most two others")
     if channels[0] != driven:
-        raise ProgramError(f"channels: the first is {channels[0]!r}; name the input that the generator drives, {driven!r}")
+        raise ProgramError(
+            f"channels: the first is {channels[0]!r}; name the input that the generator drives, {driven!r}"
+        )

@@ -279,7 +279,9 @@ def _measure_error(simulation: Simulation) -> dict[str, Facts]:
         },
         "4.6-theory": {
             "samples_from_the_alarm": [None if n is None or found is None else n - found for n, found in pairs],
-            "samples_from_the_start": settling_n(relative_errors(simulation.tracks[ERROR], FRONT.plant, 0, PROFILE[1].start)),
+            "samples_from_the_start": settling_n(
+                relative_errors(simulation.tracks[ERROR], FRONT.plant, 0, PROFILE[1].start)
+            ),
         },
         "4.4-outliers": _robustness(simulation, ERROR),
     }

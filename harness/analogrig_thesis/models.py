@@ -29,7 +29,6 @@ PERIOD_S = 0.01
 """Section 4.2: "The system sample rate was 100Hz"."""
 
 
-
 class Suspension(NamedTuple):
     """Mass, damper and spring of the thesis (Equ 2.3)."""
 

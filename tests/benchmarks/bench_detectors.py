@@ -226,7 +226,7 @@ def _play_change(bench: Bench, what: str, trial: int, effort: Effort) -> _Trial:
     """Play one change; the instants spread over a period of the excitation."""
     instant = FIRST_CHANGE_N + trial * 37 % INSTANTS_N
     plant = changed_plant(what, SIGNS[trial % len(SIGNS)])
-    change = PotChange(instant, plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m)
+    change = PotChange(instant, plant.parameters())
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=instant + AFTER_N, tweaks=(change,))
     seed = CHANGE_SEED + 1000 * list(CHANGES).index(what) + trial
     run = _sound(bench.play(scenario, seed))

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.run import CHANNELS
-from analogrig_emulator import Card
+from analogrig_emulator import CHANNELS, Card
 
 Array = NDArray[np.float64]
 

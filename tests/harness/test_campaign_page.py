@@ -13,7 +13,7 @@ from playwright.sync_api import Browser
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import Row
-from analogrig.campaigns.spec import CampaignSpec, Draw, Grid
+from analogrig.campaigns.spec import Axes, CampaignSpec
 from analogrig.campaigns.summary import Aggregate, Distribution
 from analogrig.campaigns.trials import Trials
 from analogrig.reporting.campaign import render, write_page
@@ -22,14 +22,14 @@ from tests.browser import Watched
 
 def results(name: str = "made") -> Results:
     """Three stiffnesses by two factors: latencies 1 to 6, and every second change of the last cell missed."""
-    grid = Grid(stiffness_n_per_m=(20000.0, 22000.0, 24500.0), stiffness_factor=(0.8, 0.9))
+    grid = {"K": (20000.0, 22000.0, 24500.0), "K_factor": (0.8, 0.9)}
     plan = Plan.of(CampaignSpec(trials=2, samples=1100, grid=grid, name=name))
     return counted(plan, [Trials.of([row(seed, cell) for seed in range(2)]) for cell in range(6)])
 
 
 def counted(plan: Plan, cells: Sequence[Trials]) -> Results:
     """Results of these trials of each cell."""
-    aggregates, distribution = [], Distribution(plan.spec.draw.axes())
+    aggregates, distribution = [], Distribution(plan.spec.draw)
     for trials in cells:
         aggregates.append(Aggregate())
         aggregates[-1].add(trials, 0)
@@ -79,8 +79,8 @@ def test_same_results_give_the_same_page_and_names_are_escaped() -> None:
     assert "&lt;script&gt;" in page
 
 
-@pytest.mark.parametrize("grid", [Grid(), Grid(noise_lsb=(1.0,))])
-def test_campaign_without_a_plane_has_no_map(grid: Grid) -> None:
+@pytest.mark.parametrize("grid", [{}, {"noise_lsb": (1.0,)}])
+def test_campaign_without_a_plane_has_no_map(grid: Axes) -> None:
     made = results()
     spec = dataclasses.replace(made.plan.spec, grid=grid)
     page = render(Results(dataclasses.replace(made.plan, spec=spec), made.aggregates[:1], made.distribution))
@@ -91,9 +91,7 @@ def test_page_of_many_cells_is_bounded(browser: Browser, tmp_path: Path) -> None
     """Beyond 2,000 cells the table ends, and beyond 2,000 squares of a map have no numbers."""
     factors = tuple(round(0.5 + 0.006 * i, 4) for i in range(50))
     dampings = tuple(2500.0 + 10.0 * i for i in range(50))
-    spec = CampaignSpec(
-        trials=100, samples=1100, grid=Grid(damping_n_s_per_m=dampings, stiffness_factor=factors), name="many"
-    )
+    spec = CampaignSpec(trials=100, samples=1100, grid={"B": dampings, "K_factor": factors}, name="many")
     made = results()
     plan = dataclasses.replace(made.plan, spec=dataclasses.replace(spec, scenario=made.plan.spec.scenario))
     path = tmp_path / "many.html"
@@ -108,10 +106,10 @@ def test_page_of_many_cells_is_bounded(browser: Browser, tmp_path: Path) -> None
 
 def test_drawn_values_have_maps() -> None:
     """Eight trials at the low end of the range, missed, and eight at the high end, detected."""
-    spec = CampaignSpec(trials=16, samples=1100, draw=Draw(stiffness_factor=(0.5, 0.9)), name="drawn")
+    spec = CampaignSpec(trials=16, samples=1100, draw={"K_factor": (0.5, 0.9)}, name="drawn")
     plan = dataclasses.replace(results().plan, spec=spec)
     rows = [row(seed, 5) | {"changes": [[None if seed < 8 else 3, 2, seed < 8, False]]} for seed in range(16)]
-    drawn = [each | {"drawn": {"stiffness_factor": 0.5 if i < 8 else 0.9}} for i, each in enumerate(rows)]
-    page = render(counted(plan, [Trials.of(drawn, ["stiffness_factor"])]))
+    drawn = [each | {"drawn": {"K_factor": 0.5 if i < 8 else 0.9}} for i, each in enumerate(rows)]
+    page = render(counted(plan, [Trials.of(drawn, ["K_factor"])]))
     section = page[page.index('id="drawn"') : page.index('id="spread"')]
     assert ">100.0%<" in section and ">0.0%<" in section and ">3.0<" in section

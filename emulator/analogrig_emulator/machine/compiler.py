@@ -21,9 +21,9 @@ from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import PotError, ProgramError
+from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
 from analogrig_emulator.machine.program import SOURCE, PotRow, Program, Scale, Scales
-from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.program_file import Equations, read_program
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.stages import (

@@ -114,9 +114,9 @@ def false_alarm_rate(
     performance = rig.in_blocks(played.samples).perform(played, seed)
     settings = dataclasses.replace(device.estimator, force_zero=performance.of_device["u"].zero)
     estimator = Estimator(settings, library=device.estimator_library)
-    return _Climbs(rig.card(scenario.program), settings, estimator, performance, np.random.default_rng([seed, _BRANCHES])).estimate(
-        first, branches
-    )
+    return _Climbs(
+        rig.card(scenario.program), settings, estimator, performance, np.random.default_rng([seed, _BRANCHES])
+    ).estimate(first, branches)
 
 
 class _Climbs:

@@ -42,7 +42,10 @@ class Results:
     @functools.cached_property
     def cells(self) -> list[tuple[Cell, Summary]]:
         """Cells, each with the summary of its trials."""
-        return [(cell, Summary.of(each, self.plan.estimates)) for cell, each in zip(self.plan.cells(), self.aggregates, strict=True)]
+        return [
+            (cell, Summary.of(each, self.plan.estimates))
+            for cell, each in zip(self.plan.cells(), self.aggregates, strict=True)
+        ]
 
     @functools.cached_property
     def total(self) -> Summary:

@@ -78,7 +78,9 @@ def add_what_to_play(command: argparse.ArgumentParser) -> None:
         help=f"shipped name or .toml file (default: that of the recording, one change of --program, or {DEFAULT_SCENARIO})",
     )
     command.add_argument(
-        "--program", metavar=PROGRAM, help="program of the computer instead of the scenario's: shipped name or .toml file"
+        "--program",
+        metavar=PROGRAM,
+        help="program of the computer instead of the scenario's: shipped name or .toml file",
     )
     add_rig(
         command, f"{RIG_NAMES}, or recording:FILE (default: $ANALOGRIG_RIG, that of the scenario, or emulator)", None
@@ -185,12 +187,20 @@ def files_read(arguments: argparse.Namespace) -> tuple[Path, ...]:
     from analogrig.trust import resolve_name
 
     given = vars(arguments)
-    names = [str(given[key]) for key in ("file", "rig", "scenario", "program", "dut", "log_dut") if given.get(key) is not None]
+    names = [
+        str(given[key])
+        for key in ("file", "rig", "scenario", "program", "dut", "log_dut")
+        if given.get(key) is not None
+    ]
     scenario = Path(given.get("scenario") or "")
     if scenario.suffix == ".toml":
         with contextlib.suppress(AnalogrigError):  # the command that loads it reports the error
             table = read_toml(scenario)
-            names += [resolve_name(scenario, str(table[key])) for key in ("rig", "dut", "program") if isinstance(table.get(key), str)]
+            names += [
+                resolve_name(scenario, str(table[key]))
+                for key in ("rig", "dut", "program")
+                if isinstance(table.get(key), str)
+            ]
     return tuple(Path(re.sub(r"(\.toml):.*$", r"\1", name.removeprefix("recording:"))) for name in names)
 
 

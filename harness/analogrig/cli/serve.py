@@ -79,7 +79,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
     described = ServedDescription.load(arguments.rig, arguments.defect)
-    server = Server(described.set_up(Program.load(arguments.program), drawn_from, time.monotonic if arguments.real_time else None))
+    server = Server(
+        described.set_up(Program.load(arguments.program), drawn_from, time.monotonic if arguments.real_time else None)
+    )
     if described.unsupported:
         complain(f"{described.name}: the instrument has no {', '.join(described.unsupported)}", PASSED)
     names = {"rig": described.name, "program": arguments.program, "seed": drawn_from}

@@ -172,5 +172,9 @@ def _is_detectable(signals: Signals, change: PlannedChange, stretch: range) -> b
         states = [
             plants[1 if inside and i else 0].next(state, float(signals.force_n[k])) for i, state in enumerate(states)
         ]
-        information += 0.5 * ((plants[1].output(states[1]) - plants[0].output(states[0])) / signals.noise_m) ** 2 if inside else 0.0
+        information += (
+            0.5 * ((plants[1].output(states[1]) - plants[0].output(states[0])) / signals.noise_m) ** 2
+            if inside
+            else 0.0
+        )
     return information > _CERTAIN_INFORMATION

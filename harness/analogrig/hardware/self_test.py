@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import SelfTestError
+from analogrig.hardware.instrument import MEASURED
 from analogrig.hardware.square_wave import Response, SquareWave, Uncertain
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.hardware.instrument import MEASURED
 from analogrig.plant import Plant
-from analogrig.rigs.rig import Rig
 from analogrig.program import Program
+from analogrig.rigs.rig import Rig
 from analogrig.run import Channel
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation

@@ -122,7 +122,7 @@ def _name(fault: ChannelFault) -> str:
 
 
 def _noise_setting(run: Run) -> Iterator[str]:
-    measured = run.conditions.output.noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2
+    measured = run.conditions.output.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2
     expected = run.datasheet.noise_variance
     if expected is not None and measured > NOISE_MARGIN * expected:
         yield (

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
-from analogrig.program import Program
 from analogrig.judging import information
 from analogrig.judging.exposure import Exposure, exposure
 from analogrig.plant import Segment, estimated_parameters
+from analogrig.program import Program
 from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of

@@ -18,10 +18,10 @@ from analogrig.judging.verdict import (
     Verdict,
     missing_text,
 )
+from analogrig.program import Program
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
 from analogrig.reporting.payload import is_thinned, marked_alarms
-from analogrig.program import Program
 from analogrig.reporting.summary import change_text, lamps_text, load_text
 from analogrig.run import Run
 from analogrig.wording import number_of
@@ -173,7 +173,9 @@ def estimates(run: Run, verdict: Verdict) -> str:
         return "<p>Not judged: the device does not report estimates of them.</p>"
     if not verdict.estimates:
         return "<p>The rig does not know the truth about its plant.</p>"
-    groups = [f'<th scope="colgroup" colspan="3">{name} [{text(program.unit(name))}]</th>' for name in program.estimates]
+    groups = [
+        f'<th scope="colgroup" colspan="3">{name} [{text(program.unit(name))}]</th>' for name in program.estimates
+    ]
     head = row(['<th scope="col" rowspan="2">Samples</th>', *groups])
     head += heading((), ("estimate", "truth", "error") * len(program.estimates))
     rows = (_segment_row(segment) for segment in verdict.estimates)

@@ -182,9 +182,9 @@ class ComputerDescription:
 
 @dataclass(frozen=True)
 class CardDescription:
-    """The ``[card]`` table. ``range_v`` gives the ends of each channel's range, by the channel's name.
+    """The ``[card]`` table.
 
-    It names all channels of a program or none. All channels of a program of which it names none have WHOLE_RANGE_V.
+    ``range_v`` gives the ends of a channel's range, by the channel's name; WHOLE_RANGE_V if it is not named.
     """
 
     range_v: Mapping[str, tuple[float, float]]
@@ -227,13 +227,8 @@ class CardDescription:
     def card(self, channels: Sequence[str]) -> Card:
         """Card with these channels.
 
-        :raises ConfigurationError: ``range_v`` names some of them only.
         :raises SamplerError: a value is out of range.
         """
-        named = [channel for channel in channels if channel in self.range_v]
-        if named and len(named) < len(channels):
-            lacking = ", ".join(channel for channel in channels if channel not in named)
-            raise ConfigurationError(f"card.range_v lacks the channels {lacking} of the program")
         model, given = CARDS[self.model], self.noise_lsb
         fields: dict[str, Any] = {name: getattr(model, name) for name in CHANNEL_FIELDS}
         if isinstance(given, Mapping):
@@ -304,7 +299,9 @@ class EmulatorRig(Rig):
     def __init__(self, description: EmulatorDescription, block_samples: int = BLOCK_SAMPLES) -> None:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
-        description.card.card(tuple(description.card.range_v) or ("input",))  # refused here, and not when it is first played
+        description.card.card(
+            tuple(description.card.range_v) or ("input",)
+        )  # refused here, and not when it is first played
         self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._last_prepared: _Prepared | None = None
         self._table = dataclasses.asdict(description)  # to write it takes as long as to play a thousand samples
@@ -321,10 +318,7 @@ class EmulatorRig(Rig):
         return EmulatorRig(self._description, samples)
 
     def card(self, program: Program) -> Card:
-        """Card with the channels of a program.
-
-        :raises ConfigurationError: the description names some of them only.
-        """
+        """Card with the channels of a program."""
         return self._description.card.card(program.channels)
 
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:

@@ -25,6 +25,7 @@ from analogrig.trust import Thing
 BLOCK_SAMPLES = 256
 """Block length in samples from rig to device: long enough to be fast, short enough to show progress and lose little."""
 
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Consecutive samples, each taken on all channels at the same instant; one column for each of the program."""

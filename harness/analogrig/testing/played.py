@@ -98,7 +98,9 @@ class Played:
         if not seeable:
             return Finding(holds=False, why="no change could be seen: none carried enough information before the next")
         wrong = [why for tweak in seeable if (why := _detection_failure(tweak, within))]
-        latencies = ", ".join(f"{tweak.what} after {tweak.latency_text} (bound {bound_text(tweak)})" for tweak in seeable)
+        latencies = ", ".join(
+            f"{tweak.what} after {tweak.latency_text} (bound {bound_text(tweak)})" for tweak in seeable
+        )
         return Finding(not wrong, "; ".join(wrong) or latencies)
 
     @_statement

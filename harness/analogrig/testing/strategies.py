@@ -205,7 +205,9 @@ def _within_range(excitation: Excitation, plants: Sequence[Plant]) -> Excitation
     impulse response of such a plant adds up to in magnitude: coth(pi zeta / (2 sqrt(1 - zeta^2))).
     """
     scales = plants[0].program.circuit.scales
-    n_per_v, volts_per_m = (scales.volts(name) ** power for name, power in zip(plants[0].program.measured, (-1, 1), strict=True))
+    n_per_v, volts_per_m = (
+        scales.volts(name) ** power for name, power in zip(plants[0].program.measured, (-1, 1), strict=True)
+    )
     low, high = excitation.low_v, excitation.high_v
     for plant in plants:
         v_per_v = n_per_v * volts_per_m / plant.parameters()["K"]

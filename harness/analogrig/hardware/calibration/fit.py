@@ -36,6 +36,7 @@ from analogrig.hardware.calibration.averages import (
     estimate_noise,
     rounding_variance,
 )
+from analogrig.plant import Plant
 from analogrig.rigs.emulator import (
     CardDescription,
     ComputerDescription,
@@ -43,7 +44,6 @@ from analogrig.rigs.emulator import (
     EmulatorRig,
     MeasuredValues,
 )
-from analogrig.plant import Plant
 from analogrig.run import INPUT, OUTPUT
 from analogrig.scenario import Scenario
 from analogrig_emulator import CHANNELS, OP_AMP_GRADES, Excitation, Sampler, SuspensionComputer

@@ -300,7 +300,9 @@ class _Problem:
             raise ValueError(f"{search} leaves {alone}, in which the plant changes no other time")
         first = max(search.start - WINDOW_N, alone.start, 0)
         changed = before.changes_to(after or before)
-        changes = [_UNKNOWN if after is None else _CHANGED if name in changed else _UNCHANGED for name in before.parameters()]
+        changes = [
+            _UNKNOWN if after is None else _CHANGED if name in changed else _UNCHANGED for name in before.parameters()
+        ]
         deviations = [_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * (OWN - 1), _OFFSET_CHANGE, *changes]
         rows = np.eye(len(deviations))
         rows[COMMON + OWN :, COMMON : COMMON + OWN] = -np.eye(OWN)  # the plant after is known by its change
