@@ -252,9 +252,8 @@ def convert(hint: Any, value: Any, where: str) -> Any:
             return value
         raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_quote(value)}")
     if dataclasses.is_dataclass(hint):
-        if isinstance(value, typing.cast(Any, hint)):
-            return value
-        return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
+        cls = typing.cast(Any, hint)
+        return value if isinstance(value, cls) else build(cls, _expect(dict, value, "a table", where), where)
     if origin is tuple:
         return _convert_tuple(arguments, value, where)
     if origin in (Mapping, dict):

@@ -185,7 +185,7 @@ class SampledPlant:
         return (0.0,) * len(self.response)
 
     def next(self, state: State, driven: float) -> State:
-        """State one sample later, with the input ``driven``. Plain floats: numpy takes longer for so small a product."""
+        """State one sample later, with the input ``driven``, in plain floats: numpy takes longer for so few."""
         rows = zip(self.transition, self.response, strict=True)
         return tuple(_product(row, state) + gain * driven for row, gain in rows)
 

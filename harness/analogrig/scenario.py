@@ -1,4 +1,4 @@
-"""Scenario: excitation, program, pot changes and expectations of one play. The device never receives the pot changes."""
+"""Scenario: excitation, program, pot changes and expectations of one play. The device never receives the changes."""
 
 from __future__ import annotations
 

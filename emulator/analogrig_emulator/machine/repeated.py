@@ -31,7 +31,7 @@ class Repeat(NamedTuple):
 
 
 def is_repeatable(computer: SuspensionComputer, changes: Sequence[PotTurn]) -> bool:
-    """True if RepeatedPlay accepts it: no ramps, no products, and op-amps whose offsets enter nothing but their own drives."""
+    """True if RepeatedPlay accepts it: no ramps, no products, op-amps whose offsets enter only their own drives."""
     has_ramps = any(change.ramp_n for change in changes)
     has_products = bool(computer.circuit.of(Multiplier) or computer.circuit.of(Function))
     return not (has_ramps or has_products) and all(amp.model.has_state for amp in computer.circuit.of(OpAmp))

@@ -36,7 +36,7 @@ EXACT_UP_TO = 14
 """Largest number of differences for which all sign patterns are enumerated."""
 
 LOST_ESTIMATE = 1.0
-"""Relative error assigned to a trial without a final estimate of M, B, K where the other side's has one."""
+"""Relative error assigned to a trial without a final estimate where the other side's has one."""
 
 RESAMPLES, _AT_ONCE = 99_999, 1_000
 

@@ -82,15 +82,7 @@ class CampaignSpec:
                 raise ValueError(f"{name} must be 1 to {most}, not {getattr(self, name)}")
         if not 0 <= self.first_seed < 2**62:
             raise ValueError(f"first_seed must be 0 to 2^62, not {self.first_seed}")
-        for axis, values in self.grid.items():
-            if len(set(values)) != len(values) or not values:
-                raise ValueError(f"grid: {axis} has {'a value twice' if values else 'no value'}")
-        for axis, ends in self.draw.items():
-            if len(ends) != 2 or not ends[0] < ends[1]:
-                raise ValueError(f"draw: {axis} must be (low, high), not ({', '.join(f'{end:g}' for end in ends)})")
-        twice = set(self.grid) & set(self.draw)
-        if twice:
-            raise ValueError(f"{', '.join(sorted(twice))}: in the grid and drawn as well")
+        _check_axes(self.grid, self.draw)
 
     @classmethod
     def load(cls, name: str) -> CampaignSpec:
@@ -104,3 +96,15 @@ class CampaignSpec:
             raise ConfigurationError(f"{path}: name must be one that a file can have, not {spec.name!r}")
         rigs, devices = (tuple(resolve_name(path, each) for each in names) for names in (spec.rigs, spec.devices))
         return dataclasses.replace(spec, scenario=resolve_name(path, spec.scenario), rigs=rigs, devices=devices)
+
+
+def _check_axes(grid: Axes, draw: Axes) -> None:
+    """:raises ValueError: a value is there twice, or is no pair of ends."""
+    for axis, values in grid.items():
+        if not values or len(set(values)) != len(values):
+            raise ValueError(f"grid: {axis} has {'a value twice' if values else 'no value'}")
+    for axis, ends in draw.items():
+        if len(ends) != 2 or not ends[0] < ends[1]:
+            raise ValueError(f"draw: {axis} must be (low, high), not ({', '.join(f'{end:g}' for end in ends)})")
+        if axis in grid:
+            raise ValueError(f"{axis}: in the grid and drawn as well")

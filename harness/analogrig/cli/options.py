@@ -75,7 +75,8 @@ def add_what_to_play(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--scenario",
         metavar=SCENARIO,
-        help=f"shipped name or .toml file (default: that of the recording, one change of --program, or {DEFAULT_SCENARIO})",
+        help="shipped name or .toml file (default: that of the recording, or one change of --program, or"
+        f" {DEFAULT_SCENARIO})",
     )
     command.add_argument(
         "--program",

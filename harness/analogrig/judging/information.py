@@ -7,7 +7,7 @@ in which
 
 reaches ln ARL0 (Lorden 1971; Lai 1998). This is an asymptotic bound as ARL0 grows. At an ARL0 of 1e5, a window-limited
 GLR test that knows both plants has 0.962 of it. A single delay may be shorter still. I(n) compares the plant before and
-after the change, which must be linear. It depends on the phase of the excitation, so it is computed for each change in each run.
+after the change, which must be linear. It depends on the phase of the excitation, so it is computed for each change.
 
 Isolation: the changed parameter is known with 95 % confidence once I(n) between the true plant and its best rival
 reaches ln 20. A rival is a plant with one other parameter changed.
@@ -204,7 +204,7 @@ def _changes_between(
     period_s: float,
     records: Sequence[int] = (0,),
 ) -> Iterator[_Change]:
-    """Changes between stretches (start, end, plant) under an input. The plant is at rest at the start of each record."""
+    """Changes between stretches (start, end, plant) under an input. Each record starts from rest."""
     state: State = ()
     before: Plant | None = None
     for start, end, plant in stretches:

@@ -46,7 +46,7 @@ instant, which is known only as an interval. ``not judged``: the change was not 
 ESTIMATES, STATISTIC, DIAGNOSES = "estimates of parameters", "the trigger's statistic", "diagnoses"
 """Quantities in ``Verdict.not_judged`` that reports show elsewhere."""
 
-BOUNDS = "delays (the bounds of a program that is not linear are unknown)"
+BOUNDS = "delays"
 """Quantity in ``Verdict.not_judged`` where no bound is known: every change then counts as detectable."""
 
 CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERAL)

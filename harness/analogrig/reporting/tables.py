@@ -43,6 +43,8 @@ _SENTENCES = {
     "inconclusive": "This run is not valid. The figures below prove nothing about the device.",
 }
 
+_NO_DIAGNOSES = "<p>Not judged: the device does not report diagnoses.</p>"
+
 
 def title(run: Run, verdict: Verdict) -> str:
     """Title of the page, escaped."""
@@ -110,10 +112,12 @@ def tweaks(run: Run, verdict: Verdict) -> str:
     return table(caption, head, (_change_row(tweak, run.conditions.program) for tweak in verdict.tweaks))
 
 
-def diagnoses(verdict: Verdict) -> str:
+def diagnoses(run: Run, verdict: Verdict) -> str:
     """Table of the diagnoses, compared with the truth."""
+    if not run.datasheet.diagnoses:
+        return _NO_DIAGNOSES
     if DIAGNOSES in verdict.not_judged:
-        return "<p>Not judged: the device does not report diagnoses.</p>"
+        return f"<p>Not judged: no parameter of the program {text(run.conditions.program.name)} has a diagnosis.</p>"
     if all(tweak.diagnosis is None for tweak in verdict.tweaks):
         return "<p>The device reported no diagnosis of a change.</p>"
     caption = "Diagnoses of the device; delay and isolation bound in samples from the change"
@@ -122,10 +126,10 @@ def diagnoses(verdict: Verdict) -> str:
     return table(caption, head, map(_diagnosis_row, verdict.tweaks))
 
 
-def channel_faults(verdict: Verdict) -> str:
+def channel_faults(run: Run, verdict: Verdict) -> str:
     """Table of the faults of the channels that the device diagnosed."""
-    if DIAGNOSES in verdict.not_judged:
-        return "<p>Not judged: the device does not report diagnoses.</p>"
+    if not run.datasheet.diagnoses:
+        return _NO_DIAGNOSES
     if not verdict.channel_faults:
         return "<p>The device reported none.</p>"
     shown = verdict.channel_faults[:_MAX_CHANNEL_FAULTS]

@@ -117,7 +117,7 @@ class Played:
     def isolates(self) -> Finding:
         """Finding: every parameter diagnosed as changed has changed. A missing diagnosis is allowed."""
         if DIAGNOSES in self.verdict.not_judged:
-            return Finding(holds=False, why="not judged: the device does not report diagnoses")
+            return Finding(holds=False, why="not judged: no diagnoses of the program's parameters")
         judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
         said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
         wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said

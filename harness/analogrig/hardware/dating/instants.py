@@ -2,8 +2,8 @@
 
 A pot that an operator or a slow command sets changes the plant at unknown samples. The plant before the change explains
 the samples up to it, the plant after it those that follow (``analogrig.hardware.dating.two_filter``). Other unknowns
-are estimated jointly: the parameters before and after, since a real rig deviates from its nominal values by some per cent; the
-offsets of both channels; the place of the force's edges in a sample period.
+are estimated jointly: the parameters before and after, since a real rig deviates from its nominal values by some per
+cent; the offsets of both channels; the place of the force's edges in a sample period.
 
 ``date_jump`` dates a change at once, ``date_turn`` one that takes time: a pot that is turned by hand, or two pots that
 jump in succession. Intervals hold every instant that the likelihood-ratio test accepts, and at least the requested
@@ -48,8 +48,8 @@ WINDOW_N = 500
 _NOMINAL = 0.1
 """Deviation of the logarithms of parameters before the change from their set values: components, gains."""
 _CHANGED, _UNCHANGED, _UNKNOWN = 0.1, 0.005, 0.5
-"""Deviation of each ratio of a parameter after to before from its set value: if it is to change; if not, for what one mass,
-damper and spring do not explain of a rig; if the plant after the change is unknown."""
+"""Deviation of each ratio of a parameter after to before from its set value: if it is to change; if not, for what the
+plant does not explain of a rig; if the plant after the change is unknown."""
 _OFFSET = 100.0
 """Offset of either channel, in rms of its noise."""
 _OFFSET_CHANGE = 2.0
@@ -240,8 +240,8 @@ class _Guess:
 
     unknowns: Array
     """(10,): offset of the displacement in rms of its noise; mean place of the edges less 0.5; then, for the plant
-    before and for that after, the offset of the force in rms of its noise and the logarithms of the parameters over their set
-    values."""
+    before and for that after, the offset of the force in rms of its noise and the logarithms of the parameters over
+    their set values."""
     half_width: float = _ANYWHERE
     sample: int = 0
     """Instant of the change, as an index of the window."""

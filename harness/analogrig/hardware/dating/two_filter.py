@@ -4,8 +4,9 @@ A Kalman filter with the plant before the change runs forwards; an information f
 backwards. At each instant both are joined by the state (displacement and velocity), which is continuous at a change.
 
 Unknowns enter linearly, about their best values so far, as columns that the filters carry. Both plants share the offset
-of the displacement and the place of the edges; each has its own offset of the force and logarithms of the parameters. The
-sampled force does not show where between two samples an edge lies: the deviation from its mean place is process noise.
+of the displacement and the place of the edges; each has its own offset of the force and logarithms of parameters.
+The sampled force does not show where between two samples an edge lies: the deviation from its mean place is process
+noise.
 """
 
 from __future__ import annotations
