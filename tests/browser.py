@@ -29,17 +29,17 @@ class Watched:
         self.page.goto(path.as_uri())
 
     def plots(self, within: str = "") -> list[Locator]:
-        """Those of the page, or of an element."""
+        """Texts of the page, or of an element."""
         self.page.wait_for_selector("html[data-drawn]")
         return self.page.locator(f"{within} .u-wrap canvas").all()
 
     def images(self, within: str = "") -> list[str]:
-        """What each plot shows, after the browser has painted."""
+        """Pixels of each plot, after the browser has painted."""
         self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         return [plot.evaluate("(canvas) => canvas.toDataURL()") for plot in self.plots(within)]
 
     def pixels(self, colour: tuple[int, int, int]) -> list[int]:
-        """How many pixels of exactly this colour each plot has."""
+        """Count of pixels of exactly this colour in each plot."""
         return [plot.evaluate(COUNT_PIXELS, list(colour)) for plot in self.plots()]
 
     def drag(self, plot: int, start: float, end: float, within: str = "") -> None:
@@ -56,7 +56,7 @@ class Watched:
         self.page.mouse.move(x + fraction * width, y)
 
     def values(self, plot: int) -> list[str]:
-        """What the legend of a plot says of the sample under the pointer."""
+        """Legend of a plot for the sample under the pointer."""
         return self.page.locator(".u-legend").nth(plot).locator(".u-value").all_inner_texts()
 
     def _area(self, plot: int, within: str = "") -> tuple[float, float, float]:

@@ -38,7 +38,7 @@ def theta_hash(python: Path, dut: str, folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """That of this checkout, which the system's compiler has built."""
+    """Library of this checkout, built by the system's compiler."""
     return theta_hash(Path(sys.executable), "inproc", tmp_path_factory.mktemp("checkout"))
 
 

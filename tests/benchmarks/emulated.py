@@ -67,7 +67,7 @@ class Emulated:
     wander: Wander | None = None
     """It ends at the change."""
     correlation: float = 0.0
-    """Of successive noise samples, if the noise on the displacement is autoregressive instead of the card's."""
+    """Correlation of successive noise samples, if that of the displacement is autoregressive instead of the card's."""
 
     def play(self, seeds: Sequence[int], samples: int, changes: Sequence[Change | None]) -> Iterator[Played]:
         for seed, change in zip(seeds, changes, strict=True):

@@ -387,7 +387,7 @@ def test_an_element_without_a_law_is_refused_by_name(element: Element, message: 
         ({"gain_error": math.inf}, "gain_error must be finite"),
         ({"swing_v": (1.0, 2.0)}, "on both sides of 0 V"),
         ({"full_v": 0.0}, "full_v must be positive"),
-        ({"rout_ohm": -1.0}, "rout_ohm must not be negative"),
+        ({"rout_ohm": -1.0}, "rout_ohm must be finite and not negative"),
     ],
 )
 def test_a_multiplier_model_out_of_range_is_refused_by_field(fields: dict[str, float], message: str) -> None:

@@ -41,7 +41,7 @@ LOCKED, MAY_SLIP, ANYWHERE = range(3)
 
 
 class Config(ctypes.Structure):
-    """As driver_config_t: all numbers are doubles."""
+    """driver_config_t: all numbers are doubles."""
 
     _fields_ = [
         *(
@@ -57,7 +57,7 @@ class Config(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Result:
-    """What each of n samples gave."""
+    """Results of each of n samples."""
 
     theta: NDArray[np.float32]
     innovation: NDArray[np.float32]
@@ -68,7 +68,7 @@ class Result:
     idle: NDArray[np.uint8]
     counters: Mapping[str, int]
     variance: NDArray[np.float64]
-    """Of each parameter, after the last sample, in noise variances."""
+    """Variance of each parameter, after the last sample, in noise variances."""
     noise_variance: float
     """After the last sample; codes^2."""
 
@@ -104,12 +104,12 @@ class Isolated:
 
 
 SLICES_N = 22
-"""As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes which is weighed."""
+"""EST_ISOLATION_SLICES_N of est_isolation.h: slices of work of a sample that is weighed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosed:
-    """What est_isolation made of n steps that were given to it."""
+    """Results of est_isolation for n steps that were given to it."""
 
     left: NDArray[np.intc]
     """(n,) after how many of the slices of work after this step there was more to do."""
@@ -125,7 +125,7 @@ CAUSES = ("none", "drift", "hum", "edges", "nonlinear", "noise", "slow plant", "
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """What est_fit made of t runs of n samples."""
+    """Results of est_fit for t runs of n samples."""
 
     cause: NDArray[np.uint8]
     """(t, n): index in CAUSES after each sample."""
@@ -190,7 +190,7 @@ class Estimator:
         self._c.driver_age_counters()
 
     def invariants_hold_if_damaged(self, way: int) -> bool:
-        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 9; 10: not at all."""
+        """Result of est_invariants_hold() for a state damaged in one of the ways 0 .. 9; 10: not at all."""
         return bool(self._c.driver_invariants_hold_if_damaged(way))
 
     def watch(self, u: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
@@ -272,7 +272,7 @@ class Estimator:
         return Watched(cause, *found.T)
 
     def diagnose(self, theta: ArrayLike, steps: NDArray[np.float64], slices: int = SLICES_N) -> Diagnosed:
-        """What est_isolation makes of steps (n, 3) that are given: statistic, status, alarm; theta stays as it is.
+        """Play steps (n, 3) of statistic, status and alarm to est_isolation; theta stays as it is.
 
         The force is a square wave, which the plant does not answer.
         """

@@ -58,7 +58,7 @@ an offset and a gain also the sign."""
 
 @dataclass(frozen=True)
 class Isolation:
-    """Of one change, over t trials."""
+    """Outcomes of one change, over t trials."""
 
     reported: float
     """Share of the trials in which a class was reported within the horizon."""
@@ -215,7 +215,7 @@ def bounds(
 def bounds_of_pairs(
     plant: Mechanics, change: Change, excitation: Excitation, onset: NDArray[np.int64], seed: int
 ) -> NDArray[np.float64]:
-    """As ``bounds`` of a single change; the rival is a change of both other parameters at once, or of either.
+    """``bounds`` of a single change; the rival is a change of both other parameters at once, or of either.
 
     Where no force acts, a change of M by f moves the plant exactly as one of B and of K by 1/f does, and so on round:
     the valley in which the rivals lie is narrow, and runs to where the next edge of the force comes.
@@ -242,7 +242,7 @@ def bounds_of_pairs(
 def bounds_of_faults(
     plant: Mechanics, change: Change, excitation: Excitation, onset: NDArray[np.int64], seed: int
 ) -> NDArray[np.float64]:
-    """As ``bounds`` of a single change; the rivals are an offset and a gain of either channel, of any size.
+    """``bounds`` of a single change; the rivals are an offset and a gain of either channel, of any size.
 
     An offset of the force is a force that acts from the onset on, its gain a common factor of M, B and K.
     """
@@ -314,7 +314,7 @@ def _courses(
         return k + 1.0 - (first + (np.floor((k - first) / half_n) + 1.0) * half_n)
 
     class Course:
-        """Of these plants, (plants, t) each, from rest."""
+        """Responses of plants from rest, (plants, t) each."""
 
         def __init__(self, who: list[Mechanics]) -> None:
             self.first, self.second = np.array([each.poles() for each in who]).T[:, :, None]
@@ -324,7 +324,7 @@ def _courses(
             self.x, self.v = np.zeros((2, len(who), len(onset)))
 
         def response(self, span_n: Array) -> tuple[Array, Array]:
-            """As Mechanics.response(), of all plants (plants, ...)."""
+            """Mechanics.response() of all plants (plants, ...)."""
             first, second = self.first, self.second
             a, b = (np.exp(pole * span_n * PERIOD_S) for pole in (first, second))
             gap = (first - second) * self.stiffness

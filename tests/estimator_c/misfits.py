@@ -25,16 +25,16 @@ __all__ = ["CAUSES", "CONDITIONS", "Condition", "whitened"]
 Array = NDArray[np.float64]
 
 SUBSTEPS = 4
-"""Of a sample, for the plant that is not linear."""
+"""Substeps of a sample, for the plant that is not linear."""
 
 
 FREE = Excitation(on_samples=False, drift_ppm=20.0)
-"""Of a generator on a clock of its own."""
+"""Excitation from a generator on a clock of its own."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What disturbs the front suspension, and what should be said of it."""
+    """A disturbance of the front suspension, and the misfit that should be reported."""
 
     cause: str
     """One of CAUSES."""

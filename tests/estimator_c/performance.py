@@ -53,7 +53,7 @@ QUARTER_FREE = Excitation(part_of_range=0.25, on_samples=False, drift_ppm=20.0)
 
 @dataclass(frozen=True)
 class Delay:
-    """How soon one change was noticed, over t trials; all in samples."""
+    """Delays of one change over t trials, all in samples."""
 
     mean_n: float
     bound_n: float
@@ -125,7 +125,7 @@ def upper_rate(found: int, samples: int, confidence: float = 0.99) -> float:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Of M, B and K of the front suspension from rest; relative, (3,) each."""
+    """Errors of M, B and K of the front suspension from rest; relative, (3,) each."""
 
     rms: NDArray[np.float64]
     bounds: NDArray[np.float64]

@@ -18,7 +18,7 @@ PERIOD_S = 0.01
 CODES = 4096
 NOISE_LSB = 1.0
 VARIANCE_LSB2 = NOISE_LSB**2 + 1.0 / 12.0
-"""Of the displacement: noise and rounding."""
+"""Variance of the displacement: noise and rounding."""
 DISPLACEMENT_RANGE_M = 0.1996
 """On 10 V (facts, section 1)."""
 
@@ -179,7 +179,7 @@ def _driven(plant: Mechanics, force: _Force) -> Array:
 def simulate(
     plants: tuple[Mechanics, Mechanics], onset: NDArray[np.int64], excitation: Excitation, samples: int, seed: int
 ) -> Trials:
-    """As many trials as onsets."""
+    """Responses of as many trials as there are onsets."""
     rng = np.random.default_rng(seed)
     force_n = plants[0].force_range_n
     first = excitation.first_edges(rng, len(onset))

@@ -31,7 +31,7 @@ EXTENDED, REMOTE, FD, ERROR = 1, 2, 4, 8
 
 
 class Frame(NamedTuple):
-    """As can_frame_t."""
+    """can_frame_t."""
 
     id: int
     data: bytes = bytes(8)
@@ -50,13 +50,13 @@ class CFrame(ctypes.Structure):
 
 
 class Progress(ctypes.Structure):
-    """As device_progress_t."""
+    """device_progress_t."""
 
     _fields_ = (("taken", ctypes.c_size_t), ("given", ctypes.c_size_t))
 
 
 IDENTITY = (ctypes.c_uint32 * 3)(CATALOGUE_HASH, NONCE, FirmwareId.LIBRARY << 8 | 255)
-"""As device_identity_t."""
+"""device_identity_t: hash of the catalogue, nonce, firmware."""
 
 
 def to_c(frame: Frame) -> CFrame:
@@ -68,7 +68,7 @@ def from_c(frame: CFrame) -> Frame:
 
 
 def frame_of(message: Message) -> Frame:
-    """As the harness sends it."""
+    """A message as the harness sends it."""
     packet = pack(message)
     return Frame(packet[0], packet[1:], FD if len(packet) > 9 else 0)
 
@@ -79,7 +79,7 @@ def numbered(messages: Iterable[Message]) -> list[Message]:
 
 
 def conversation(*, in_blocks: bool, n: int = 140) -> list[Message]:
-    """Who are you, settings, samples of which some are missing, a change that raises an alarm, counters."""
+    """Identity, settings, samples of which some are missing, a change that raises an alarm, counters."""
     u, y = codes(n, change_at=100)
     missing = [k in (30, 31, 57) for k in range(n)]
     samples = [Sample(0, int(missing[k]), k, u[k], y[k]) for k in range(n)]
@@ -114,7 +114,7 @@ class CanDevice:
         c.can_device_init(self._state, IDENTITY, ctypes.c_bool(is_fd))
 
     def run(self, frames: list[Frame], room: int) -> tuple[int, list[Frame]]:
-        """How many it took, and what it gave. What it took is no longer there afterwards."""
+        """Feed it; return the count that it took, and its answer. The bytes taken are gone afterwards."""
         given = (CFrame * room)()
         taken = (CFrame * len(frames))(*map(to_c, frames))
         progress = self._run(self._state, taken, ctypes.c_size_t(len(frames)), given, ctypes.c_size_t(room))
@@ -136,7 +136,7 @@ class CanDevice:
 
 
 def counters(answers: Iterable[Frame]) -> dict[Counter, int]:
-    """What a device has counted, by its answers."""
+    """Counters of a device, by its answers."""
     messages = [unpack(bytes([answer.id]) + answer.data) for answer in answers]
     return {Counter(message.counter): message.value for message in messages if isinstance(message, Status)}
 
@@ -153,7 +153,7 @@ class SlcanDevice:
         c.slcan_device_init(self._state, IDENTITY)
 
     def run(self, text: bytes, room: int) -> tuple[int, bytes]:
-        """How many bytes it took, and what it gave."""
+        """Feed it; return the count of bytes taken, and its answer."""
         given = ctypes.create_string_buffer(b"\xaa" * (room + 64))
         progress = self._run(self._state, text, ctypes.c_size_t(len(text)), given, ctypes.c_size_t(room))
         assert progress.given <= room

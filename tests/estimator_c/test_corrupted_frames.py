@@ -22,13 +22,13 @@ AT_ONCE = 10_000
 
 
 class Outcome(ctypes.Structure):
-    """As outcome_t of corrupted_frames.c."""
+    """outcome_t of corrupted_frames.c."""
 
     _fields_ = tuple((name, ctypes.c_uint64) for name in ("taken", "wrong", "dropped", "stream_n", "packets_n"))
 
 
 class CorruptedLine:
-    """As line_t of corrupted_frames.c."""
+    """line_t of corrupted_frames.c."""
 
     def __init__(self, library: Path, seed: int) -> None:
         self._c = ctypes.CDLL(str(library))

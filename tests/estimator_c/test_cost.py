@@ -1,4 +1,4 @@
-"""What the estimator costs on a Cortex-M stays within the limits (estimator_c/evidence/cost.py)."""
+"""Costs of the estimator on a Cortex-M, against the limits (estimator_c/evidence/cost.py)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ BEYOND = {
     "M4F, code of the core at -Os, everything": 6368,
     "M4F, code of the core at -Os, trigger alone": 1574,
 }
-"""What the core still misses, and may not exceed; a limit that it comes to keep must be taken off this list.
+"""Limits that the core still misses, with values not to exceed; one that it keeps must leave this list.
 
 In the longest steps an edge comes, or an alarm is on trial, while the gains of the whitening are on their way (1.27 to
 1.44 times the typical one)."""

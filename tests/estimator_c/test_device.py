@@ -503,7 +503,7 @@ def test_index_wraps_around(device: Device) -> None:
 
 @pytest.mark.parametrize("in_blocks", [False, True])
 def test_samples_of_another_run_are_not_taken(in_blocks: bool) -> None:  # noqa: FBT001 - a parameter of pytest
-    """As when the line has kept some of a run that was broken off."""
+    """A line that has kept some of a run that was broken off."""
     device = Device()
     assert device.control(Command.START, 5) == Result.APPLIED
     for run in range(RUNS):
@@ -550,11 +550,11 @@ VALUES = {
     Key.C1: -0.5,
     Key.C2: 0.25,
 }
-"""Of each key of this build, a value that is not the default."""
+"""A value for each key of this build that is not the default."""
 
 
 def current(device: Device, key: Key) -> float:
-    """What is set: a value that is no number changes nothing."""
+    """Value of a key: one that is no number changes nothing."""
     answer = device.configure(key, math.nan)
     assert answer.result == Result.OUT_OF_RANGE
     return answer.value
@@ -689,7 +689,7 @@ def test_impossible_commands_are_refused(idle: Device) -> None:
 
 
 def test_messages_of_devices_are_refused(idle: Device) -> None:
-    """As when the line echoes."""
+    """A line that echoes."""
     assert idle.tell(Stepped(0, 0, 0, 0.0)) == []
     assert idle.tell(Hello(0, 6, 0, CATALOGUE_HASH)) == []
     assert idle.counters()[Counter.MESSAGES_REFUSED] == 2
@@ -723,13 +723,13 @@ def test_noise_is_never_answered_and_never_stops_it(device: Device) -> None:
 
 
 class Progress(ctypes.Structure):
-    """As serial_progress_t."""
+    """serial_progress_t."""
 
     _fields_ = (("taken", ctypes.c_size_t), ("given", ctypes.c_size_t))
 
 
 def answers_in_pieces(stream: bytes, rng: random.Random, room: int) -> bytes:
-    """What a device answers that receives random pieces and may answer ``room`` bytes at a time."""
+    """Answers of a device that receives random pieces and may answer ``room`` bytes at a time."""
     c = ctypes.CDLL(str(LIBRARY))
     c.serial_device_run.restype = Progress
     c.serial_device_size.restype = ctypes.c_size_t

@@ -1,4 +1,4 @@
-"""Whatever the configuration and the data, the state stays one that the estimator can live with."""
+"""Invariants of the state, for any configuration and any data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which of M, B, K has changed: what est_isolation.h promises, on simulated plants.
+"""Isolation of the change among M, B, K: promises of est_isolation.h, on simulated plants.
 
 Seeds are fixed, so that a test passes or fails for good; the probabilities stated are those of another seed.
 """
@@ -18,7 +18,7 @@ from tests.estimator_c.plants import FRONT, SHOCK, Excitation, random_plants, si
 CLOCKS = {"one clock": (SHARED_CLOCK, FULL), "edges anywhere": (OWN_CLOCK, FULL_FREE)}
 SINGLE = [{name: factor} for name in "MBK" for factor in (0.8, 1.2)]
 TWO = [{"B": 1.2, "K": 1.2}, {"B": 0.8, "K": 0.8}, {"M": 1.2, "B": 1.2}, {"M": 1.2, "K": 1.2}, {"B": 0.8, "K": 1.2}]
-"""Of the first four each looks like a change of the third parameter at first."""
+"""Single changes, of which each of the first four looks like one of the third parameter at first."""
 
 
 @pytest.mark.parametrize(("settings", "excitation"), CLOCKS.values(), ids=CLOCKS)
@@ -90,7 +90,7 @@ def test_random_plants_are_isolated_as_well(estimator: Estimator, change: Change
 
 
 def test_mass_that_hardly_matters_is_not_named_for_what_damping_did(estimator: Estimator) -> None:
-    """Of the shock absorber a mass a hundred times as heavy explains any change: 19 of 100 were named so."""
+    """A mass a hundred times as heavy explains any change of the shock absorber: 19 of 100 were named so."""
     played = isolation.play(SHOCK, {"B": 1.2}, FULL, 100, seed=31)
     assert estimator.init(**SHARED_CLOCK)
     named = estimator.isolate(played.u, played.y, played.onset).change
@@ -162,7 +162,7 @@ def test_offset_of_the_displacement_is_not_taken_for_stiffness(estimator: Estima
 
 
 def test_zero_of_the_force_may_lie_anywhere_in_its_range(estimator: Estimator) -> None:
-    """As on a card from -1 to 11 V; were 0 taken for it, the spring would carry another force."""
+    """A card from -1 to 11 V; were 0 taken for its offset, the spring would carry another force."""
     played = isolation.play(FRONT, {"K": 0.8}, FULL, 60, seed=7)
     assert estimator.init(**OWN_CLOCK)
     found = estimator.isolate(played.u + 1000.0, played.y + 2048.0, played.onset, force_zero=1000.0)

@@ -290,7 +290,7 @@ def test_each_reading_of_an_edge_is_that_of_the_twin(slip: int, nb: int, nk: int
 @pytest.mark.parametrize("nk", [0, 1])
 @pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
 def test_an_edge_one_sample_early_would_have_entered_the_equation_before(slip: int, nk: int) -> None:
-    """If there is a direct term; the whitened equation before is remembered."""
+    """Equation with a direct term; the whitened equation before is remembered."""
     config = replace(IN_DOUBT, c=(-0.5,), nk=nk)
     statistic, expected = statistics_in_doubt(slip, 2, config, [*[0.0] * nk, 0.3, -0.9])
     assert statistic == pytest.approx(expected, abs=0.1)

@@ -1,4 +1,4 @@
-"""What the estimator makes of readings that come from no plant, and of a force that does not move."""
+"""Readings that come from no plant, and a force that does not move."""
 
 from __future__ import annotations
 

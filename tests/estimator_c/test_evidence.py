@@ -1,4 +1,4 @@
-"""What static checkers say of core and isolation: what MISRA.md explains, and no more; of the device: nothing."""
+"""Findings of static checkers: those that MISRA.md explains for core and isolation, none for the device."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_gcc_analyzer_finds_nothing_in_the_device_and_its_port_to_this_computer(
 
 @pytest.mark.tools("cppcheck")
 def test_cppcheck_finds_nothing_in_the_device() -> None:
-    """Of its own; the rules of MISRA are for core and isolation."""
+    """Findings of its own rules; those of MISRA are for core and isolation."""
     command = [
         "cppcheck",
         "--quiet",

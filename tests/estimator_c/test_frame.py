@@ -16,7 +16,7 @@ from analogrig.links import frame
 
 
 class Decoder(ctypes.Structure):
-    """As frame_decoder_t of frame.h."""
+    """frame_decoder_t of frame.h."""
 
     _fields_ = (
         ("catalogue_hash", ctypes.c_uint32),
@@ -56,7 +56,7 @@ def decoded(c: ctypes.CDLL, stream: bytes, catalogue_hash: int = CATALOGUE_HASH)
 
 
 def random_packets(rng: random.Random, n: int) -> Iterator[bytes]:
-    """Of all messages, with many zeros, which are what COBS is about."""
+    """Bytes of all messages, with many zeros, which COBS replaces."""
     layouts = list(LAYOUTS.values())
     for _ in range(n):
         layout = rng.choice(layouts)

@@ -34,7 +34,7 @@ def floats(values: Words) -> Floats:
 
 
 def truncated(a: Floats, kind: type[np.integer]) -> Words:
-    """As Arm's VCVT: beyond the range its end, and 0 for no number."""
+    """Integer as Arm's VCVT gives it: beyond the range its end, and 0 for no number."""
     limits = np.iinfo(kind)
     whole = np.trunc(np.nan_to_num(a.astype(np.float64), nan=0.0, posinf=1e30, neginf=-1e30))
     return np.clip(whole, limits.min, limits.max).astype(kind).view(np.uint32)

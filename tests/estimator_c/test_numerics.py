@@ -22,7 +22,7 @@ Extended = NDArray[np.longdouble]
 REST_CODES = 410.0
 """The displacement that suspension() has without force."""
 A_FRONT = (-1.7499, 0.7687)
-"""Of the front suspension, sampled at 100 Hz of problem time."""
+"""a1 and a2 of the front suspension, sampled at 100 Hz of problem time."""
 BLOCK_N = 500_000
 
 

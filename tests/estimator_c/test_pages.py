@@ -292,7 +292,7 @@ def flat(page: Path) -> str:
 
 TSR, RF0R = 0x008, 0x00C
 MAILBOX, FIFO = 0x180, 0x1B0
-"""Of each: identifier, length, four bytes, four bytes."""
+"""Mailboxes and FIFO: identifier, length, four bytes, four bytes each."""
 
 
 class Controller:

@@ -40,7 +40,7 @@ LONGEST = 1 + 8 + 1 + 2 * 64
 
 
 class Event(ctypes.Structure):
-    """As slcan_event_t."""
+    """slcan_event_t."""
 
     _fields_ = (
         ("has_frame", ctypes.c_bool),
@@ -223,7 +223,7 @@ def told(*, in_blocks: bool) -> list[bytes]:
 
 
 def packet(line: bytes) -> bytes:
-    """Of an answer: always a classic frame of eight bytes."""
+    """Payload of an answer: always a classic frame of eight bytes."""
     assert line[:2] + line[4:5] == b"t08"
     return bytes.fromhex(line[2:4].decode()) + bytes.fromhex(line[5:].decode())
 

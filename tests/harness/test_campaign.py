@@ -147,6 +147,7 @@ def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
         ("[grid]\nmass_factor = [0.5]\n", None),
         ("[stop]\nquantity = 'late'\nrate = 0.1", "quantity: must be one of"),
         ("samples = 1100\n[grid]\nmass_factor = [0.5]\nchange_at = 3", "unknown key 'change_at'"),
+        ("false_alarms = -1\n[grid]\nmass_factor = [0.5]", "false_alarms must not be negative, not -1"),
         (
             "samples = 500\n[grid]\nmass_factor = [0.5]",
             "mass_factor = 0.5: the tweak at sample 1000 is beyond the last",

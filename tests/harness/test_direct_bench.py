@@ -46,7 +46,7 @@ def test_run_without_a_line_is_that_over_a_line_to_the_bit(scenario_name: str, r
     assert trial.conditions.overloads == run.conditions.overloads
     assert dict(trial.conditions.counters).items() <= dict(run.conditions.counters).items()
     ours, theirs = (dataclasses.replace(judge(each), tweaks=()) for each in (trial, run))
-    assert ours == dataclasses.replace(theirs, fit=None)
+    assert ours == dataclasses.replace(theirs, fit=None, channel_faults=())
     for mine, other in zip(judge(trial).tweaks, judge(run).tweaks, strict=True):
         assert mine == dataclasses.replace(other, diagnosis=None)
 

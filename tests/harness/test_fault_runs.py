@@ -26,7 +26,7 @@ from tests.harness.fault_runs import (
 from tests.harness.firmware import needs_firmware
 
 TALKED_OVER = {("serial", "sample"), ("can", "sample"), ("can-fd", "block")}
-"""Of the ways of a link that on which every step has its second frame and its last but one tried.
+"""Way of a link on which every step has its second frame and its last but one tried.
 
 Only the samples go otherwise on the others: handshake, configuration, start and stop are the same conversation.
 """

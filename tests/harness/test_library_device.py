@@ -592,7 +592,7 @@ def test_library_that_a_file_names_is_loaded_only_if_allowed(
 
 
 def test_library_that_turns_off_denormals_does_so_for_itself_only(tmp_path: Path) -> None:
-    """As one built with -ffast-math. In a process of its own: its failure would spoil all other tests."""
+    """A library as -ffast-math builds it, in a process of its own, whose failure spoils no other test."""
     library = build(tmp_path / "flush.so", FAULTY, flags=("-DFLUSH",))
     script = (
         "import ctypes, numpy as np; from analogrig.devices.registry import describe;"

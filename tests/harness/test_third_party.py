@@ -52,7 +52,7 @@ BROKEN = {
 
 
 def install(site: Path, package: str, **groups: dict[str, str]) -> None:
-    """What pip leaves of a package, except its modules."""
+    """Files that pip leaves of a package, except its modules."""
     info = site / f"{package}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")

@@ -209,7 +209,7 @@ class Cases:
         return ("--out", str(folder / "out.sqlite"))
 
     def _kept(self, kind: str, rng: random.Random, folder: Path, argv: tuple[str, ...]) -> Case:
-        """What a campaign finds that was left by another."""
+        """Files in the folder of a campaign, left by another one."""
         (folder / "file.toml").write_text(descriptions.toml(descriptions.CAMPAIGN))
         whole = self._seeds.begun if kind == "begun store" else self._seeds.ended
         changed, what = campaign_files.mutated(whole, rng, folder / "forged.sqlite")

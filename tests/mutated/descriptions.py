@@ -171,8 +171,8 @@ CAMPAIGN: dict[str, Any] = {
     "trials": 2,
     "first_seed": 0,
     "chunk": 2,
-    "samples": 300,
-    "change_at": 200,
+    "samples": 800,
+    "change_at": 700,
     "grid": {"M": [115.0], "K_factor": [0.7, 0.9], "noise_lsb": [1.0]},
     "draw": {"B": [2900.0, 3100.0]},
     "stop": {"quantity": "missed", "rate": 0.1, "confidence": 0.95},
@@ -250,7 +250,7 @@ def asks_much(table: dict[str, Any]) -> bool:
     for values in grid.values() if isinstance(grid, dict) else ():
         cells *= max(1, len(values)) if isinstance(values, list) else 1
     trials = counts.get("trials", 100 if grid is not None else 1)
-    return counts.get("samples", 300) * trials * cells > _MOST_SAMPLES
+    return counts.get("samples", 800) * trials * cells > _MOST_SAMPLES
 
 
 _MOST_SAMPLES = 20_000

@@ -93,7 +93,7 @@ def _array(whole: bytes, rng: random.Random) -> Mutated:
 
 
 def _other_values(array: NDArray[Any], rng: random.Random) -> NDArray[Any]:
-    """Of the same type and shape; an empty one gets a row."""
+    """Random array of the same type and shape; an empty one gets a row."""
     out = np.array(array if array.size else np.zeros((3, *array.shape[1:]), array.dtype))
     if out.dtype.kind == "f":
         value: Any = rng.choice((np.nan, np.inf, -np.inf, 1e38, -1e38, 1e-45, 0.0))

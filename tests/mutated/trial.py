@@ -18,10 +18,10 @@ MOST_CPU_S = 5.0
 MOST_MB = 200
 
 _HANGS_S = 300
-"""Of the clock on the wall: nothing that is awaited takes so long, not on a loaded machine."""
+"""Limit of the wall clock: nothing that is awaited takes so long, not on a loaded machine."""
 
 _KILL_MB = 4_000
-"""Of address space, for the sake of the machine."""
+"""Limit of the address space, for the sake of the machine."""
 
 _REFUSED = 2
 
@@ -33,7 +33,7 @@ class Case:
     """A command on one file that was made from a seed."""
 
     kind: str
-    """Of the row in the table."""
+    """Name of the row in the table."""
     argv: tuple[str, ...]
     what: str
     """Was done to the file."""
@@ -50,7 +50,7 @@ class Outcome:
     memory_mb: float
 
     def problems(self, case: Case) -> list[str]:
-        """What is not as it should be; empty if all is."""
+        """Faults of the trial; empty if there are none."""
         out: list[str] = []
         is_long = self.status == -signal.SIGXCPU
         if is_long and case.asks_much:

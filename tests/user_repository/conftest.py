@@ -1,4 +1,4 @@
-"""What pytest may load here: an ini file names the device, and only code or the command line may allow that."""
+"""Permission for pytest to load the device: the ini file names it, only code or the command line may allow it."""
 
 from __future__ import annotations
 

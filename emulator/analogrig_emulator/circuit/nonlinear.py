@@ -19,6 +19,7 @@ from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import ClassVar
 
+from analogrig_emulator.circuit.opamp import OutputStage
 from analogrig_emulator.circuit.part import GROUND, CircuitPart
 from analogrig_emulator.engine.system import Kink, Product
 from analogrig_emulator.errors import CircuitError
@@ -28,7 +29,7 @@ _CUBIC = 1.5 * math.sqrt(3.0)
 
 
 @dataclass(frozen=True)
-class MultiplierModel:
+class MultiplierModel(OutputStage):
     """One type or specimen of a multiplier. The defaults are ideal; each field switches one non-ideality on.
 
     gain_error: relative error of the scale; x_offset_v, y_offset_v: added to the inputs; z_offset_v: added to the
@@ -60,28 +61,7 @@ class MultiplierModel:
                 raise CircuitError(f"multiplier: {each.name} must be finite, got {value!r}")
         if not self.full_v > 0:
             raise CircuitError(f"multiplier: full_v must be positive, got {self.full_v!r}")
-        if not self.rout_ohm >= 0:
-            raise CircuitError(f"multiplier: rout_ohm must not be negative, got {self.rout_ohm!r}")
-        low, high = self.swing_v
-        if not low < 0 < high:
-            raise CircuitError(f"multiplier: swing_v must lie on both sides of 0 V, got {self.swing_v!r}")
-        if not self.has_state and (self.slews or self.clamps):
-            raise CircuitError("multiplier: slew_v_per_s and swing_v need a finite bandwidth_hz")
-
-    @property
-    def has_state(self) -> bool:
-        """True if the output has a pole, and so a state."""
-        return math.isfinite(self.bandwidth_hz)
-
-    @property
-    def slews(self) -> bool:
-        """True if the slew rate is finite."""
-        return math.isfinite(self.slew_v_per_s)
-
-    @property
-    def clamps(self) -> bool:
-        """True if the output swing is finite on either side."""
-        return any(math.isfinite(limit) for limit in self.swing_v)
+        self.require_limits("multiplier", "bandwidth_hz")
 
     @property
     def gain_rate(self) -> float:
@@ -107,7 +87,7 @@ class MultiplierModel:
 
 
 _FINITE = frozenset(
-    ("gain_error", "x_offset_v", "y_offset_v", "z_offset_v", "x_nonlinearity", "y_nonlinearity", "full_v", "rout_ohm")
+    ("gain_error", "x_offset_v", "y_offset_v", "z_offset_v", "x_nonlinearity", "y_nonlinearity", "full_v")
 )
 
 MULTIPLIERS: Mapping[str, MultiplierModel] = MappingProxyType(

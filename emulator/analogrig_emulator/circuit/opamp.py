@@ -26,8 +26,50 @@ CLAMP_RATE = 1e9
 LEAST_GBW_HZ = 1.0
 
 
+class OutputStage:
+    """Output of an active element: a pole, limits of slew rate and swing, a resistance.
+
+    Both models of active elements are dataclasses with these fields; gain_rate is the rate in 1/s at which the output
+    moves for each volt that drives it.
+    """
+
+    slew_v_per_s: float
+    swing_v: tuple[float, float]
+    rout_ohm: float
+
+    @property
+    def gain_rate(self) -> float:
+        """2 pi bandwidth, in 1/s."""
+        raise NotImplementedError
+
+    @property
+    def has_state(self) -> bool:
+        """True if the output has a pole, and so a state."""
+        return math.isfinite(self.gain_rate)
+
+    @property
+    def slews(self) -> bool:
+        """True if the slew rate is finite."""
+        return math.isfinite(self.slew_v_per_s)
+
+    @property
+    def clamps(self) -> bool:
+        """True if the output swing is finite on either side."""
+        return any(math.isfinite(limit) for limit in self.swing_v)
+
+    def require_limits(self, element: str, bandwidth: str) -> None:
+        """Raise CircuitError naming the element and the field, unless the limits make sense together."""
+        if not (math.isfinite(self.rout_ohm) and self.rout_ohm >= 0):
+            raise CircuitError(f"{element}: rout_ohm must be finite and not negative, got {self.rout_ohm!r}")
+        low, high = self.swing_v
+        if not low < 0 < high:
+            raise CircuitError(f"{element}: swing_v must lie on both sides of 0 V, got {self.swing_v!r}")
+        if not self.has_state and (self.slews or self.clamps):
+            raise CircuitError(f"{element}: slew_v_per_s and swing_v need a finite {bandwidth}")
+
+
 @dataclass(frozen=True)
-class OpAmpModel:
+class OpAmpModel(OutputStage):
     """One type of op-amp. The defaults are ideal: v+ = v-, no state. Each field switches one non-ideality on.
 
     avol: open-loop gain at DC (V/V); gbw_hz: gain-bandwidth product; slew_v_per_s: slew rate; swing_v: (lowest,
@@ -48,32 +90,11 @@ class OpAmpModel:
             value = getattr(self, field)
             if not value > 0:
                 raise CircuitError(f"op-amp: {field} must be positive, got {value!r}")
-        if not (math.isfinite(self.rout_ohm) and self.rout_ohm >= 0):
-            raise CircuitError(f"op-amp: rout_ohm must be finite and not negative, got {self.rout_ohm!r}")
         if not math.isfinite(self.vos_v):
             raise CircuitError(f"op-amp: vos_v must be finite, got {self.vos_v!r}")
-        low, high = self.swing_v
-        if not low < 0 < high:
-            raise CircuitError(f"op-amp: swing_v must lie on both sides of 0 V, got {self.swing_v!r}")
-        if not self.has_state and (self.slews or self.clamps):
-            raise CircuitError("op-amp: slew_v_per_s and swing_v need a finite gbw_hz")
+        self.require_limits("op-amp", "gbw_hz")
         if self.gbw_hz < LEAST_GBW_HZ:
             raise CircuitError(f"op-amp: gbw_hz {self.gbw_hz!r} is below {LEAST_GBW_HZ:g} Hz")
-
-    @property
-    def has_state(self) -> bool:
-        """True if the amplifier has a pole, and so a state."""
-        return math.isfinite(self.gbw_hz)
-
-    @property
-    def slews(self) -> bool:
-        """True if the slew rate is finite."""
-        return math.isfinite(self.slew_v_per_s)
-
-    @property
-    def clamps(self) -> bool:
-        """True if the output swing is finite on either side."""
-        return any(math.isfinite(limit) for limit in self.swing_v)
 
     @property
     def gain_rate(self) -> float:

@@ -207,7 +207,10 @@ class Plan:
         before = Plant.of(base.program, start).parameters()
         changed = {factors[axis]: value * before[factors[axis]] for axis, value in values.items() if axis in factors}
         tweaks = (*base.tweaks, PotChange(self.spec.change_at, changed)) if changed else base.tweaks
-        return dataclasses.replace(base, set=start, tweaks=tweaks)
+        expect = base.expect
+        if self.spec.false_alarms is not None:
+            expect = dataclasses.replace(expect, false_alarms=self.spec.false_alarms)
+        return dataclasses.replace(base, set=start, tweaks=tweaks, expect=expect)
 
     def _check(self) -> None:
         spec = self.spec

@@ -112,7 +112,7 @@ _benches = _Benches()
 
 
 class PlayedTask(NamedTuple):
-    """What a worker returns of a task."""
+    """Result of a task, as a worker returns it."""
 
     parts: list[tuple[Part, tuple[bytes, ...]]]
     """Parts, each with the columns of its trials (``Trials.encode``)."""

@@ -60,6 +60,8 @@ class CampaignSpec:
     """Number of trials of a cell between two looks of ``[stop]``."""
     samples: int | None = None
     """Number of samples of each trial; overrides the scenario's."""
+    false_alarms: int | None = None
+    """Largest number of false alarms in a trial that passes; overrides the scenario's."""
     change_at: int = 1000
     """Sample at which the factors take effect."""
     grid: Axes = field(default_factory=dict)
@@ -73,6 +75,8 @@ class CampaignSpec:
     def __post_init__(self) -> None:
         if self.samples is not None and not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be 1 to {MAX_SAMPLES}, not {self.samples}")
+        if self.false_alarms is not None and self.false_alarms < 0:
+            raise ValueError(f"false_alarms must not be negative, not {self.false_alarms}")
         for name in ("rigs", "devices"):
             values = getattr(self, name)
             if not values or len(set(values)) != len(values):

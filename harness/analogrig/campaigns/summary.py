@@ -115,7 +115,7 @@ class Blocks:
 
 @dataclass
 class Aggregate:
-    """What is known of the trials of a cell, or of all cells."""
+    """Aggregates of the trials of a cell, or of all cells."""
 
     trials: int = 0
     passed: int = 0

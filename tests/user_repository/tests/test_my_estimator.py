@@ -1,4 +1,4 @@
-"""What our estimator must do."""
+"""Requirements of our estimator."""
 
 from __future__ import annotations
 
