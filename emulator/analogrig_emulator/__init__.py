@@ -49,6 +49,7 @@ from analogrig_emulator.errors import (
     SamplerError,
 )
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program
+from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
 from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
@@ -84,6 +85,8 @@ __all__ = [
     "CircuitError",
     "CircuitNoise",
     "Components",
+    "Course",
+    "Courses",
     "CurrentSource",
     "Deck",
     "Dielectric",
@@ -101,6 +104,7 @@ __all__ = [
     "Mass",
     "Mode",
     "ModeError",
+    "Moment",
     "Multiplier",
     "MultiplierGrade",
     "MultiplierModel",
@@ -133,6 +137,8 @@ __all__ = [
     "TwoMassPlant",
     "TwoMassProgram",
     "VoltageSource",
+    "WideProgram",
+    "Wired",
     "acquired",
     "ahead_ticks",
     "drawn_levels",

@@ -28,6 +28,7 @@ from analogrig_emulator import (
     Capacitor,
     Card,
     Components,
+    Courses,
     EmulatorError,
     Excitation,
     NoisySuspension,
@@ -35,10 +36,13 @@ from analogrig_emulator import (
     OpAmpGrade,
     Pot,
     PotTurn,
+    Program,
     RepeatedPlay,
     Resistor,
     Sampler,
     SuspensionComputer,
+    WideProgram,
+    Wired,
     acquired,
     ahead_ticks,
     drawn_offsets_v,
@@ -143,7 +147,7 @@ class ComputerDescription:
         stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
         return stock if self.values is None else self.values.put_in(stock)
 
-    def machine(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+    def machine(self, program: str | Program, seed: int, sample_rate_hz: float) -> SuspensionComputer:
         """Machine drawn from the seed of a run, wired as a program, with the program's pots.
 
         :raises EmulatorError: it cannot be.
@@ -327,6 +331,22 @@ class EmulatorRig(Rig):
             changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
 
+    def courses(self, scenario: Scenario, seed: int, samples: int) -> Courses:
+        """Noise-free courses of the displacement on the machine of a play, for so many samples.
+
+        :raises EmulatorError: the machine cannot be, or not play the excitation.
+        """
+        name = scenario.plant.set
+        rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
+
+        def wired(gain: float) -> Wired:
+            machine = self._description.computer.machine(_with_gain(name, gain), seed, rate_hz)
+            is_digital = self._description.computer.pots == "dial"
+            return Wired(machine, _nominal(name, gain) if is_digital else machine)
+
+        excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
+        return Courses(wired, self._card, excitation, samples, CHANNELS.index("displacement"))
+
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         if scenario.samples <= self._block_samples:
             prepared = self._prepare(scenario, seed)
@@ -450,10 +470,28 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         raise as_error(f"{prefix}{error}") from error
 
 
+def nominal_courses(scenario: Scenario) -> Courses:
+    """Noise-free courses of the displacement on a nominal machine at 20,000 samples/s, with the scenario's own phase.
+
+    :raises EmulatorError: the machine cannot play the excitation.
+    """
+
+    def wired(gain: float) -> Wired:
+        machine = SuspensionComputer(_with_gain(scenario.plant.set, gain))
+        return Wired(machine, machine)
+
+    return Courses(wired, Card(), scenario.excitation, scenario.samples, CHANNELS.index("displacement"))
+
+
 @functools.cache
-def _nominal(program: str) -> SuspensionComputer:
+def _nominal(program: str, gain: float = 1.0) -> SuspensionComputer:
     """Nominal machine, used only to compute dials."""
-    return SuspensionComputer(program, opamp="ideal")
+    return SuspensionComputer(_with_gain(program, gain), opamp="ideal")
+
+
+def _with_gain(program: str, gain: float) -> Program:
+    """Program whose pots feed inputs of so many times the gain."""
+    return PROGRAMS[program] if gain == 1.0 else WideProgram(PROGRAMS[program], gain)
 
 
 def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
