@@ -32,8 +32,6 @@ _WIDE_GAIN = 10.0
 _MOST_STEPS = 64
 """Steps in which pots turn during a ramp, at most one a sample."""
 
-_CHUNK_SAMPLES = 1 << 16
-
 
 class Wired(NamedTuple):
     """Machine to play, and the one whose pots show the dials: a nominal one where pots are digital."""
@@ -52,27 +50,35 @@ class Moment(NamedTuple):
 class Course:
     """Course of the channel from the sample after a moment on."""
 
-    def __init__(
-        self, engine: Engine, edges: Edges, turns: Sequence[tuple[int, PiecewiseLinear]], probes: int, sign: float
-    ) -> None:
-        """Engine stands at a probe of the moment's sample; edges and turns count from that sample."""
-        self._engine, self._edges, self._turns = engine, edges, list(turns)
-        self._probes, self._sign = probes, sign
+    def __init__(self, courses: Courses, start: Moment, turns: Sequence[tuple[int, PiecewiseLinear]], probe: int) -> None:
+        """turns: circuits and the probes after which they begin, the first at once. Samples are taken at a probe."""
+        self._courses, self._start, self._turns, self._probe = courses, start, turns, probe
+        self._edges = courses.edges_from(start.sample)
+        self._engine = courses.engine(turns[0][1])
+        self._engine.state = start.state
+        self._coming = list(turns[1:])
+        self._run(1 + probe)
 
     def advance(self, samples: int) -> Matrix:
-        """Voltages of the next samples, (samples,)."""
-        count = samples * self._probes
-        until = self._engine.recorded + count
-        now = [turn for turn in self._turns if turn[0] < until]
-        del self._turns[: len(now)]
-        edges = {SOURCE: self._edges.within(*self._engine.window(count))}
-        volts = self._engine.run_changing(count, now, edges) if now else self._engine.run(count, edges)
-        return self._sign * volts[self._probes - 1 :: self._probes, 0]
+        """Voltages of the next samples, (samples,). Raises EngineError."""
+        probes = self._courses.probes
+        return self._courses.sign * self._run(samples * probes)[probes - 1 :: probes, 0]
 
-    @property
-    def state(self) -> Matrix:
-        """Voltages of the states at the present probe."""
-        return self._engine.state
+    def moment(self) -> Moment:
+        """Moment of the last sample. Raises EngineError."""
+        samples = (self._engine.recorded - 1) // self._courses.probes
+        if not self._probe:
+            return Moment(self._start.sample + samples, self._engine.state)
+        course = Course(self._courses, self._start, self._turns, 0)
+        course.advance(samples)
+        return course.moment()
+
+    def _run(self, probes: int) -> Matrix:
+        until = self._engine.recorded + probes
+        now = [turn for turn in self._coming if turn[0] < until]
+        del self._coming[: len(now)]
+        edges = {SOURCE: self._edges.within(*self._engine.window(probes))}
+        return self._engine.run_changing(probes, now, edges) if now else self._engine.run(probes, edges)
 
 
 class Courses:
@@ -87,10 +93,10 @@ class Courses:
     ) -> None:
         self._wire = functools.cache(wire)
         self._machine = self._wire(1.0).machine
-        self._probes, self._probe = probes_per_sample(card), probe_of_channel(card, channel)
+        self.probes, self._probe = probes_per_sample(card), probe_of_channel(card, channel)
         program = self._machine.program
         self._nodes = (program.channel_nodes[channel],)
-        self._sign = float(program.channel_signs[channel])
+        self.sign = float(program.channel_signs[channel])
         self._edges = on_card_clock(card, excitation).edges(0, self._tick(samples), self._machine.sample_rate_hz)
         self._later: dict[int, Edges] = {}
 
@@ -109,29 +115,13 @@ class Courses:
 
         Raises PotError for values beyond pots and gains, and EngineError.
         """
-        return self._begin(start, before, after, ramp_n, self._probe)
+        return Course(self, start, self._turns(before, after, ramp_n), self._probe)
 
-    def follow(
-        self, start: Moment, before: Mapping[str, float], after: Mapping[str, float], ramp_n: int, samples: int
-    ) -> Moment:
-        """Moment so many samples later. Raises like course()."""
-        course = self._begin(start, before, after, ramp_n, 0)
-        for first in range(0, samples, _CHUNK_SAMPLES):
-            course.advance(min(_CHUNK_SAMPLES, samples - first))
-        return Moment(start.sample + samples, course.state)
+    def engine(self, circuit: PiecewiseLinear) -> Engine:
+        """Engine of the machine, at rest before a first sample."""
+        return Engine(circuit, self._nodes, self._machine.sample_rate_hz)
 
-    def _begin(
-        self, start: Moment, before: Mapping[str, float], after: Mapping[str, float], ramp_n: int, probe: int
-    ) -> Course:
-        """Course whose samples are taken at a probe of theirs."""
-        (_, circuit), *turns = self._turns(before, after, ramp_n)
-        engine = Engine(circuit, self._nodes, self._machine.sample_rate_hz)
-        engine.state = start.state
-        edges = self._edges_from(start.sample)
-        engine.run(1 + probe, {SOURCE: edges.within(*engine.window(1 + probe))})
-        return Course(engine, edges, turns, self._probes, self._sign)
-
-    def _edges_from(self, sample: int) -> Edges:
+    def edges_from(self, sample: int) -> Edges:
         """Edges after a sample, counted from there, with the level at the sample first."""
         if sample not in self._later:
             tick = self._tick(sample)
@@ -154,11 +144,11 @@ class Courses:
     ) -> list[tuple[int, PiecewiseLinear]]:
         machine, shown = self._wire(gain)
         goal = shown.dials_between(after)
-        last = (ramp_n * self._probes, machine.machine.operating(goal))
+        last = (ramp_n * self.probes, machine.machine.operating(goal))
         if not ramp_n:
             return [last]
         start, steps = shown.dials_between(before), min(ramp_n, _MOST_STEPS)
-        places = [(i * ramp_n // steps * self._probes, (i + 0.5) / steps) for i in range(steps)]
+        places = [(i * ramp_n // steps * self.probes, (i + 0.5) / steps) for i in range(steps)]
         return [
             *(
                 (probe, machine.machine.operating({pot: start[pot] + part * (dial - start[pot]) for pot, dial in goal.items()}))
@@ -168,7 +158,7 @@ class Courses:
         ]
 
     def _tick(self, sample: int) -> int:
-        return sample * self._probes * TICKS_PER_SAMPLE
+        return sample * self.probes * TICKS_PER_SAMPLE
 
 
 @dataclass(frozen=True)

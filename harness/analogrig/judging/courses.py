@@ -21,15 +21,15 @@ class Course(Protocol):
     def advance(self, samples: int) -> NDArray[np.float64]:
         """Displacement of the next samples in LSB, (samples,)."""
 
+    def moment(self) -> Any:
+        """Moment of the last sample."""
+
 
 class Model(Protocol):
     """Plant of a run. A moment is its state at one sample, in the model's own form."""
 
     def at_rest(self, start: int, values: Values) -> Any:
         """Moment of sample ``start``, the first of a record."""
-
-    def follow(self, moment: Any, before: Values, after: Values, ramp_n: int, samples: int) -> Any:
-        """Moment so many samples later; the other arguments as for ``course``."""
 
     def course(self, moment: Any, before: Values, after: Values, ramp_n: int) -> Course:
         """Course from a moment on, at which the parameters change at once or over a ramp."""
@@ -43,32 +43,17 @@ class Change:
     """One change of the plant in a run."""
 
     start: int
-    samples: int
-    """Samples after ``start`` up to the next change or the end."""
     before: Values
     after: Values
-    ramp_n: int
     moment: Any
     """Moment of the model at ``start``."""
+    course_lsb: NDArray[np.float64]
+    """Displacement in the samples after ``start``, up to the next change or the end."""
 
     @property
     def changed(self) -> tuple[str, ...]:
         """Names of the parameters that change."""
         return tuple(name for name, value in self.after.items() if value != self.before[name])
-
-    def course(self, model: Model) -> Course:
-        """Course with the change."""
-        return model.course(self.moment, self.before, self.after, self.ramp_n)
-
-    def unchanged(self, model: Model) -> Course:
-        """Course without it."""
-        return model.course(self.moment, self.before, self.before, 0)
-
-    def chunks(self) -> Iterator[slice]:
-        """Samples after ``start`` in chunks, counted from 0."""
-        for first in range(0, self.samples, CHUNK_SAMPLES):
-            yield slice(first, min(first + CHUNK_SAMPLES, self.samples))
-
 
 def changes_between(
     model: Model,
@@ -77,19 +62,29 @@ def changes_between(
     records: Sequence[int] = (0,),
 ) -> Iterator[Change]:
     """Changes between stretches (start, end, values). The plant is at rest at the start of each record."""
+    stretches = list(stretches)
     moment: Any = None
     before: Values | None = None
-    stretches = list(stretches)
     for i, (start, end, values) in enumerate(stretches):
+        is_last = i + 1 == len(stretches)
         if start in records:
             moment = model.at_rest(start, values)
-        ramp_n = ramps_n.get(start, 0) if before else 0
-        change = Change(start, end - start - 1, before or values, values, ramp_n, moment)
+        if before is None and is_last:
+            return
+        course = model.course(moment, before or values, values, ramps_n.get(start, 0) if before else 0)
+        course_lsb = advance(course, end - start - 1)
         if before is not None:
-            yield change
-        if i + 1 < len(stretches) and stretches[i + 1][0] not in records:
-            moment = model.follow(moment, change.before, values, ramp_n, end - start)
+            yield Change(start, before, values, moment, course_lsb)
+        if not is_last:
+            course.advance(1)
+            moment = course.moment()
         before = values
+
+
+def advance(course: Course, samples: int) -> NDArray[np.float64]:
+    """Displacement of the next samples in LSB, computed in chunks."""
+    chunks = (min(CHUNK_SAMPLES, samples - first) for first in range(0, samples, CHUNK_SAMPLES))
+    return np.concatenate([np.empty(0), *(course.advance(chunk) for chunk in chunks)])
 
 
 def first_at_level(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:

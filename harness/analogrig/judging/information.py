@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from analogrig.judging import isolation, played
 from analogrig.judging.courses import Change, Model, changes_between, first_at_level
 from analogrig.judging.linear import LinearPlant
-from analogrig.run import Run
+from analogrig.run import CHUNK_SAMPLES, Run
 
 if TYPE_CHECKING:
     from analogrig.scenario import Scenario
@@ -117,11 +117,12 @@ def _per_lsb2(noise_lsb: float) -> float:
 
 def _information(model: Model, change: Change, weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """I(1), I(2), ... of one change, float64."""
-    changed, unchanged = change.course(model), change.unchanged(model)
-    out = np.empty(change.samples)
+    out = change.course_lsb
+    unchanged = model.course(change.moment, change.before, change.before, 0)
     gathered = 0.0
-    for part in change.chunks():
-        difference_lsb = changed.advance(part.stop - part.start) - unchanged.advance(part.stop - part.start)
+    for first in range(0, len(out), CHUNK_SAMPLES):
+        part = slice(first, min(first + CHUNK_SAMPLES, len(out)))
+        difference_lsb = out[part] - unchanged.advance(part.stop - part.start)
         informative = difference_lsb**2 * weight[change.start + 1 :][part]
         out[part] = np.cumsum(np.append(gathered, informative))[1:]
         gathered = float(out[part][-1])

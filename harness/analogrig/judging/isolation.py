@@ -37,8 +37,7 @@ def bound(model: Model, change: Change, weight: NDArray[np.float64]) -> int | No
     """
     if not change.changed:
         return None
-    samples = min(change.samples, ISOLATION_HORIZON_N)
-    rivals = _Rivals(model, change, change.course(model).advance(samples), weight[:samples])
+    rivals = _Rivals(model, change, weight)
     latest_n = 0
     for name in change.before:
         if change.changed != (name,):
@@ -52,9 +51,10 @@ def bound(model: Model, change: Change, weight: NDArray[np.float64]) -> int | No
 class _Rivals:
     """Changes of one other parameter by any factor from 1/4 to 4 that the plant can have."""
 
-    def __init__(self, model: Model, change: Change, truth: NDArray[np.float64], weight: NDArray[np.float64]) -> None:
-        """Compare with ``truth``, the course of the changed plant."""
-        self._model, self._change, self._truth, self._weight = model, change, truth, weight
+    def __init__(self, model: Model, change: Change, weight: NDArray[np.float64]) -> None:
+        self._model, self._change = model, change
+        self._truth = change.course_lsb[:ISOLATION_HORIZON_N]
+        self._weight = weight[: len(self._truth)]
 
     def rejected_after(self, name: str) -> int | None:
         """Samples until every factor on a parameter is rejected; None: some never is.

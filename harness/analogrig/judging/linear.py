@@ -24,17 +24,20 @@ class _Course:
 
     def __init__(self, moment: _Moment, steps: Iterator[SampledPlant], force_n: NDArray[np.float64], lsb_m: float) -> None:
         """``steps`` yields the plant of each sample period."""
-        self.moment = moment
+        self._moment = moment
         self._steps, self._force_n, self._lsb_m = steps, force_n, lsb_m
 
     def advance(self, samples: int) -> NDArray[np.float64]:
-        first, state = self.moment
+        first, state = self._moment
         out = np.empty(samples)
         for k, (force, step) in enumerate(zip(self._force_n[first : first + samples].tolist(), self._steps, strict=False)):
             state = step.next(state, force)
             out[k] = state[0]
-        self.moment = _Moment(first + samples, state)
+        self._moment = _Moment(first + samples, state)
         return out / self._lsb_m
+
+    def moment(self) -> _Moment:
+        return self._moment
 
 
 class LinearPlant:
@@ -52,11 +55,6 @@ class LinearPlant:
 
     def at_rest(self, start: int, values: Values) -> _Moment:  # noqa: ARG002 - rest is the same for all
         return _Moment(start, AT_REST)
-
-    def follow(self, moment: _Moment, before: Values, after: Values, ramp_n: int, samples: int) -> _Moment:
-        course = self.course(moment, before, after, ramp_n)
-        course.advance(samples)
-        return course.moment
 
     def course(self, moment: _Moment, before: Values, after: Values, ramp_n: int) -> _Course:
         first, last = _plant(before), _plant(after)

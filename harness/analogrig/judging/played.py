@@ -29,6 +29,10 @@ class _Course:
         with emulator_errors(_PREFIX):
             return self._played.advance(samples) / self._lsb_v
 
+    def moment(self) -> Moment:
+        with emulator_errors(_PREFIX):
+            return self._played.moment()
+
 
 class Machine:
     """Machine of a run, as a model of its plant."""
@@ -44,10 +48,6 @@ class Machine:
     def at_rest(self, start: int, values: Values) -> Moment:  # noqa: ARG002 - a machine plays one record
         with emulator_errors(_PREFIX):
             return self._courses.at_rest(self._settings(values))
-
-    def follow(self, moment: Moment, before: Values, after: Values, ramp_n: int, samples: int) -> Moment:
-        with emulator_errors(_PREFIX):
-            return self._courses.follow(moment, self._settings(before), self._settings(after), ramp_n, samples)
 
     def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _Course:
         with emulator_errors(_PREFIX):
