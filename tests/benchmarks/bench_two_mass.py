@@ -14,14 +14,14 @@ from analogrig.devices.direct import DirectDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import DEFAULT_ARL0, EstimatorConfig
 from analogrig.judging.bursts import BURST, upper_count
+from analogrig.judging.courses import first_at_level
 from analogrig.judging.exposure import ObservedRecord, record_exposure
-from analogrig.judging.information import first_at_level
 from analogrig_emulator import TWO_MASS, Excitation
 
 from .bench_reality import Delays, delays_of
 from .emulated import Emulated
 from .figure import Figure
-from .played import CARD, DISPLACEMENT, FORCE, HIGH_V, LOW_V, Change, Played
+from .played import CARD, FORCE, HIGH_V, LOW_V, Change, Played
 from .shipped import ONSET_N, ONSET_SPAN_N, answers_to, direct
 
 CHECKOUT = Path(__file__).parents[2]
@@ -42,10 +42,10 @@ CONFIDENCE = 0.999
 LEAST_NATS = (0.983 / 0.43 - 1.0) / 2.0
 """Information a sample from which the trigger's sum rises: its drift is 0.43 z^2 - 0.983."""
 
-NOTE = f"""Real samples of the emulated computer: program two-mass, TL07x amplifiers, 12 bits and 1 LSB, random phase. The
-estimator's settings are `EstimatorConfig.of_order(4)`; its build has `-DEST_NA_MAX=4U
--DEST_NB_MAX=5U -DEST_THETA_MAX=10U`. Delays and bounds are means over the detected changes, 20 % up
-and down in turn. The bound comes from noise-free plays with and without the change.
+NOTE = f"""Program two-mass on the emulated computer: TL07x amplifiers, 12 bits, 1 LSB, random phase. The
+settings of the estimator are `EstimatorConfig.of_order(4)`; its build has `-DEST_NA_MAX=4U
+-DEST_NB_MAX=5U -DEST_THETA_MAX=10U`. Changes are 20 % up and down in turn. Delays and bounds are
+means over the detected changes. A bound comes from noise-free plays with and without the change.
 
 Changes of M1 and B1 are mostly missed. They carry less information a sample than the
 {LEAST_NATS:.2f} nats from which the trigger's sum rises."""
@@ -108,7 +108,9 @@ def false_alarms(device: DirectDevice, runs: int, samples: int = HEALTHY_N) -> t
 def _armed(device: DirectDevice, played: Played, alarms: Sequence[int]) -> int:
     """Armed samples of a run."""
     flags = np.zeros(len(played.u), np.uint8)
-    record = ObservedRecord(played.u.astype(np.uint16), flags, np.ones(len(flags), np.bool_), np.array(alarms, np.int64))
+    record = ObservedRecord(
+        played.u.astype(np.uint16), flags, np.ones(len(flags), np.bool_), np.array(alarms, np.int64)
+    )
     return record_exposure(record, device.datasheet, CARD.noise_lsb[FORCE]).armed
 
 

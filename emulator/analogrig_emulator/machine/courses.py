@@ -29,8 +29,8 @@ Matrix = NDArray[np.float64]
 
 _WIDE_GAIN = 10.0
 
-_MOST_STEPS = 64
-"""Steps in which pots turn during a ramp, at most one a sample."""
+_MOST_STEPS = 256
+"""Steps in which pots turn during a ramp; a step is at least a sample long, and shows its middle."""
 
 
 class Wired(NamedTuple):
@@ -50,7 +50,9 @@ class Moment(NamedTuple):
 class Course:
     """Course of the channel from the sample after a moment on."""
 
-    def __init__(self, courses: Courses, start: Moment, turns: Sequence[tuple[int, PiecewiseLinear]], probe: int) -> None:
+    def __init__(
+        self, courses: Courses, start: Moment, turns: Sequence[tuple[int, PiecewiseLinear]], probe: int
+    ) -> None:
         """turns: circuits and the probes after which they begin, the first at once. Samples are taken at a probe."""
         self._courses, self._start, self._turns, self._probe = courses, start, turns, probe
         self._edges = courses.edges_from(start.sample)
@@ -147,18 +149,18 @@ class Courses:
         last = (ramp_n * self.probes, machine.machine.operating(goal))
         if not ramp_n:
             return [last]
-        start, steps = shown.dials_between(before), min(ramp_n, _MOST_STEPS)
-        places = [(i * ramp_n // steps * self.probes, (i + 0.5) / steps) for i in range(steps)]
-        return [
-            *(
-                (probe, machine.machine.operating({pot: start[pot] + part * (dial - start[pot]) for pot, dial in goal.items()}))
-                for probe, part in places
-            ),
-            last,
-        ]
+        start, step_n = shown.dials_between(before), -(-ramp_n // _MOST_STEPS)
+        places = [(first, min(first + step_n, ramp_n)) for first in range(0, ramp_n, step_n)]
+        turns = [(first * self.probes, _between(start, goal, (first + end) / (2 * ramp_n))) for first, end in places]
+        return [*((probe, machine.machine.operating(dials)) for probe, dials in turns), last]
 
     def _tick(self, sample: int) -> int:
         return sample * self.probes * TICKS_PER_SAMPLE
+
+
+def _between(start: Mapping[str, float], goal: Mapping[str, float], part: float) -> dict[str, float]:
+    """Dials at a fraction of the way."""
+    return {pot: start[pot] + part * (dial - start[pot]) for pot, dial in goal.items()}
 
 
 @dataclass(frozen=True)
@@ -189,11 +191,11 @@ class WideProgram(Program):
         return self.program.channels
 
     @property
-    def values(self) -> dict[str, float]:  # type: ignore[override]
+    def values(self) -> dict[str, float]:
         return self.program.values
 
     @property
-    def pots(self) -> Mapping[str, PotRow]:  # type: ignore[override]
+    def pots(self) -> Mapping[str, PotRow]:
         return self.program.pots
 
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:

@@ -55,6 +55,7 @@ class Change:
         """Names of the parameters that change."""
         return tuple(name for name, value in self.after.items() if value != self.before[name])
 
+
 def changes_between(
     model: Model,
     stretches: Iterable[tuple[int, int, Values]],

@@ -19,7 +19,7 @@ real rig or a CAN log, use a mass, a damper and a spring under the measured forc
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from analogrig.scenario import Scenario
 
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
+
 
 def change_information(run: Run) -> list[NDArray[np.float64]]:
     """I(1), I(2), ... of each change of ``run``, up to the next change or the end: float64 arrays.

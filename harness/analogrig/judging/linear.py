@@ -22,7 +22,9 @@ class _Moment(NamedTuple):
 class _Course:
     """Simulation of the plant under the force from one sample on."""
 
-    def __init__(self, moment: _Moment, steps: Iterator[SampledPlant], force_n: NDArray[np.float64], lsb_m: float) -> None:
+    def __init__(
+        self, moment: _Moment, steps: Iterator[SampledPlant], force_n: NDArray[np.float64], lsb_m: float
+    ) -> None:
         """``steps`` yields the plant of each sample period."""
         self._moment = moment
         self._steps, self._force_n, self._lsb_m = steps, force_n, lsb_m
@@ -30,7 +32,9 @@ class _Course:
     def advance(self, samples: int) -> NDArray[np.float64]:
         first, state = self._moment
         out = np.empty(samples)
-        for k, (force, step) in enumerate(zip(self._force_n[first : first + samples].tolist(), self._steps, strict=False)):
+        for k, (force, step) in enumerate(
+            zip(self._force_n[first : first + samples].tolist(), self._steps, strict=False)
+        ):
             state = step.next(state, force)
             out[k] = state[0]
         self._moment = _Moment(first + samples, state)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.judging.courses import Values
 from analogrig.errors import ConfigurationError
+from analogrig.judging.courses import Values
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors, nominal_courses
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -51,7 +51,9 @@ class Machine:
 
     def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _Course:
         with emulator_errors(_PREFIX):
-            return _Course(self._courses.course(moment, self._settings(before), self._settings(after), ramp_n), self._lsb_v)
+            return _Course(
+                self._courses.course(moment, self._settings(before), self._settings(after), ramp_n), self._lsb_v
+            )
 
     def rival(self, moment: Moment, values: Values) -> _Course | None:
         try:

@@ -25,6 +25,7 @@ from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
+from analogrig.judging.courses import first_at_level
 from analogrig.judging.exposure import Exposure, exposure
 from analogrig.plant import PARAMETERS, Segment, physical_parameters
 from analogrig.run import LOST, Run
@@ -521,7 +522,7 @@ def _attribute_alarms(
         detection = in_segment[0] if in_segment else None
         detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
-        late = information.first_at_level(gathered, expect.late_information_ratio * level)
+        late = first_at_level(gathered, expect.late_information_ratio * level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -530,7 +531,7 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=information.first_at_level(gathered, level),
+                bound_n=first_at_level(gathered, level),
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
                 if detection is None

@@ -340,7 +340,7 @@ class EmulatorRig(Rig):
         rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
 
         def wired(gain: float) -> Wired:
-            machine = self._description.computer.machine(_with_gain(name, gain), seed, rate_hz)
+            machine = _drawn_machine(self._description.computer, _with_gain(name, gain), seed, rate_hz)
             is_digital = self._description.computer.pots == "dial"
             return Wired(machine, _nominal(name, gain) if is_digital else machine)
 
@@ -416,7 +416,7 @@ class EmulatorRig(Rig):
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
-        computer = self._description.computer.machine(scenario.plant.set, seed, rate_hz)
+        computer = _drawn_machine(self._description.computer, PROGRAMS[scenario.plant.set], seed, rate_hz, anew=True)
         start = settings_of(computer, scenario.plant.overrides())
         computer.set(**self._pot_settings({**computer.program.values, **start}, scenario.plant.set))
         return computer
@@ -468,6 +468,21 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         yield
     except EmulatorError as error:
         raise as_error(f"{prefix}{error}") from error
+
+
+_last_machine: tuple[tuple[object, ...], SuspensionComputer] | None = None
+"""Machine drawn last, with what it was drawn from."""
+
+
+def _drawn_machine(
+    computer: ComputerDescription, program: Program, seed: int, rate_hz: float, *, anew: bool = False
+) -> SuspensionComputer:
+    """Machine of a seed; the last one unless ``anew``. Courses leave a machine as it is, and drawing takes long."""
+    global _last_machine  # noqa: PLW0603 - a cache of one entry
+    key = (computer, program, seed, rate_hz)
+    if anew or _last_machine is None or _last_machine[0] != key:
+        _last_machine = key, computer.machine(program, seed, rate_hz)
+    return _last_machine[1]
 
 
 def nominal_courses(scenario: Scenario) -> Courses:
