@@ -100,7 +100,7 @@ def test_information_is_that_of_whole_plays(rig: str, ramp_n: int, tolerance: fl
     scenario = Scenario(800, WAVE, tweaks=(PotChange(450, stiffness_n_per_m=18000.0, ramp_n=ramp_n),))
     run = bench(rig).play(scenario, 3)
     (played,) = information.change_information(run)
-    assert played == pytest.approx(information_of_whole_plays(run, rig, scenario), rel=tolerance, abs=0.1)
+    assert played == pytest.approx(information_of_whole_plays(run, rig, scenario), rel=tolerance, abs=0.2)
 
 
 def test_two_changes_are_each_judged_from_the_state_at_the_change() -> None:
