@@ -49,6 +49,7 @@ from analogrig_emulator.errors import (
     SamplerError,
 )
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
+from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
 from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
@@ -85,6 +86,8 @@ __all__ = [
     "CircuitError",
     "CircuitNoise",
     "Components",
+    "Course",
+    "Courses",
     "CurrentSource",
     "Deck",
     "Dielectric",
@@ -103,6 +106,7 @@ __all__ = [
     "Mass",
     "Mode",
     "ModeError",
+    "Moment",
     "Multiplier",
     "MultiplierGrade",
     "MultiplierModel",
@@ -136,6 +140,8 @@ __all__ = [
     "TwoMassPlant",
     "TwoMassProgram",
     "VoltageSource",
+    "WideProgram",
+    "Wired",
     "acquired",
     "ahead_ticks",
     "drawn_levels",

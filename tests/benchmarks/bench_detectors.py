@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Samples
 from analogrig.bench import Bench, direct_bench
-from analogrig.judging.information import change_information, first_at_level
+from analogrig.judging.courses import first_at_level
+from analogrig.judging.information import change_information
 from analogrig.judging.statistics import lower_rate, upper_rate
 from analogrig.judging.verdict import judge
 from analogrig.run import Run

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_campaign, bench_certificates, bench_detectors, bench_reality
+from . import bench_campaign, bench_certificates, bench_detectors, bench_reality, bench_two_mass
 
 FOLDER = Path("harness/docs/evidence")
 
@@ -19,6 +19,7 @@ TITLES: Mapping[str, str] = {
     "isolation": "Isolation",
     "fit": "Watch of the fit",
     "trials": "Closed-loop trials and certificates",
+    "two-mass": "Two-mass quarter car",
     "certificates": "Error probabilities of certificates",
     "calibration": "Calibration of drawn rigs",
     "campaign": "Campaigns of many trials",
@@ -38,6 +39,7 @@ NOTES: Mapping[str, str] = {
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
     "reality": bench_reality.NOTE,
+    "two-mass": bench_two_mass.NOTE,
 }
 """Paragraphs below the tables."""
 

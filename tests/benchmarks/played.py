@@ -30,7 +30,7 @@ class Change(NamedTuple):
     """Change of one parameter; the next sample is the first one affected."""
 
     parameter: str
-    """``M``, ``B`` or ``K``."""
+    """Name of its pot: ``M``, ``B`` or ``K``."""
     factor: float
     sample: int
 

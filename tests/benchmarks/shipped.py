@@ -35,7 +35,12 @@ class Misfit:
 
 def shipped() -> DirectDevice:
     """Device with its default settings."""
-    device = InprocDevice(name="shipped").direct(alarms_only=True)
+    return direct(InprocDevice(name="shipped"))
+
+
+def direct(description: InprocDevice) -> DirectDevice:
+    """Device without its line, prepared for the card."""
+    device = description.direct(alarms_only=True)
     assert isinstance(device, DirectDevice)
     _prepare(device)
     return device

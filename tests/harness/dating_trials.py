@@ -16,7 +16,7 @@ from analogrig import config
 from analogrig.hardware.by_hand import PlannedChange
 from analogrig.hardware.dating.instants import Instant, NoInstant, TurnInstants, date_jump, date_turn
 from analogrig.hardware.dating.two_filter import Signals
-from analogrig.judging import information
+from analogrig.judging.isolation import ISOLATION_INFORMATION
 from analogrig.plant import Plant, SampledPlant
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
@@ -126,14 +126,14 @@ class Trial:
     def width_bound(self) -> int:
         """Number of instants that no method separates from the true one with 95 % confidence.
 
-        The information between the courses of the displacement is below ln 20, as in analogrig.judging.information.
+        The information between the courses of the displacement is below ln 20, as in analogrig.judging.isolation.
         """
         first = max(0, self.sample - 400)
         samples = np.arange(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
         courses_m = self._courses(first, samples)
         true_m = courses_m[samples == self.sample]
         gathered = ((courses_m - true_m) ** 2).sum(axis=1) / (2.0 * self.signals.noise_m**2)
-        return int((gathered < information.ISOLATION_INFORMATION).sum())
+        return int((gathered < ISOLATION_INFORMATION).sum())
 
     def _courses(self, first: int, samples: NDArray[np.int64]) -> NDArray[np.float64]:
         """(m, 800) displacement in metres from sample ``first`` on, for a change at each of ``samples`` (m,)."""

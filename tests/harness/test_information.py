@@ -13,6 +13,7 @@ from scipy.signal import cont2discrete
 
 from analogrig.datasheet import ModelOrders
 from analogrig.judging import information
+from analogrig.judging.courses import first_at_level
 from analogrig.plant import Plant, SampledPlant, estimated_parameters
 from tests.harness.runs import made_run
 
@@ -85,13 +86,13 @@ def test_clipped_samples_carry_no_information() -> None:
 def test_change_of_an_unloaded_suspension_is_not_detectable() -> None:
     run = made_run(force_n=np.zeros(600), plants=[(0, FRONT), (400, SOFT)])
     (gathered,) = information.change_information(run)
-    assert information.first_at_level(gathered, math.log(1e5)) is None
+    assert first_at_level(gathered, math.log(1e5)) is None
 
 
 def test_first_reaching_counts_from_one() -> None:
-    assert information.first_at_level([0.0, 5.0, 5.0, 12.0], 5.0) == 2
-    assert information.first_at_level([6.0], 5.0) == 1
-    assert information.first_at_level([], 5.0) is None
+    assert first_at_level([0.0, 5.0, 5.0, 12.0], 5.0) == 2
+    assert first_at_level([6.0], 5.0) == 1
+    assert first_at_level([], 5.0) is None
 
 
 @pytest.mark.parametrize(

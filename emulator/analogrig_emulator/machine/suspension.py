@@ -113,6 +113,10 @@ class SuspensionComputer:
         """Dials to which set(**settings) turns the pots."""
         return self.machine.resting(self._resolve(settings, dict(self._values)))
 
+    def dials_between(self, settings: Mapping[str, float]) -> dict[str, float]:
+        """Dials for settings on continuous tracks, between windings. Raises PotError."""
+        return self._resolve(settings, dict(self._values))
+
     def plan(self, changes: Sequence[PotTurn], samples: int) -> list[PotTurn]:
         """Dials by pot that play(..., samples, changes) sets, in order of time. Raises PotError."""
         planned, values = [], dict(self._values)

@@ -25,6 +25,7 @@ from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
+from analogrig.judging.courses import first_at_level
 from analogrig.judging.exposure import Exposure, exposure
 from analogrig.plant import Segment, estimated_parameters
 from analogrig.program import Program
@@ -366,7 +367,7 @@ def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
 def not_judged(run: Run) -> tuple[str, ...]:
     """Quantities that the device does not report, or that the program does not relate to its parameters."""
     program = run.conditions.program
-    stated = {ESTIMATES: program.estimates, DIAGNOSES: _diagnosed(program), BOUNDS: program.is_linear}
+    stated = {ESTIMATES: program.estimates, DIAGNOSES: _diagnosed(program), BOUNDS: information.is_bounded(run)}
     unstated = (name for name, is_stated in stated.items() if not is_stated)
     return tuple(dict.fromkeys((*unreported(run.datasheet), *unstated)))
 
@@ -531,7 +532,7 @@ def _attribute_alarms(
     by_start = {segment.start: segment for segment in run.conditions.segments}
     detected: set[int] = set()
     tweaks = []
-    diagnosed, is_linear = _diagnosed(run.conditions.program), run.conditions.program.is_linear
+    diagnosed, is_bounded = _diagnosed(run.conditions.program), information.is_bounded(run)
     isolates = len(run.diagnosis_index) and diagnosed
     isolation_bounds = information.isolation_bounds(run) if isolates else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
@@ -544,7 +545,7 @@ def _attribute_alarms(
         detection = in_segment[0] if in_segment else None
         detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
-        late = information.first_at_level(gathered, expect.late_information_ratio * level)
+        late = first_at_level(gathered, expect.late_information_ratio * level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -553,8 +554,8 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=information.first_at_level(gathered, level),
-                is_bounded=is_linear,
+                bound_n=first_at_level(gathered, level),
+                is_bounded=is_bounded,
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
                 if detection is None or not diagnosed

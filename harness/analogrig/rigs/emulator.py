@@ -19,7 +19,7 @@ from analogrig.errors import AnalogrigError, ConfigurationError, RigError
 from analogrig.plant import Segment
 from analogrig.program import Program
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
-from analogrig.run import Channel
+from analogrig.run import OUTPUT, Channel
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
     CARDS,
@@ -29,6 +29,7 @@ from analogrig_emulator import (
     Capacitor,
     Card,
     Components,
+    Courses,
     EmulatorError,
     Excitation,
     NoisySuspension,
@@ -40,6 +41,8 @@ from analogrig_emulator import (
     Resistor,
     Sampler,
     SuspensionComputer,
+    WideProgram,
+    Wired,
     acquired,
     ahead_ticks,
     drawn_offsets_v,
@@ -47,6 +50,7 @@ from analogrig_emulator import (
     preset,
     probes_per_sample,
 )
+from analogrig_emulator import Program as Circuit
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
@@ -150,14 +154,14 @@ class ComputerDescription:
         stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
         return stock if self.values is None else self.values.put_in(stock)
 
-    def machine(self, program: Program, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+    def machine(self, program: Circuit, seed: int, sample_rate_hz: float) -> SuspensionComputer:
         """Machine drawn from the seed of a run, wired as a program, with the program's pots.
 
         :raises EmulatorError: it cannot be.
         """
         specimen = seed if self.specimen is None else self.specimen
         return SuspensionComputer(
-            program.circuit,
+            program,
             opamp=preset(self.op_amp),
             rng=Stream.COMPONENTS.generator(specimen),
             offset_v=self.offset_v,
@@ -337,6 +341,22 @@ class EmulatorRig(Rig):
             changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
 
+    def courses(self, scenario: Scenario, seed: int, samples: int) -> Courses:
+        """Noise-free courses of the output on the machine of a play, for so many samples.
+
+        :raises EmulatorError: the machine cannot be, or not play the excitation.
+        """
+        program, card = scenario.program, self.card(scenario.program)
+        rate_hz = card.true_rate_hz * probes_per_sample(card)
+
+        def wired(gain: float) -> Wired:
+            machine = _drawn_machine(self._description.computer, _with_gain(program, gain), seed, rate_hz)
+            is_digital = self._description.computer.pots == "dial"
+            return Wired(machine, _nominal(program, gain) if is_digital else machine)
+
+        excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
+        return Courses(wired, card, excitation, samples, OUTPUT)
+
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         if scenario.samples <= self._block_samples:
             prepared = self._prepare(scenario, seed)
@@ -409,7 +429,7 @@ class EmulatorRig(Rig):
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         card = self.card(scenario.program)
         rate_hz = card.true_rate_hz * probes_per_sample(card)
-        computer = self._description.computer.machine(scenario.program, seed, rate_hz)
+        computer = _drawn_machine(self._description.computer, scenario.program.circuit, seed, rate_hz, anew=True)
         computer.set(**self._pot_settings(scenario.plant.parameters(), scenario.program))
         return computer
 
@@ -463,7 +483,40 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         raise as_error(f"{prefix}{error}") from error
 
 
+_last_machine: tuple[tuple[object, ...], SuspensionComputer] | None = None
+"""Machine drawn last, with what it was drawn from."""
+
+
+def _drawn_machine(
+    computer: ComputerDescription, program: Circuit, seed: int, rate_hz: float, *, anew: bool = False
+) -> SuspensionComputer:
+    """Machine of a seed; the last one unless ``anew``. Courses leave a machine as it is, and drawing takes long."""
+    global _last_machine  # noqa: PLW0603 - a cache of one entry
+    key = (computer, program, seed, rate_hz)
+    if anew or _last_machine is None or _last_machine[0] != key:
+        _last_machine = key, computer.machine(program, seed, rate_hz)
+    return _last_machine[1]
+
+
+def nominal_courses(scenario: Scenario) -> Courses:
+    """Noise-free courses of the output on a nominal machine at 20,000 samples/s, with the scenario's own phase.
+
+    :raises EmulatorError: the machine cannot play the excitation.
+    """
+
+    def wired(gain: float) -> Wired:
+        machine = SuspensionComputer(_with_gain(scenario.program, gain))
+        return Wired(machine, machine)
+
+    return Courses(wired, Card(), scenario.excitation, scenario.samples, OUTPUT)
+
+
 @functools.lru_cache(maxsize=8)
-def _nominal(program: Program) -> SuspensionComputer:
+def _nominal(program: Program, gain: float = 1.0) -> SuspensionComputer:
     """Nominal machine, used only to compute dials."""
-    return SuspensionComputer(program.circuit, opamp="ideal")
+    return SuspensionComputer(_with_gain(program, gain), opamp="ideal")
+
+
+def _with_gain(program: Program, gain: float) -> Circuit:
+    """Circuit whose pots feed inputs of so many times the gain."""
+    return program.circuit if gain == 1.0 else WideProgram(program.circuit, gain)

@@ -362,7 +362,7 @@ class ServedDescription(EmulatorDescription):
             except ValueError as error:
                 raise ConfigurationError(f"{self.name}: card and instrument together: {error}") from error
             return ServedRedPitaya(
-                lambda rate_hz: self.computer.machine(program, seed, rate_hz),
+                lambda rate_hz: self.computer.machine(program.circuit, seed, rate_hz),
                 Stream.CARD.generator(seed),
                 described,
                 clock,
