@@ -41,7 +41,18 @@ CONCRETE = re.compile(
 """Classes of rigs and devices that have an interface."""
 
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("errors", "config", "wording", "catalogue", "_catalogue", "estimator_config", "storage", "program", "plant", "lazy"),
+    (
+        "errors",
+        "config",
+        "wording",
+        "catalogue",
+        "_catalogue",
+        "estimator_config",
+        "storage",
+        "program",
+        "plant",
+        "lazy",
+    ),
     ("run", "scenario", "header", "trust", "identity", "signals", "output"),
     ("links",),
     ("protocol",),

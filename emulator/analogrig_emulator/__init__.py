@@ -52,7 +52,16 @@ from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wi
 from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
-from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
+from analogrig_emulator.machine.program import (
+    CHANNELS,
+    SOURCE,
+    ForceLaw,
+    Mass,
+    Parameter,
+    ProgramCircuit,
+    Scale,
+    Scales,
+)
 from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, BumpStop, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
@@ -122,7 +131,7 @@ __all__ = [
     "PotGrade",
     "PotModel",
     "PotTurn",
-    "Program",
+    "ProgramCircuit",
     "ProgramError",
     "ProgramParameter",
     "Repeat",

@@ -30,7 +30,7 @@ from analogrig_emulator.circuit.components import (
 from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
 from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.machine.noise import NoisySuspension
-from analogrig_emulator.machine.program import CHANNELS, Program
+from analogrig_emulator.machine.program import CHANNELS, ProgramCircuit
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
 
@@ -114,7 +114,7 @@ class _Setup:
     quantised: bool = False
     turning: bool = False
 
-    def figure_lsb(self, program: Program, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
+    def figure_lsb(self, program: ProgramCircuit, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
         """Largest difference of the displacement from the ideal machine's, or from that without the effect."""
         reference_lsb = ideal_lsb
         if self.turning:
@@ -123,7 +123,7 @@ class _Setup:
             reference_lsb = dataclasses.replace(self, noise=None).displacement_lsb(program, seed)
         return float(np.abs(self.displacement_lsb(program, seed) - reference_lsb).max())
 
-    def displacement_lsb(self, program: Program, seed: int) -> NDArray[np.float64]:
+    def displacement_lsb(self, program: ProgramCircuit, seed: int) -> NDArray[np.float64]:
         """Converter input or code of the displacement at every sample: (SAMPLES,), LSB."""
         rate_hz = self.card.true_rate_hz * probes_per_sample(self.card)
         components = dataclasses.replace(self.components, seed=seed)
@@ -137,7 +137,7 @@ class _Setup:
         seen_lsb = sampler.seen_lsb(volts)
         return (sampler.convert(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
 
-    def _changes(self, program: Program) -> Sequence[PotTurn]:
+    def _changes(self, program: ProgramCircuit) -> Sequence[PotTurn]:
         if self.turning:
             return [PotTurn(200, {"K": 0.8 * program.values["K"]}, _SLOW_CHANGE_N)]
         return _CHANGES[program.name]

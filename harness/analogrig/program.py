@@ -18,7 +18,7 @@ from analogrig.errors import ConfigurationError
 from analogrig_emulator import EmulatorError, Equations, ProgramError, ProgramParameter, equations_of, wired
 
 if TYPE_CHECKING:
-    from analogrig_emulator import Program as Circuit
+    from analogrig_emulator import ProgramCircuit
 
 MAX_CHARACTERS = 65_536
 MOST_CHANNELS = 4
@@ -28,7 +28,7 @@ _LINEAR_TO = 1e-9
 """Largest relative deviation from superposition of equations that count as linear."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Program:
     """Equations of a plant with its channels, scales and parameters; programs with equal files are equal.
 
@@ -37,6 +37,9 @@ class Program:
 
     source: str
     """Tables of the file as JSON."""
+
+    def __repr__(self) -> str:
+        return f"Program({self.name!r})"
 
     @classmethod
     def load(cls, name: str) -> Program:
@@ -88,7 +91,7 @@ class Program:
         return _equations(self.source)
 
     @property
-    def circuit(self) -> Circuit:
+    def circuit(self) -> ProgramCircuit:
         """Circuit that solves the equations.
 
         :raises ConfigurationError: the machine cannot be patched so; names the term and the cure.

@@ -21,7 +21,7 @@ from analogrig_emulator import (
     OpAmpModel,
     PotError,
     PotTurn,
-    Program,
+    ProgramCircuit,
     SuspensionComputer,
 )
 
@@ -42,7 +42,7 @@ def played(
     return np.concatenate(list(computer.play(excitation or Excitation(), samples, tweaks)))
 
 
-def plant(program: Program, force_n: Volts, tweaks: Sequence[PotTurn] = ()) -> Volts:
+def plant(program: ProgramCircuit, force_n: Volts, tweaks: Sequence[PotTurn] = ()) -> Volts:
     """M x'' + B x' + K x = F with F held between samples, exactly, by scipy: x in m, v in m/s, (samples, 2)."""
     values = program.values
     turns = {change.sample: change.values for change in tweaks}

@@ -146,7 +146,7 @@ def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
         ("scenario = 'thesis'\n[grid]\nmass_factor = [0.5]", "has tweaks of its own"),
         ("[grid]\nmass_factor = [0.5]\n", None),
         ("[stop]\nquantity = 'late'\nrate = 0.1", "quantity: must be one of"),
-        ("samples = 1100\n[grid]\nmass_factor = [0.5]\nchange_at = 3", "unknown key 'change_at'"),
+        ("samples = 1100\n[grid]\nmass_factor = [0.5]\nchange_at = 3", "grid.change_at: must be an array, not 3"),
         ("false_alarms = -1\n[grid]\nmass_factor = [0.5]", "false_alarms must not be negative, not -1"),
         (
             "samples = 500\n[grid]\nmass_factor = [0.5]",

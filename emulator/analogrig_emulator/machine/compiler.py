@@ -23,7 +23,7 @@ from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import PotError, ProgramError
 from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
-from analogrig_emulator.machine.program import SOURCE, PotRow, Program, Scale, Scales
+from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scale, Scales
 from analogrig_emulator.machine.program_file import Equations, read_program
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.stages import (
@@ -37,7 +37,7 @@ from analogrig_emulator.machine.stages import (
 )
 from analogrig_emulator.machine.trial import Reach, reaches
 
-DIAGRAMS: Mapping[str, Program] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
+DIAGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
 """Circuits wired by hand, by the name that a program file gives as its diagram."""
 
 MACHINE_V = 10.0
@@ -104,7 +104,7 @@ class PatchedElement:
 
 
 @dataclass(frozen=True)
-class PatchedProgram(Program):
+class PatchedProgram(ProgramCircuit):
     """Program compiled from equations.
 
     patch: computing elements in the order of the diagram; inverters: names of the last amplifiers, by quantity;
@@ -179,7 +179,7 @@ class PatchedProgram(Program):
         return [replace(each, model=next(given)) if isinstance(each, OpAmp) else each for each in self.elements]
 
 
-def wired(equations: Equations) -> Program:
+def wired(equations: Equations) -> ProgramCircuit:
     """Circuit that solves the equations: that of the diagram that the file names, or else their patch.
 
     Raises ProgramError like compile_program(), and for an unknown diagram or one with other parameters and channels.

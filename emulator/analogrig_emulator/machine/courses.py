@@ -22,7 +22,7 @@ from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
 from analogrig_emulator.errors import PotError
-from analogrig_emulator.machine.program import SOURCE, PotRow, Program, Scales
+from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scales
 from analogrig_emulator.machine.suspension import SuspensionComputer
 
 Matrix = NDArray[np.float64]
@@ -164,10 +164,10 @@ def _between(start: Mapping[str, float], goal: Mapping[str, float], part: float)
 
 
 @dataclass(frozen=True)
-class WideProgram(Program):
+class WideProgram(ProgramCircuit):
     """Program whose pots feed inputs of so many times the gain, with as much smaller coefficients."""
 
-    program: Program
+    program: ProgramCircuit
     gain: float
 
     @property

@@ -105,7 +105,7 @@ class PotRow:
     settings: tuple[str, ...]
 
 
-class Program(ABC):
+class ProgramCircuit(ABC):
     """Circuit for the machine, with its scales and pots. Programs never change."""
 
     name: str

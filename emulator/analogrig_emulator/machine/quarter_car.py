@@ -30,7 +30,7 @@ from analogrig_emulator.circuit.circuit import (
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import CircuitError
-from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, ProgramCircuit, Scale, Scales
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class BumpStop:
 
 
 @dataclass(frozen=True)
-class SuspensionProgram(Program):
+class SuspensionProgram(ProgramCircuit):
     """Parameters with suitable scaling and nominal parts.
 
     force_n, velocity_m_per_s: full scale, 10 V; the displacement's is time velocity R2 C2. stop: optional bump stop.

@@ -20,11 +20,11 @@ from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_
 from analogrig_emulator.engine.system import Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
-from analogrig_emulator.machine.program import SOURCE, Program, Scales
+from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK
 from analogrig_emulator.machine.two_mass import TWO_MASS
 
-PROGRAMS: Mapping[str, Program] = MappingProxyType(
+PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType(
     {program.name: program for program in (FRONT, SHOCK, BUMP_STOP, TWO_MASS)}
 )
 """Programs by name."""
@@ -47,7 +47,7 @@ class SuspensionComputer:
 
     def __init__(
         self,
-        program: str | Program = "front",
+        program: str | ProgramCircuit = "front",
         *,
         opamp: str | OpAmpModel = "tl07x",
         components: Components = NOMINAL,
@@ -245,19 +245,21 @@ class _LoadedPot:
 _LoadedPots: TypeAlias = dict[str, _LoadedPot]
 
 
-def _wired(program: Program, models: Sequence[OpAmpModel], components: Components) -> tuple[Circuit, _LoadedPots]:
+def _wired(
+    program: ProgramCircuit, models: Sequence[OpAmpModel], components: Components
+) -> tuple[Circuit, _LoadedPots]:
     """Circuit of a program with these op-amps and components, and its pots."""
     circuit = Circuit(components.fit(program.netlist(models)))
     return circuit, _pots(program, circuit, components)
 
 
 @functools.lru_cache(maxsize=8)
-def _nominal(program: Program, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
+def _nominal(program: ProgramCircuit, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
     """The same with perfect components. Equal machines share their circuit, and with it its equations."""
     return _wired(program, [model] * program.amplifiers, NOMINAL)
 
 
-def _pots(program: Program, circuit: Circuit, components: Components) -> _LoadedPots:
+def _pots(program: ProgramCircuit, circuit: Circuit, components: Components) -> _LoadedPots:
     loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
     tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
@@ -266,8 +268,8 @@ def _pots(program: Program, circuit: Circuit, components: Components) -> _Loaded
     }
 
 
-def _program(program: str | Program) -> Program:
-    if isinstance(program, Program):
+def _program(program: str | ProgramCircuit) -> ProgramCircuit:
+    if isinstance(program, ProgramCircuit):
         return program
     if program not in PROGRAMS:
         raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}")

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from analogrig_emulator.circuit.circuit import Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
-from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, ProgramCircuit, Scale, Scales
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class TwoMassParts:
 
 
 @dataclass(frozen=True)
-class TwoMassProgram(Program):
+class TwoMassProgram(ProgramCircuit):
     """Plant and parts of the program; force_n, velocity_m_per_s: full scale, 10 V.
 
     All other scales follow from the ratios of the parts. At the edges of a square wave over 0..10 V (0..2940 N) the

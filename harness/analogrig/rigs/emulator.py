@@ -37,6 +37,7 @@ from analogrig_emulator import (
     OpAmpGrade,
     Pot,
     PotTurn,
+    ProgramCircuit,
     RepeatedPlay,
     Resistor,
     Sampler,
@@ -50,7 +51,6 @@ from analogrig_emulator import (
     preset,
     probes_per_sample,
 )
-from analogrig_emulator import Program as Circuit
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
@@ -154,7 +154,7 @@ class ComputerDescription:
         stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
         return stock if self.values is None else self.values.put_in(stock)
 
-    def machine(self, program: Circuit, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+    def machine(self, program: ProgramCircuit, seed: int, sample_rate_hz: float) -> SuspensionComputer:
         """Machine drawn from the seed of a run, wired as a program, with the program's pots.
 
         :raises EmulatorError: it cannot be.
@@ -488,7 +488,7 @@ _last_machine: tuple[tuple[object, ...], SuspensionComputer] | None = None
 
 
 def _drawn_machine(
-    computer: ComputerDescription, program: Circuit, seed: int, rate_hz: float, *, anew: bool = False
+    computer: ComputerDescription, program: ProgramCircuit, seed: int, rate_hz: float, *, anew: bool = False
 ) -> SuspensionComputer:
     """Machine of a seed; the last one unless ``anew``. Courses leave a machine as it is, and drawing takes long."""
     global _last_machine  # noqa: PLW0603 - a cache of one entry
@@ -517,6 +517,6 @@ def _nominal(program: Program, gain: float = 1.0) -> SuspensionComputer:
     return SuspensionComputer(_with_gain(program, gain), opamp="ideal")
 
 
-def _with_gain(program: Program, gain: float) -> Circuit:
+def _with_gain(program: Program, gain: float) -> ProgramCircuit:
     """Circuit whose pots feed inputs of so many times the gain."""
     return program.circuit if gain == 1.0 else WideProgram(program.circuit, gain)
