@@ -19,7 +19,7 @@ class _Moment(NamedTuple):
     state: State
 
 
-class _Course:
+class _Simulated:
     """Simulation of the plant under the force from one sample on."""
 
     def __init__(
@@ -60,16 +60,16 @@ class LinearPlant:
     def at_rest(self, start: int, values: Values) -> _Moment:  # noqa: ARG002 - rest is the same for all
         return _Moment(start, AT_REST)
 
-    def course(self, moment: _Moment, before: Values, after: Values, ramp_n: int) -> _Course:
+    def course(self, moment: _Moment, before: Values, after: Values, ramp_n: int) -> _Simulated:
         first, last = _plant(before), _plant(after)
         length = min(ramp_n, len(self._force_n) - moment.sample)
         ramp = SampledPlant.from_plants(
             [first.interpolate(last, (k + 0.5) / ramp_n) for k in range(length)], self._period_s
         )
         settled = itertools.repeat(SampledPlant.from_plant(last, self._period_s))
-        return _Course(moment, itertools.chain(ramp, settled), self._force_n, self._lsb_m)
+        return _Simulated(moment, itertools.chain(ramp, settled), self._force_n, self._lsb_m)
 
-    def rival(self, moment: _Moment, values: Values) -> _Course:
+    def rival(self, moment: _Moment, values: Values) -> _Simulated:
         return self.course(moment, values, values, 0)
 
 
