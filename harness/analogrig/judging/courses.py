@@ -15,7 +15,7 @@ Values = Mapping[str, float]
 """Parameters of the plant by name."""
 
 
-class Course(Protocol):
+class Trajectory(Protocol):
     """Displacement from the sample after a moment on."""
 
     def advance(self, samples: int) -> NDArray[np.float64]:
@@ -31,15 +31,15 @@ class Model(Protocol):
     def at_rest(self, start: int, values: Values) -> Any:
         """Moment of sample ``start``, the first of a record."""
 
-    def course(self, moment: Any, before: Values, after: Values, ramp_n: int) -> Course:
-        """Course from a moment on, at which the parameters change at once or over a ramp."""
+    def course(self, moment: Any, before: Values, after: Values, ramp_n: int) -> Trajectory:
+        """Trajectory from a moment on, at which the parameters change at once or over a ramp."""
 
-    def rival(self, moment: Any, values: Values) -> Course | None:
-        """Course from a moment on with other parameters; None: the plant cannot have them."""
+    def rival(self, moment: Any, values: Values) -> Trajectory | None:
+        """Trajectory from a moment on with other parameters; None: the plant cannot have them."""
 
 
 @dataclass(frozen=True)
-class Change:
+class PlantChange:
     """One change of the plant in a run."""
 
     start: int
@@ -61,7 +61,7 @@ def changes_between(
     stretches: Iterable[tuple[int, int, Values]],
     ramps_n: Mapping[int, int],
     records: Sequence[int] = (0,),
-) -> Iterator[Change]:
+) -> Iterator[PlantChange]:
     """Changes between stretches (start, end, values). The plant is at rest at the start of each record."""
     stretches = list(stretches)
     moment: Any = None
@@ -75,14 +75,14 @@ def changes_between(
         course = model.course(moment, before or values, values, ramps_n.get(start, 0) if before else 0)
         course_lsb = advance(course, end - start - 1)
         if before is not None:
-            yield Change(start, before, values, moment, course_lsb)
+            yield PlantChange(start, before, values, moment, course_lsb)
         if not is_last:
             course.advance(1)
             moment = course.moment()
         before = values
 
 
-def advance(course: Course, samples: int) -> NDArray[np.float64]:
+def advance(course: Trajectory, samples: int) -> NDArray[np.float64]:
     """Displacement of the next samples in LSB, computed in chunks."""
     chunks = (min(CHUNK_SAMPLES, samples - first) for first in range(0, samples, CHUNK_SAMPLES))
     return np.concatenate([np.empty(0), *(course.advance(chunk) for chunk in chunks)])

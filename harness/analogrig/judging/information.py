@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging import isolation, played
-from analogrig.judging.courses import Change, Model, changes_between, first_at_level
+from analogrig.judging.courses import Model, PlantChange, changes_between, first_at_level
 from analogrig.judging.linear import LinearPlant
 from analogrig.run import CHUNK_SAMPLES, Run
 
@@ -114,7 +114,7 @@ def _model(run: Run) -> Model | None:
     return machine
 
 
-def _run_changes(run: Run, model: Model) -> Iterator[Change]:
+def _run_changes(run: Run, model: Model) -> Iterator[PlantChange]:
     """Changes of the plant in ``run``, including those at the start of a record."""
     ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
     stretches = [(start, end, plant.parameters()) for start, end, plant in run.segments]
@@ -130,7 +130,7 @@ def _per_lsb2(noise_lsb: float) -> float:
     return 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2))
 
 
-def _information(model: Model, change: Change, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+def _information(model: Model, change: PlantChange, weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """I(1), I(2), ... of one change, float64."""
     out = change.course_lsb
     unchanged = model.course(change.moment, change.before, change.before, 0)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.judging.courses import Change, Model, first_at_level
+from analogrig.judging.courses import Model, PlantChange, first_at_level
 
 ISOLATION_INFORMATION = math.log(20.0)
 """Information at which a rival hypothesis is rejected with 95 % confidence."""
@@ -33,7 +33,7 @@ _LEAST_NODES = 3
 _MOST_REFINEMENTS = 12
 
 
-def bound(model: Model, change: Change, weight: NDArray[np.float64]) -> int | None:
+def bound(model: Model, change: PlantChange, weight: NDArray[np.float64]) -> int | None:
     """Samples after a change until every rival is rejected; None: not before the next change or within the horizon.
 
     :param weight: information per squared LSB of each sample after the change.
@@ -54,7 +54,7 @@ def bound(model: Model, change: Change, weight: NDArray[np.float64]) -> int | No
 class _Rivals:
     """Changes of one other parameter by any factor from 1/4 to 4 that the plant can have."""
 
-    def __init__(self, model: Model, change: Change, weight: NDArray[np.float64]) -> None:
+    def __init__(self, model: Model, change: PlantChange, weight: NDArray[np.float64]) -> None:
         self._model, self._change = model, change
         self._truth = change.course_lsb[:ISOLATION_HORIZON_N]
         self._weight = weight[: len(self._truth)]

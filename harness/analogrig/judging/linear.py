@@ -19,7 +19,7 @@ class _Moment(NamedTuple):
     state: State
 
 
-class _Course:
+class _Simulated:
     """Simulation of the plant under the input from one sample on."""
 
     def __init__(
@@ -65,16 +65,16 @@ class LinearPlant:
     def at_rest(self, start: int, values: Values) -> _Moment:
         return _Moment(start, SampledPlant.from_plant(self._plant(values), self._period_s).at_rest)
 
-    def course(self, moment: _Moment, before: Values, after: Values, ramp_n: int) -> _Course:
+    def course(self, moment: _Moment, before: Values, after: Values, ramp_n: int) -> _Simulated:
         first, last = self._plant(before), self._plant(after)
         length = min(ramp_n, len(self._driven) - moment.sample)
         ramp = SampledPlant.from_plants(
             [first.interpolate(last, (k + 0.5) / ramp_n) for k in range(length)], self._period_s
         )
         settled = SampledPlant.from_plant(last, self._period_s)
-        return _Course(moment, iter(ramp), settled, self._driven, self._lsb)
+        return _Simulated(moment, iter(ramp), settled, self._driven, self._lsb)
 
-    def rival(self, moment: _Moment, values: Values) -> _Course:
+    def rival(self, moment: _Moment, values: Values) -> _Simulated:
         return self.course(moment, values, values, 0)
 
     def _plant(self, values: Values) -> Plant:

@@ -19,7 +19,7 @@ from analogrig_emulator import Course, Courses, Moment
 _PREFIX = "no bound from a play of the machine: "
 
 
-class _Course:
+class _Played:
     """Course in LSB."""
 
     def __init__(self, played: Course, lsb_v: float) -> None:
@@ -44,11 +44,11 @@ class Machine:
         with emulator_errors(_PREFIX):
             return self._courses.at_rest(values)
 
-    def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _Course:
+    def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _Played:
         with emulator_errors(_PREFIX):
-            return _Course(self._courses.course(moment, before, after, ramp_n), self._lsb_v)
+            return _Played(self._courses.course(moment, before, after, ramp_n), self._lsb_v)
 
-    def rival(self, moment: Moment, values: Values) -> _Course | None:
+    def rival(self, moment: Moment, values: Values) -> _Played | None:
         try:
             return self.course(moment, values, values, 0)
         except ConfigurationError:
