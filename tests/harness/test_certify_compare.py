@@ -333,7 +333,7 @@ def test_build_that_loses_its_estimates_is_worse() -> None:
     good, bad = ([observed(seed, 5) for seed in range(20)] for _ in "ab")
     for _, trial in bad:
         trial["errors"] = []
-    words = {each.quantity: each.word for each in compare(good, bad).differences}
+    words = {each.quantity: each.word for each in compare(good, bad, estimates="MBK").differences}
     assert {words[f"error of {name}"] for name in "MBK"} == {"worse"}
 
 

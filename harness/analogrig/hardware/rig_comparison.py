@@ -173,7 +173,7 @@ def compare_rigs(
         signals=tuple(signal_difference(runs, name, confidence) for name in scenario.program.measured),
         latency=_latency(rows_a, rows_b, confidence),
         false_alarms=(FalseAlarms.of(rows_a, confidence), FalseAlarms.of(rows_b, confidence)),
-        verdicts=compare(keyed_a, keyed_b, alpha=round(1.0 - confidence, 12)),
+        verdicts=compare(keyed_a, keyed_b, round(1.0 - confidence, 12), scenario.program.estimates),
     )
 
 
