@@ -33,6 +33,9 @@
 /// determined by the noise, which any A = C fits, and C must not follow.
 #define REFRESH_MEMORIES 2.0F
 
+/// Samples after an edge of u within which another one is part of a slope: no edge that could slip.
+#define SLOPE_N 5U
+
 /// Square of the smallest ratio of the range of the codes to the standard deviation of the noise.
 #define NOISE_SHARE 1024.0F
 
@@ -359,7 +362,7 @@ static void enter_edge(est_t* const self) {
         forget_samples(self);  // the instant of the edge is unknown
         return;                // MISRA D4
     }
-    const bool slope = self->edge_age_n <= 1U;  // u changes in every sample: no edges that could slip
+    const bool slope = self->edge_age_n <= SLOPE_N;
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
         return;  // MISRA D4
@@ -541,7 +544,6 @@ static void put_on_trial(est_t* const self, const bool overflown) {
     if (self->scale.trial_n > 0U) {
         est_scale_conclude(&self->scale, self->noise_variance);
     }
-    self->edges.misfit *= 0.5F;
     if (!overflown && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);

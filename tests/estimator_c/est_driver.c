@@ -23,8 +23,11 @@ static void set_theta(const double* theta) {
         self.theta[i] = (float)theta[i];
     }
     if (est_delta_applies(&config)) {
-        est_delta_from_plain(self.theta, 1.0F, 2U);
-        est_delta_from_plain(&self.theta[3], self.theta[2], (uint_fast8_t)(config.nb - 1U));
+        float a[] = { 1.0F, self.theta[0], self.theta[1] };
+        est_delta_from_plain(a, 2U);
+        self.theta[0] = a[1];
+        self.theta[1] = a[2];
+        est_delta_from_plain(&self.theta[2], (uint_fast8_t)(config.nb - 1U));
     }
 }
 
