@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -62,6 +62,10 @@ def deck_of(
     return Deck(computer.circuit, SAMPLES, RATE_HZ, {"F": edges}, turns, title="two masses")
 
 
+FIELDS = {field.name.partition("_")[0]: field.name for field in fields(TwoMassPlant)}
+"""Fields of the plant by the names of the parameters."""
+
+
 def by_equations(program: TwoMassProgram, tweaks: Sequence[PotTurn]) -> Volts:
     """Equ 2.1 and 2.2 stepped exactly: (samples, quantities in the order of QUANTITIES), in V at their nodes."""
     plant, scales = program.plant, program.scales
@@ -72,7 +76,7 @@ def by_equations(program: TwoMassProgram, tweaks: Sequence[PotTurn]) -> Volts:
     for k in range(SAMPLES):
         force_n = force_v[k] * scales.full("force") / 10.0
         rows.append(quantities(plant, state, force_n))
-        plant = replace(plant, **settings.get(k, {}))
+        plant = replace(plant, **{FIELDS[name]: value for name, value in settings.get(k, {}).items()})
         state = stepped(plant, state, force_n)
     return np.array(rows) * [scales.volts_at_node(quantity) for quantity in QUANTITIES]
 

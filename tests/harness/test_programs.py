@@ -82,7 +82,7 @@ def test_any_program_is_played_and_judged(program: str) -> None:
 def test_example_scenario_of_every_program_is_judged(name: str) -> None:
     scenario = Scenario.load({"front": "thesis"}.get(name, name))
     assert scenario.program == Program.load(name)
-    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+    with open_rig(scenario.rig or "emulator") as rig, open_dut("inproc") as dut:
         verdict = judge(Bench(rig, dut).play(scenario, scenario.seed or DEFAULT_SEED))
     assert verdict.outcome == "passed", verdict.reasons
     assert verdict.tweaks and all(tweak.result == "detected" for tweak in verdict.tweaks)
