@@ -33,6 +33,9 @@
 /// determined by the noise, which any A = C fits, and C must not follow.
 #define REFRESH_MEMORIES 2.0F
 
+/// Samples after an edge of u within which another one is part of a slope: no edge that could slip.
+#define SLOPE_N 5U
+
 /// Square of the smallest ratio of the range of the codes to the standard deviation of the noise.
 #define NOISE_SHARE 1024.0F
 
@@ -86,7 +89,7 @@ static bool codes_valid(const est_config_t* const config) {
 }
 
 static bool needs_adaptation(const est_config_t* const config) {
-    return (config->nc > 0U) || (config->random_walk > 0.0F);
+    return (est_shape_of(config).nc > 0U) || (config->random_walk > 0.0F);
 }
 
 /// True iff this build supports the configuration.
@@ -106,31 +109,22 @@ bool est_config_valid(const est_config_t* const config) {
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
-static void shift_u(est_t* const self, const float newest) {
+/// Shift n values, newest first, by one place.
+EST_ROBUST_SHARED void shift(float* const x, const uint_fast8_t n, const float newest) {
     EST_UNROLL
-    for (uint_fast8_t i = EST_INPUTS_KEPT - 1U; i > 0U; i--) {
-        self->u[i] = self->u[i - 1U];
+    for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
+        x[i] = x[i - 1U];
     }
-    self->u[0] = newest;
+    x[0] = newest;
 }
 
-static void shift_y(est_t* const self, const float newest) {
-    EST_UNROLL
-    for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
-        self->y[i] = self->y[i - 1U];
-    }
-    self->y[0] = newest;
-}
+static void shift_u(est_t* const self, const float newest) { shift(self->u, EST_INPUTS_KEPT, newest); }
+
+static void shift_y(est_t* const self, const float newest) { shift(self->y, EST_NA_MAX, newest); }
 
 /// Number of samples before its own that an equation needs.
 static inline uint8_t count_past(const est_config_t* const config) {
     return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
-}
-
-static void zero(float* const x, const uint_fast8_t n) {
-    for (uint_fast8_t i = 0U; i < n; i++) {
-        x[i] = 0.0F;
-    }
 }
 
 /// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
@@ -139,56 +133,54 @@ static void follow_slip(est_t* const self, const bool late) {
     const uint_fast8_t last = (uint_fast8_t)(self->config->nb - 1U);
     float* const       b    = &self->theta[self->config->na];
     (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
-    (void)est_delta_to_plain(&b[1], b[0], last, &b[1]);
+    est_delta_to_plain(b, last);
     if (late) {
-        for (uint_fast8_t j = last; j > 0U; j--) {
-            b[j] = b[j - 1U];
-        }
+        shift(b, self->config->nb, 0.0F);
     } else {
-        (void)append(b, &b[1], last);
+        *append(b, &b[1], last) = 0.0F;
     }
-    b[late ? 0U : last] = 0.0F;
-    est_delta_from_plain(&b[1], b[0], last);
+    est_delta_from_plain(b, last);
     est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
 }
 
-/// Copy theta in the plain form of est.h.
-EST_SHARED void copy_theta(const est_t* const self, const est_shape_t shape, float* const theta) {
 #if EST_WITH_ROBUSTNESS
-    float* const b = append(theta, self->theta, shape.na);
-    (void)append(b, &self->theta[shape.na], (uint_fast8_t)(EST_THETA_MAX - shape.na));
+/// Compute theta in the plain form of est.h, after the first coefficient of A.
+EST_SHARED void compute_plain(const est_t* const self, const est_shape_t shape, float* const plain) {
+    float* const b = &plain[shape.na + 1U];
+    plain[0]       = 1.0F;
+    (void)append(&plain[1], self->theta, EST_THETA_MAX);
     if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
-        b[shape.nb + shape.nc] += (theta[shape.na - 1U] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
+        b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
     }
     if (est_delta_applies(self->config)) {
-        (void)est_delta_to_plain(theta, 1.0F, shape.na, theta);
-        (void)est_delta_to_plain(&b[1], b[0], (uint_fast8_t)(shape.nb - 1U), &b[1]);
+        est_delta_to_plain(plain, shape.na);
+        est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
     }
-#else
-    (void)append(theta, self->theta, est_shape_count(shape));
+}
 #endif
-}
 
-/// Set c to the estimate of A, contracted. With noise on the output, the noise of the equations is coloured by A
-/// (thesis section 3.5).
-EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const c) {
-    float              factor = 1.0F;
-    float              plain[EST_NA_MAX];
-    const float* const a =
-        est_delta_applies(self->config) ? est_delta_to_plain(self->theta, 1.0F, na, plain) : self->theta;
+/// Compute the estimate of A, contracted: 1, c[0], ... With noise on the output, the noise of the equations is coloured
+/// by A (thesis section 3.5).
+EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const out) {
+    float factor = 1.0F;
+    *out         = 1.0F;
+    (void)append(&out[1], self->theta, na);
+    if (est_delta_applies(self->config)) {
+        est_delta_to_plain(out, na);
+    }
     EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t i = 1U; i <= na; i++) {
         factor *= CONTRACTION;
-        c[i] = (i < na) ? (a[i] * factor) : 0.0F;
+        out[i] *= factor;
     }
 }
 
-static void refresh_prefilter(est_t* const self) {
-    float c[EST_NA_MAX];
-    contract_a(self, est_shape_of(self->config).na, c);
+EST_SHARED void refresh_prefilter(est_t* const self, const uint_fast8_t na) {
+    float a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
+    contract_a(self, na, a);
     self->refresh_in = self->config->refresh_n;
-    if (est_whitener_accepts(c, EST_NA_MAX)) {
-        est_whitener_set(&self->whitener, c, EST_NA_MAX);
+    if (est_whitener_accepts(&a[1], EST_NA_MAX)) {
+        est_whitener_set(&self->whitener, &a[1], na);
         increment(&self->counters.refreshes);
     }
 }
@@ -203,7 +195,7 @@ static void renew(est_t* const self) {
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
-        refresh_prefilter(self);
+        refresh_prefilter(self, est_shape_of(self->config).na);
     } else {
         // the last step left no work
     }
@@ -213,7 +205,7 @@ static void renew(est_t* const self) {
 /// Clear the residuals: they belong to earlier equations, and may have overflowed.
 EST_INLINE void forget_residuals(est_t* const self) {
 #if EST_NC_MAX > 0
-    zero(self->residual, EST_NC_MAX);
+    clear(self->residual, EST_NC_MAX);
 #else
     (void)self;
 #endif
@@ -221,7 +213,7 @@ EST_INLINE void forget_residuals(est_t* const self) {
 
 /// Count one sample towards the next complete equation. The step has time for the work that an alarm or a slip left,
 /// because it has no equation of its own.
-EST_SHARED void gather(est_t* const self) {
+static void gather(est_t* const self) {
     self->pending_n--;
     self->known = true;
     renew(self);
@@ -246,37 +238,30 @@ EST_SHARED void forget_samples(est_t* const self) {
 
 /// Set theta to zero.
 static void clear_theta(est_t* const self) {
-    zero(self->theta, EST_THETA_MAX);
+    clear(self->theta, EST_THETA_MAX);
     if (est_delta_applies(self->config)) {
-        est_delta_from_plain(self->theta, 1.0F, self->config->na);
+        self->theta[0] = 1.0F;  // the first coefficient of A, which is no parameter
+        est_delta_from_plain(self->theta, self->config->na);
+        *append(self->theta, &self->theta[1], self->config->na) = 0.0F;
     }
 }
 
-/// The output less the reference.
-EST_INLINE float relative_y(const est_t* const self, const float y) {
+/// Subtract the reference from the codes. The first sample becomes the reference: the samples that follow are then
+/// small numbers, which float32 rounds less. Without an offset in the model, codes are what they are.
+EST_INLINE void subtract_reference(est_t* const self, float* const u, float* const y) {
 #if EST_WITH_ROBUSTNESS
-    return est_shape_of(self->config).offset ? (y - self->reference_y) : y;
+    if (est_shape_of(self->config).offset > 0U) {
+        if ((self->counters.updated == 0U) && est_delta_applies(self->config)) {
+            self->reference_u = *u;
+            self->reference_y = *y;
+        }
+        *u -= self->reference_u;
+        *y -= self->reference_y;
+    }
 #else
     (void)self;
-    return y;
-#endif
-}
-
-/// The input less the reference. The first sample becomes the reference: the samples that follow are then small
-/// numbers, which float32 rounds less. Without an offset in the model, codes are what they are.
-EST_INLINE float relative_u(est_t* const self, const est_sample_t sample) {
-#if EST_WITH_ROBUSTNESS
-    if (est_shape_of(self->config).offset == 0U) {
-        return sample.u;  // MISRA D4
-    }
-    if ((self->counters.updated == 0U) && est_delta_applies(self->config)) {
-        self->reference_u = sample.u;
-        self->reference_y = sample.y;
-    }
-    return sample.u - self->reference_u;
-#else
-    (void)self;
-    return sample.u;
+    (void)u;
+    (void)y;
 #endif
 }
 
@@ -318,9 +303,10 @@ EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
 /// Innovation of the last equation, with the present theta.
 static float last_innovation(const est_t* const self) {
     const uint_fast8_t count = est_theta_count(self);
-    float              out   = self->whitener.past[count].x[0];
+    float              out   = self->whitener.past[0].x[0];
+    EST_UNROLL
     for (uint_fast8_t i = 0U; i < count; i++) {
-        out -= self->whitener.past[i].x[0] * self->theta[i];
+        out -= self->whitener.past[i + 1U].x[0] * self->theta[i];
     }
     return out;
 }
@@ -376,7 +362,7 @@ static void enter_edge(est_t* const self) {
         forget_samples(self);  // the instant of the edge is unknown
         return;                // MISRA D4
     }
-    const bool slope = self->edge_age_n <= 1U;  // u changes in every sample: no edges that could slip
+    const bool slope = self->edge_age_n <= SLOPE_N;
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
         return;  // MISRA D4
@@ -396,7 +382,7 @@ static void enter_edge(est_t* const self) {
 /// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
 static bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return self->known && (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) && (self->same_n == 0U) &&
+    return (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) && (self->same_n == 0U) &&
            (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
            (est_shape_of(self->config).nc == 0U);
 #else
@@ -405,11 +391,13 @@ static bool can_bridge(const est_t* const self) {
 #endif
 }
 
-/// Enter u(k). Return EST_GATHERING while the equation of this sample needs unknown samples.
-static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
-    shift_u(self, relative_u(self, sample));
+/// Subtract the reference and enter u(k). Return EST_GATHERING while the equation of this sample needs unknown
+/// samples.
+static est_status_t enter_input(est_t* const self, float u, float* const y) {
+    subtract_reference(self, &u, y);
+    shift_u(self, u);
     const bool edge = EST_KNOWS_EDGES && est_edges_is_edge(self->config, self->u) && self->known;
-    if (EST_WITH_WATCH && is_stuck(self, relative_y(self, sample.y), edge)) {
+    if (EST_WITH_WATCH && is_stuck(self, *y, edge)) {
         increment(&self->counters.stuck);
         return EST_REFUSED;  // MISRA D4
     }
@@ -428,19 +416,20 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     increment_long(&self->counters.updated);
     if (self->pending_n > 0U) {
         gather(self);
-        shift_y(self, relative_y(self, sample.y));
+        shift_y(self, *y);
         return EST_GATHERING;  // MISRA D4
     }
     return EST_UPDATED;
 }
 
-/// Classify the sample, and enter its u if it is good.
-static est_status_t examine(est_t* const self, const est_sample_t sample) {
+/// Classify the sample, and enter its u if it is good. `y`: that of its equation.
+static est_status_t examine(est_t* const self, const est_sample_t sample, float* const y) {
     if (!sample.valid) {
         return EST_MISSING;  // MISRA D4
     }
     if (in_range(self->config, sample.u) && in_range(self->config, sample.y)) {
-        return enter_input(self, sample);  // MISRA D4
+        *y = sample.y;
+        return enter_input(self, sample.u, y);  // MISRA D4
     }
     if (EST_WITH_WATCH && is_plausible(sample.u) && is_plausible(sample.y)) {
         increment(&self->counters.saturated);
@@ -452,23 +441,21 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 /// Compare an innovation after an edge with the effect of a displaced edge. If every edge is displaced by another part
 /// of an interval, edges come anywhere from now on. The innovations so far are those of the wrong model.
-EST_INLINE void watch_edges(est_t* const self, const float e, const float early, const float late) {
+EST_INLINE void watch_edges(est_t* const self, const float e, const float effect) {
 #if EST_WITH_ROBUSTNESS
-    est_edges_compare(&self->edges, e, early, late);
+    est_edges_compare(&self->edges, e, effect);
     if ((self->doubt_n >= EST_DOUBT_N) && est_edges_displaced(&self->edges)) {
         self->edges_vary      = true;
         self->scale.inflation = 1.0F;
         if (self->scale.share > 0.0F) {
             self->scale.share = EST_SHARE_WARM;
         }
-        est_scale_restart(&self->scale);
-        est_scale_apply(&self->scale, self->noise_variance);
+        est_scale_restart(&self->scale, self->noise_variance);
     }
 #else
     (void)self;
     (void)e;
-    (void)early;
-    (void)late;
+    (void)effect;
 #endif
 }
 
@@ -478,44 +465,31 @@ EST_INLINE est_finding_t judge_readings(est_t* const                self,
                                         const est_shape_t           shape,
                                         const est_equation_t* const equation,
                                         const float                 weight) {
-    const float e = (self->doubt_n > 1U)
-                        ? est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape))
-                        : equation->innovation;  // theta has not changed yet
-    float       early;
-    float       late;
-    est_edges_shares(&self->edges, shape, &self->whitener, self->u, self->doubt_n, self->edge_age_n, &early, &late);
-    watch_edges(self, e, early, late);
-    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - early, e - late, weight,
-                                     self->doubt_n >= EST_DOUBT_N);
+    const float e = (self->doubt_n > 1U) ? est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape))
+                                         : equation->innovation;  // theta has not changed yet
+    const est_shares_t shares = est_edges_shares(self, shape);
+    watch_edges(self, e, shares.early - shares.late);
+    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - shares.early, e - shares.late,
+                                     weight, self->doubt_n >= EST_DOUBT_N);
 }
-
-#if EST_NC_MAX > 0
-static void shift(float* const x, const uint_fast8_t n, const float newest) {
-    for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
-        x[i] = x[i - 1U];
-    }
-    x[0] = newest;
-}
-#endif
 
 /// Store the residual of an equation after its update: it replaces e in the next equations (thesis section 3.5).
-static void store_residual(est_t* const self, const float* const phi) {
+static void store_residual(est_t* const self, const float* const x) {
 #if EST_NC_MAX > 0
     if (self->config->nc > 0U) {
-        shift(self->residual, self->config->nc, est_equation_residual(phi, self->theta, est_theta_count(self)));
+        shift(self->residual, self->config->nc, est_equation_residual(x, self->theta, est_theta_count(self)));
     }
 #else
     (void)self;
-    (void)phi;
+    (void)x;
 #endif
 }
 
 /// Squared distance between these coefficients and the present C.
-EST_INLINE float distance(const est_whitener_t* const whitener, const float* const c) {
-    const float first = c[0] - whitener->c[0];
-    float       sum   = first * first;
+EST_INLINE float distance(const est_whitener_t* const whitener, const float* const c, const uint_fast8_t na) {
+    float sum = 0.0F;
     EST_UNROLL
-    for (uint_fast8_t i = 1U; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t i = 0U; i < na; i++) {
         const float step = c[i] - whitener->c[i];
         sum += step * step;
     }
@@ -528,10 +502,10 @@ static bool remembers_edge(const est_t* const self) {
 
 /// Decide whether C follows A. If C moves far, or the gains have not settled, the whitening begins anew: C is then
 /// taken at the next sample, which has no equation.
-static void compare_prefilter(est_t* const self) {
-    float c[EST_NA_MAX];
-    contract_a(self, est_shape_of(self->config).na, c);
-    const float moved = distance(&self->whitener, c);
+EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
+    float a[EST_NA_MAX + 1U];
+    contract_a(self, shape.na, a);
+    const float moved = distance(&self->whitener, &a[1], shape.na);
     if (moved < REFRESH_STEP) {
         self->renewal    = EST_RENEWAL_NONE;
         self->refresh_in = self->config->refresh_n;
@@ -546,14 +520,14 @@ static void compare_prefilter(est_t* const self) {
 /// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while another
 /// reading of the edges leads, because theta may have followed an edge that was misread. A doubt alone does not suspend
 /// it: with edges in quick succession it never ends.
-static void consider_refresh(est_t* const self) {
+EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
     if (EST_WITH_EDGES && (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
-        compare_prefilter(self);
+        compare_prefilter(self, shape);
     } else if (self->renewal == EST_RENEWAL_PREFILTER) {
         self->renewal = EST_RENEWAL_NONE;
-        refresh_prefilter(self);
+        refresh_prefilter(self, shape.na);
     } else if (remembers_edge(self)) {
         self->renewal = EST_RENEWAL_COMPARE;
     } else {
@@ -563,19 +537,17 @@ static void consider_refresh(est_t* const self) {
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
 
-/// Put an alarm of the cumulative sum on trial: the present estimate is kept and compared with the next one. An earlier
-/// trial ends.
+/// Put an alarm of the cumulative sum on trial, unless theta has overflown: the present estimate is kept and compared
+/// with the next one. An earlier trial ends.
 static void put_on_trial(est_t* const self, const bool overflown) {
 #if EST_WITH_ROBUSTNESS
     if (self->scale.trial_n > 0U) {
-        est_scale_conclude(&self->scale);
-        est_scale_apply(&self->scale, self->noise_variance);
+        est_scale_conclude(&self->scale, self->noise_variance);
     }
     if (!overflown && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
-    self->edges.misfit *= 0.5F;
 #else
     (void)self;
     (void)overflown;
@@ -587,15 +559,15 @@ static void put_on_trial(est_t* const self, const bool overflown) {
 static void raise_alarm(est_t* const self, est_step_t* const step) {
     step->alarm          = true;
     const bool overflown = !(step->statistic < FLT_MAX);
-    if (overflown) {
-        step->statistic = FLT_MAX;
-    }
     put_on_trial(self, overflown);
     if (overflown || (self->config->trigger.reset == EST_RESET_ALL)) {
         clear_theta(self);
     }
-    if (EST_WITH_ADAPTATION && overflown) {  // P may have overflowed with the residuals in its regressors
-        est_factors_reset(&self->factors, self->config);
+    if (overflown) {
+        step->statistic = FLT_MAX;
+        if (EST_WITH_ADAPTATION) {  // P may have overflowed with the residuals in its regressors
+            est_factors_reset(&self->factors, self->config);
+        }
     }
     self->renewal = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
@@ -612,19 +584,19 @@ EST_SHARED void note_slip(est_t* const self) {
 }
 
 /// Enter a sample that is not good. Return true iff its y is to be predicted; its u is taken for the last one.
-static bool enter_gap(est_t* const self, const est_status_t status) {
+static bool enter_gap(est_t* const self, const est_status_t status, float* const y) {
     if (status == EST_REFUSED) {
         increment(&self->counters.refused);
     } else {
         increment_long(&self->counters.missing);
     }
     const bool bridged = can_bridge(self);
-    if (EST_WITH_EDGES && self->known && (self->doubt_n > 0U)) {
-        if (bridged && (self->doubt_n < (EST_DOUBT_N - 1U))) {  // its last sample decides and must be good
-            self->doubt_n++;
-        } else if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
-            note_slip(self);
-        } else {
+    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
+        self->doubt_n++;
+        if (!bridged || (self->doubt_n >= EST_DOUBT_N)) {  // the last sample of a doubt decides and must be good
+            if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
+                note_slip(self);
+            }
             self->doubt_n = 0U;
         }
     }
@@ -632,22 +604,25 @@ static bool enter_gap(est_t* const self, const est_status_t status) {
     if (bridged && self->known) {
         self->bridged_n++;
         shift_u(self, self->u[0]);
+        *y = self->y[0];
         increment(&self->edge_age_n);
         return true;  // MISRA D4
     }
+#else
+    (void)y;
 #endif
     forget_samples(self);
     return false;
 }
 
 /// Update everything an equation determines besides theta.
-static void adapt(est_t* const self, const float* const phi) {
+static void adapt(est_t* const self, const est_shape_t shape, const float* const x) {
     const est_config_t* const config = self->config;
     if (config->random_walk > 0.0F) {
-        est_factors_walk(&self->factors, config);
+        est_factors_walk(&self->factors, config->random_walk, est_shape_count(shape));
         est_factors_inflate(&self->factors, config, 1.0F);
     }
-    store_residual(self, phi);
+    store_residual(self, x);
 }
 
 /// Weight of a squared innovation of unit precision in the cumulative sum.
@@ -666,8 +641,8 @@ EST_INLINE float weight_of(const est_t* const self) {
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
     if (!scale->followed) {
-        const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
         if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
+            const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
             self->noise_variance =
                 est_scale_follow(scale, self->noise_variance, EST_NOISE_LEAST * self->config->noise_variance,
                                  warm ? EST_SHARE_MIN : EST_SHARE_WARM);
@@ -675,19 +650,17 @@ static void renew_scale(est_t* const self) {
         scale->followed = true;
     } else {
         est_scale_relax(scale);
-        est_scale_restart(scale);
-        est_scale_apply(scale, self->noise_variance);
+        est_scale_restart(scale, self->noise_variance);
     }
 }
 
 /// Continue the trial of the last alarm by one equation.
 EST_INLINE void
 try_alarm(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float precision) {
-    const float old = est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape));
+    const float old = est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     const float e   = equation->innovation;
     if (!est_scale_try(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
-        est_scale_conclude(&self->scale);
-        est_scale_apply(&self->scale, self->noise_variance);
+        est_scale_conclude(&self->scale, self->noise_variance);
     }
 }
 #endif
@@ -732,17 +705,14 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
 
 /// Predict a missing y: replace the one of an equation by that whose innovation is zero. With C close to A the next
 /// equations then lose nothing but the information of the missing sample.
-static void bridge(est_t* const self, const float innovation) {
-    const est_shape_t shape = est_shape_of(self->config);
-    est_past_t* const past  = &self->whitener.past[est_shape_count(shape)];
+EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
+    float* const past = self->whitener.past[0].x;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        float early;
-        float late;
-        est_edges_shares(&self->edges, shape, &self->whitener, self->u, self->doubt_n, self->edge_age_n, &early, &late);
+        (void)est_edges_shares(self, shape);
     }
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        past->x[i] -= innovation;  // the differences contain y(k) with the factor 1
+        past[i] -= innovation;  // the differences contain y(k) with the factor 1
     }
     self->y[0] -= innovation;
 }
@@ -761,16 +731,16 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     if (self->factors.weight < weight_min) {
         limit_factors(self, shape);
     }
-    est_equation_fill(self, shape, y, equation.phi);
+    est_equation_fill(self, shape, y, equation.x);
     shift_y(self, y);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
     if (EST_WITH_ROBUSTNESS && (step->status != EST_UPDATED)) {
-        bridge(self, equation.innovation);
+        bridge(self, shape, equation.innovation);
         return;  // MISRA D4
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION && self->adaptive) {
-        adapt(self, equation.phi);
+        adapt(self, shape, equation.x);
     }
     const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
     const float weight = precision * weight_of(self);
@@ -796,7 +766,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
         self->refresh_in--;
     } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
-        consider_refresh(self);
+        consider_refresh(self, shape);
     } else {
         // C is constant
     }
@@ -855,11 +825,12 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
-    est_step_t step    = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
+    float      y       = 0.0F;
+    est_step_t step    = { .status = examine(self, sample, &y), .alarm = false, .innovation = 0.0F };
     step.statistic     = self->trigger.statistic;
     const bool updated = step.status == EST_UPDATED;
-    if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status))) {
-        dispatch_equation(self, updated ? relative_y(self, sample.y) : self->y[0], &step);
+    if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status, &y))) {
+        dispatch_equation(self, y, &step);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);
     return step;
@@ -873,9 +844,9 @@ uint8_t est_theta_count(const est_t* const self) {
 float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
 #if EST_WITH_ROBUSTNESS
-    float theta[EST_THETA_MAX];
-    copy_theta(self, est_shape_of(self->config), theta);
-    return theta[index];
+    float plain[EST_THETA_MAX + 1U];
+    compute_plain(self, est_shape_of(self->config), plain);
+    return plain[index + 1U];
 #else
     return self->theta[index];
 #endif
@@ -883,20 +854,27 @@ float est_theta(const est_t* const self, const uint8_t index) {
 
 void est_copy_theta(const est_t* const self, float* const out) {
     EST_ASSERT((self != NULL) && (out != NULL));
-    copy_theta(self, est_shape_of(self->config), out);
+#if EST_WITH_ROBUSTNESS
+    float plain[EST_THETA_MAX + 1U];
+    compute_plain(self, est_shape_of(self->config), plain);
+    (void)append(out, &plain[1], EST_THETA_MAX);
+#else
+    (void)append(out, self->theta, EST_THETA_MAX);
+#endif
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
-    const est_shape_t shape                      = est_shape_of(self->config);
-    float             factor[EST_THETA_MAX + 1U] = { 0.0F };  // after that of y(k); MISRA D2
-    factor[index + 1U]                           = 1.0F;
+    const est_shape_t shape = est_shape_of(self->config);
+    float             factor[EST_THETA_MAX + 1U];  // 0 for the first coefficient of A, then those of theta
+    clear(factor, EST_THETA_MAX + 1U);
+    factor[index + 1U] = 1.0F;
     if (est_delta_applies(self->config)) {
         est_delta_difference(factor, shape.na);
         est_delta_difference(&factor[shape.na + 1U], (uint_fast8_t)(shape.nb - 1U));
     }
 #if EST_WITH_ROBUSTNESS
-    if (est_is_offset(shape, index)) {  // see copy_theta()
+    if (est_is_offset(shape, index)) {  // see compute_plain()
         factor[shape.na] += self->reference_y;
         factor[shape.na + shape.nb] -= self->reference_u;
     }

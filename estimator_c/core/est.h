@@ -393,22 +393,22 @@ typedef struct {
 
 /// State of a trigger. Private to est_trigger.h.
 typedef struct {
+    uint16_t quiet_n;  ///< remaining innovations during which the statistic is held at zero
+    uint16_t mean_n;   ///< innovations in the mean between faults; 0: the next one is the first
     float    statistic;
     float    rival[EST_OTHER_READINGS];  ///< cumulative sum under each other reading; rival[0] also holds the mean
-    uint16_t quiet_n;                    ///< remaining innovations during which the statistic is held at zero
-    uint16_t mean_n;                     ///< innovations in the mean between faults; 0: the next one is the first
 } est_trigger_t;
 
 /// Scale of the innovations and the trial of the last alarm. Private to est_scale.h.
 typedef struct {
-    float   weight;  ///< of a squared innovation in the cumulative sum
-    float   sum;     ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
-    float   share;   ///< share of this block in the noise variance
+    uint8_t left_n;    ///< equations left in this block; 0: it is complete, or an alarm is on trial
+    bool    followed;  ///< the noise variance contains this block
+    uint8_t trial_n;   ///< equations since the alarm on trial; 0: none is
+    float   weight;    ///< of a squared innovation in the cumulative sum
+    float   sum;    ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
+    float   share;  ///< share of this block in the noise variance
     float   inflation;  ///< factor for what the model does not explain
     float   credit;     ///< alarms that may be justified without being plain
-    uint8_t left_n;     ///< equations left in this block; 0: it is complete, or an alarm is on trial
-    bool    followed;   ///< the noise variance contains this block
-    uint8_t trial_n;    ///< equations since the alarm on trial; 0: none is
 } est_scale_t;
 
 /// Work that a step leaves to the next one. Private.
@@ -425,27 +425,29 @@ typedef enum {
 /// below 128 bytes fits a short Thumb instruction.
 typedef struct {
     const est_config_t* config;
-    uint8_t             same_n;          ///< samples of constant y since an edge of u
-    uint8_t             pending_n;       ///< samples needed before the next equation is complete
-    bool                adaptive;        ///< residuals, random walk or noise variance need an update
-    est_renewal_t       renewal;         ///< work left by the last step
-    bool                known;           ///< the previous sample is known; if not, pending_n > 0
-    bool                settled;         ///< the gains of the whitener are c, and its variance is 1
-    uint16_t            refresh_in;      ///< equations until C is compared with A; 0: never
-    uint16_t            edge_age_n;      ///< samples since the last edge of u
-    uint8_t             doubt_n;         ///< samples since the first edge in doubt, inclusive; 0: no doubt
-    float               noise_variance;  ///< [codes^2]
+    uint8_t             same_n;     ///< samples of constant y since an edge of u
+    uint8_t             pending_n;  ///< samples needed before the next equation is complete
+    bool                adaptive;   ///< residuals, random walk or noise variance need an update
+    est_renewal_t       renewal;    ///< work left by the last step
+    bool                known;      ///< the previous sample is known; if not, pending_n > 0
+    bool                settled;    ///< the gains of the whitener are c, and its variance is 1
+    uint8_t             doubt_n;    ///< samples since the first edge in doubt, inclusive; 0: no doubt
 #if EST_WITH_ROBUSTNESS
-    bool        edges_vary;   ///< edges come anywhere, against the configuration
-    uint8_t     bridged_n;    ///< samples before the next one that were predicted
+    bool    edges_vary;  ///< edges come anywhere, against the configuration
+    uint8_t bridged_n;   ///< samples before the next one that were predicted
+#endif
+    uint16_t refresh_in;  ///< equations until C is compared with A; 0: never
+    uint16_t edge_age_n;  ///< samples since the last edge of u
+#if EST_WITH_ROBUSTNESS
+    est_scale_t scale;
     float       reference_u;  ///< codes of the first sample, subtracted from all if the offset is estimated
     float       reference_y;
-    est_scale_t scale;
 #endif
-    float          y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
-    float          u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...
     est_trigger_t  trigger;
     est_counters_t counters;
+    float          noise_variance;              ///< [codes^2]
+    float          y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
+    float          u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...
     float          theta[EST_THETA_MAX];
     est_factors_t  factors;
     est_whitener_t whitener;

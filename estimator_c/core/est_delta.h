@@ -14,22 +14,6 @@
 
 #include "est_shape.h"
 
-/// Functions with several callers, or with one or none in a build without robustness.
-#if EST_WITH_ROBUSTNESS
-#define EST_ROBUST_SHARED EST_SHARED
-#else
-#define EST_ROBUST_SHARED EST_INLINE
-#endif
-
-/// Copy n values; return the end of the copy.
-EST_SHARED float* append(float* const out, const float* const from, const uint_fast8_t n) {
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < n; i++) {
-        out[i] = from[i];
-    }
-    return &out[n];
-}
-
 /// True iff this configuration uses the delta form: with the cumulative sum. The other triggers keep the parameters and
 /// the prior of the thesis.
 EST_INLINE bool est_delta_applies(const est_config_t* const config) {
@@ -47,36 +31,24 @@ EST_ROBUST_SHARED void est_delta_difference(float* const x, const uint_fast8_t o
     }
 }
 
-/// Coefficients of the values from those of these differences: the transpose of the above. `x` holds all but the first,
-/// which is the same in both forms: `lead`. The result is `out`, which may be `x`; without conversions it is `x`.
-EST_ROBUST_SHARED const float*
-est_delta_to_plain(const float* const x, const float lead, const uint_fast8_t order, float* const out) {
-#if EST_WITH_ROBUSTNESS
-    (void)append(out, x, order);
+/// Coefficients of the values from those of these differences: the transpose of the above. The first is the same in
+/// both forms.
+EST_ROBUST_SHARED void est_delta_to_plain(float* const x, const uint_fast8_t order) {
     EST_UNROLL
-    for (uint_fast8_t n = 1U; n <= order; n++) {
+    for (uint_fast8_t n = 1U; n <= (EST_WITH_ROBUSTNESS ? order : 0U); n++) {
         EST_UNROLL
-        for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
-            out[i] -= out[i - 1U];
+        for (uint_fast8_t i = n; i > 0U; i--) {
+            x[i] -= x[i - 1U];
         }
-        out[0] -= lead;
     }
-    return out;
-#else
-    (void)lead;
-    (void)order;
-    (void)out;
-    return x;
-#endif
 }
 
 /// The inverse of est_delta_to_plain().
-EST_ROBUST_SHARED void est_delta_from_plain(float* const x, const float lead, const uint_fast8_t order) {
+EST_ROBUST_SHARED void est_delta_from_plain(float* const x, const uint_fast8_t order) {
     EST_UNROLL
     for (uint_fast8_t n = EST_WITH_ROBUSTNESS ? order : 0U; n > 0U; n--) {
-        x[0] += lead;
         EST_UNROLL
-        for (uint_fast8_t i = 1U; i < n; i++) {
+        for (uint_fast8_t i = 1U; i <= n; i++) {
             x[i] += x[i - 1U];
         }
     }

@@ -35,9 +35,8 @@ static inline void est_edges_begin_comparison(est_edges_t* const self, const flo
     self->energy = EST_DOUBT_BEFORE_N * before * before;
 }
 
-/// Enter an innovation with the effects of early and late edges on it.
-EST_INLINE void est_edges_compare(est_edges_t* const self, const float e, const float early, const float late) {
-    const float effect = early - late;
+/// Enter an innovation with the effect of a displacement on it: the share of early edges less that of late ones.
+EST_INLINE void est_edges_compare(est_edges_t* const self, const float e, const float effect) {
     self->along += e * effect;
     self->span += effect * effect;
     self->energy += e * e;
@@ -45,10 +44,9 @@ EST_INLINE void est_edges_compare(est_edges_t* const self, const float e, const 
 
 /// Conclude the comparison. Return true iff the edges are displaced again and again.
 static inline bool est_edges_displaced(est_edges_t* const self) {
-    const float whole  = self->span * self->energy;
-    const float part   = (whole > 0.0F) ? ((self->along * self->along) / whole) : 0.0F;
-    const float misfit = self->misfit + (part - EST_DISPLACED);
-    self->misfit       = (misfit > 0.0F) ? misfit : 0.0F;
+    const float whole = self->span * self->energy;
+    const float part  = (whole > 0.0F) ? ((self->along * self->along) / whole) : 0.0F;
+    self->misfit      = est_max(self->misfit + (part - EST_DISPLACED), 0.0F);
     return self->misfit > EST_DISPLACED_SUM;
 }
 #endif
@@ -63,41 +61,39 @@ est_edges_begin(est_edges_t* const self, const est_config_t* const config, const
         self->early.x[i] = ((i == 0U) || EST_WITH_ROBUSTNESS) ? before : 0.0F;  // its differences are equal to it
         self->late.x[i]  = 0.0F;
     }
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
-        self->theta[i] = theta[i];
-    }
+    (void)append(self->theta, theta, EST_THETA_MAX);
 }
+
+/// Shares of early and of late edges in an equation, whitened.
+typedef struct {
+    float early;
+    float late;
+} est_shares_t;
 
 /// Compute what early edges, and late edges, would have added to the present equation, whitened. With an early edge u
 /// changes in the sample before it was recorded, with a late one in the sample after. u since the beginning of the
 /// doubt is therefore shifted by one sample against y, including its noise.
-EST_ROBUST_SHARED void est_edges_shares(est_edges_t* const          self,
-                                        const est_shape_t           shape,
-                                        const est_whitener_t* const whitener,
-                                        const float* const          u,
-                                        const uint_fast8_t          doubt_n,
-                                        const uint_fast16_t         edge_age_n,
-                                        float* const                early,
-                                        float* const                late) {
-    float early_raw = 0.0F;
-    float late_raw  = 0.0F;
-    if (edge_age_n < ((uint32_t)shape.nb + shape.nk)) {
-        const float* const delta = &self->theta[shape.na];
-        float              rest[EST_NB_MAX];
-        const float* const others = est_delta_to_plain(&delta[1], delta[0], (uint8_t)(shape.nb - 1U), rest);
+EST_ROBUST_SHARED est_shares_t est_edges_shares(est_t* const self, const est_shape_t shape) {
+    est_edges_t* const edges     = &self->edges;
+    float              early_raw = 0.0F;
+    float              late_raw  = 0.0F;
+    if (self->edge_age_n < ((uint32_t)shape.nb + shape.nk)) {
+        const float* const u = self->u;
+        float              b[EST_NB_MAX];
+        (void)append(b, &edges->theta[shape.na], shape.nb);
+        est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
         EST_UNROLL
         for (uint_fast8_t j = 0U; j < shape.nb; j++) {
             const uint_fast8_t lag = (uint_fast8_t)(shape.nk + j);
-            const float        b   = (j == 0U) ? delta[0] : others[j - 1U];
-            late_raw -= b * ((lag < doubt_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
+            late_raw -= b[j] * ((lag < self->doubt_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
             if (lag > 0U) {
-                early_raw += b * ((lag <= doubt_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
+                early_raw += b[j] * ((lag <= self->doubt_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
             }
         }
     }
-    *early = est_filter(est_filter_of(whitener), &self->early, early_raw);
-    *late  = est_filter(est_filter_of(whitener), &self->late, late_raw);
+    const float* const gain = est_filter_of(&self->whitener);
+    const float        late = est_filter(gain, &edges->late, late_raw);
+    return (est_shares_t){ .early = est_filter(gain, &edges->early, early_raw), .late = late };
 }
 
 #endif  // EST_EDGES_H_INCLUDED

@@ -11,44 +11,52 @@
 #include "est_whitener.h"
 
 typedef struct {
-    float phi[EST_THETA_MAX + 1U];  ///< regressor in the order of theta, followed by y(k)
-    float innovation;               ///< prediction error of y(k) [codes]
-    float variance;                 ///< variance of the equation's noise [noise variances]
+    float x[EST_THETA_MAX + 1U];  ///< y(k), followed by the regressor phi in the order of theta
+    float innovation;             ///< prediction error of y(k) [codes]
+    float variance;               ///< variance of the equation's noise [noise variances]
 } est_equation_t;
 
-/// Fill phi and y(k) from the stored samples.
-EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const phi) {
-    float past[EST_NA_MAX + 1U];  // y(k), y(k-1), ...; or their differences
-    past[0] = y;
-    (void)append(&past[1], self->y, shape.na);
-    const bool delta = est_delta_applies(self->config);
+/// Fill x from the stored samples.
+EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const x) {
+    const bool   delta  = est_delta_applies(self->config);
+    float* const inputs = append(&x[1], self->y, shape.na);
+    x[0]                = y;
     if (delta) {
-        est_delta_difference(past, shape.na);
+        est_delta_difference(x, shape.na);
     }
     EST_UNROLL
-    for (uint_fast8_t i = 0U; i < shape.na; i++) {
-        phi[i] = -past[i + 1U];
+    for (uint_fast8_t i = 1U; i <= shape.na; i++) {
+        x[i] = -x[i];
     }
-    float* out = append(&phi[shape.na], &self->u[shape.nk], shape.nb);
+    float* out = append(inputs, &self->u[shape.nk], shape.nb);
     if (delta) {
-        est_delta_difference(&phi[shape.na], (uint_fast8_t)(shape.nb - 1U));
+        est_delta_difference(inputs, (uint_fast8_t)(shape.nb - 1U));
     }
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
 #endif
-    out[0]            = 1.0F;  // regressor of the offset; without one, y(k) overwrites it
-    out[shape.offset] = past[0];
+    if (shape.offset > 0U) {
+        *out = 1.0F;
+    }
 }
 
-/// Prediction error of y(k), the element that follows the regressor.
-EST_SHARED float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
-    float out = phi[n];
+/// Prediction error of y(k) with this theta of n parameters.
+EST_SHARED float est_equation_residual(const float* const x, const float* const theta, const uint_fast8_t n) {
+    float out = x[0];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < n; i++) {
-        out -= phi[i] * theta[i];
+        out -= x[i + 1U] * theta[i];
     }
     return out;
 }
+
+/// Initialiser against false warnings: gcc does not see that each gain is written before it is read. Omitted in a
+/// build for size, where gcc would call memset().
+#if EST_FOR_SIZE
+#define EST_ZEROED
+#else
+#define EST_ZEROED = { 0.0F }
+#endif
 
 /// Whiten the equation in place and compute its innovation.
 EST_INLINE void est_equation_whiten(est_equation_t* const equation,
@@ -56,26 +64,18 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
     const uint_fast8_t count = est_shape_count(shape);
-    float* const       phi   = equation->phi;  // cppcheck F2
-    float              gain[EST_NA_MAX];
+    float* const       x     = equation->x;          // cppcheck F2
+    float              gain[EST_NA_MAX] EST_ZEROED;  // MISRA D2
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         gain[i] = est_filter_of(whitener)[i];
     }
     EST_UNROLL
     for (uint_fast8_t j = 0U; j <= count; j++) {
-        phi[j] = est_filter(gain, &whitener->past[j], phi[j]);
+        x[j] = est_filter(gain, &whitener->past[j], x[j]);
     }
-    equation->innovation = est_equation_residual(phi, theta, count);
+    equation->innovation = est_equation_residual(x, theta, count);
 }
-
-/// Initialiser against a false warning: gcc does not see that each gain is written before it is read. Omitted in a
-/// build for size, where gcc would call memset().
-#if EST_FOR_SIZE
-#define EST_ZEROED
-#else
-#define EST_ZEROED = { 0.0F }
-#endif
 
 /// Update theta and the covariance with one measurement: Bierman, "Factorization Methods for Discrete Sequential
 /// Estimation" (1977), section V.3. The forgetting factor of thesis Equ 3.21 divides the weight of P, and with it
@@ -86,7 +86,7 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
                                       const est_equation_t* const equation,
                                       float* const                theta) {
     const uint_fast8_t count  = est_shape_count(shape);
-    const float* const phi    = equation->phi;
+    const float* const phi    = &equation->x[1];
     const float        weight = forgetting * self->weight;
     float              gain[EST_THETA_MAX] EST_ZEROED;  // P phi, unscaled; MISRA D2
     float              alpha   = weight * equation->variance;

@@ -32,7 +32,7 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
     for (uint_fast8_t j = 0U; j < count; j++) {
         const float d     = self->d[j] * scale;
         const float prior = est_is_offset(shape, j) ? p0_offset : p0;
-        self->d[j]        = (d < prior) ? d : prior;
+        self->d[j]        = est_min(d, prior);
     }
 }
 
@@ -46,9 +46,7 @@ static inline void est_factors_reset(est_factors_t* const self, const est_config
     for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
         self->d[j] = EST_VARIANCE_MAX;
     }
-    for (uint_fast16_t i = 0U; i < EST_UPPER_N; i++) {
-        self->upper[i] = 0.0F;
-    }
+    clear(self->upper, EST_UPPER_N);
     est_factors_inflate(self, config, 1.0F);  // limits each d to its prior
 }
 
@@ -74,21 +72,22 @@ static inline void walk_row(est_factors_t* const self, const uint_fast8_t row, c
 
 /// P := P + random_walk I. The factors are those of Thornton's time update, "Triangular covariance factorizations for
 /// Kalman filtering" (1976). Rank-one updates compute them without work space.
-static inline void est_factors_walk(est_factors_t* const self, const est_config_t* const config) {
-    for (uint_fast8_t i = 0U; i < est_shape_count(est_shape_of(config)); i++) {
-        walk_row(self, i, config->random_walk * self->weight);
+static inline void est_factors_walk(est_factors_t* const self, const float random_walk, const uint_fast8_t count) {
+    const float variance = random_walk * self->weight;
+    for (uint_fast8_t i = 0U; i < count; i++) {
+        walk_row(self, i, variance);
     }
 }
 
 /// Variance of the sum of `factor` times the parameters.
 static inline float
 est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, const float* const factor) {
-    float out = 0.0F;
+    float        out    = 0.0F;
+    const float* column = self->upper;
     for (uint_fast8_t k = 0U; k < count; k++) {
-        const float* const column = &self->upper[(k * (k - 1U)) / 2U];
-        float              sum    = factor[k];
+        float sum = factor[k];
         for (uint_fast8_t i = 0U; i < k; i++) {
-            sum += column[i] * factor[i];
+            sum += *column++ * factor[i];
         }
         out += sum * sum * self->d[k];
     }

@@ -63,13 +63,9 @@
 
 #if EST_WITH_ROBUSTNESS
 
-/// Derive from the scale the weight of a squared innovation in the cumulative sum.
-static inline void est_scale_apply(est_scale_t* const self, const float noise_variance) {
-    self->weight = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
-}
-
-/// Begin a block.
-static inline void est_scale_restart(est_scale_t* const self) {
+/// Begin a block. The scale determines the weight of a squared innovation in the cumulative sum.
+EST_SHARED void est_scale_restart(est_scale_t* const self, const float noise_variance) {
+    self->weight   = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
     self->sum      = 0.0F;
     self->left_n   = EST_BLOCK_N;
     self->followed = false;
@@ -79,8 +75,7 @@ static inline void est_scale_init(est_scale_t* const self, const est_config_t* c
     self->inflation = 1.0F;
     self->share     = config->noise_estimated ? 1.0F : 0.0F;
     self->credit    = EST_CREDIT_MAX;
-    est_scale_restart(self);
-    est_scale_apply(self, config->noise_variance);
+    est_scale_restart(self, config->noise_variance);
 }
 
 /// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
@@ -97,20 +92,16 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
 static inline float
 est_scale_follow(est_scale_t* const self, const float noise_variance, const float least, const float share_least) {
     const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
-    const float most    = EST_GROWTH_MAX * noise_variance;
-    const float limited = (mean < most) ? mean : most;
+    const float limited = est_min(mean, EST_GROWTH_MAX * noise_variance);
     const float noise   = noise_variance + (self->share * (limited - noise_variance));
-    const float share   = self->share / (1.0F + self->share);
-    self->share         = (share > share_least) ? share : share_least;
-    return (noise > least) ? noise : least;
+    self->share         = est_max(self->share / (1.0F + self->share), share_least);
+    return est_max(noise, least);
 }
 
 /// Let the inflation decrease, and the number of alarms that may be justified increase, by one block.
 static inline void est_scale_relax(est_scale_t* const self) {
-    const float inflation = self->inflation * EST_INFLATION_DECAY;
-    const float credit    = self->credit + EST_CREDIT_PER_BLOCK;
-    self->inflation       = (inflation > 1.0F) ? inflation : 1.0F;
-    self->credit          = (credit < EST_CREDIT_MAX) ? credit : EST_CREDIT_MAX;
+    self->inflation = est_max(self->inflation * EST_INFLATION_DECAY, 1.0F);
+    self->credit    = est_min(self->credit + EST_CREDIT_PER_BLOCK, EST_CREDIT_MAX);
 }
 
 /// Begin the trial of an alarm. The block restarts after it.
@@ -121,7 +112,7 @@ static inline void est_scale_begin_trial(est_scale_t* const self) {
 }
 
 /// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
-static inline void est_scale_conclude(est_scale_t* const self) {
+EST_SHARED void est_scale_conclude(est_scale_t* const self, const float noise_variance) {
     const bool  justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
     const float cost      = ((self->sum * self->weight) > EST_PLAIN) ? 0.0F : 1.0F;
     if (justified && (self->credit >= cost)) {
@@ -132,7 +123,7 @@ static inline void est_scale_conclude(est_scale_t* const self) {
         // the scale is large enough
     }
     self->trial_n = 0U;
-    est_scale_restart(self);
+    est_scale_restart(self, noise_variance);
 }
 
 /// Enter one equation into the trial of an alarm: the squared errors of the old and the new estimate, the latter

@@ -71,6 +71,35 @@ EST_INLINE float est_magnitude(const float x) {
 #endif
 }
 
+/// Functions with several callers, or with one or none in a build without robustness.
+#if EST_WITH_ROBUSTNESS
+#define EST_ROBUST_SHARED EST_SHARED
+#else
+#define EST_ROBUST_SHARED EST_INLINE
+#endif
+
+/// Copy n values; return the end of the copy.
+EST_SHARED float* append(float* const out, const float* const from, const uint_fast8_t n) {
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < n; i++) {
+        out[i] = from[i];
+    }
+    return &out[n];
+}
+
+/// Set n values to zero.
+EST_ROBUST_SHARED void clear(float* const out, const uint_fast8_t n) {
+    for (uint_fast8_t i = 0U; i < n; i++) {
+        out[i] = 0.0F;
+    }
+}
+
+/// The smaller number; the second one if either is NaN.
+EST_SHARED float est_min(const float a, const float b) { return (a < b) ? a : b; }
+
+/// The larger number; the second one if either is NaN.
+EST_SHARED float est_max(const float a, const float b) { return (a > b) ? a : b; }
+
 /// Orders of the model.
 typedef struct {
     uint8_t na;
@@ -89,7 +118,7 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
     return (est_shape_t){ .na     = config->na,
                           .nb     = config->nb,
                           .nk     = config->nk,
-                          .nc     = EST_WITH_ADAPTATION ? config->nc : 0U,
+                          .nc     = (EST_WITH_ADAPTATION && (EST_NC_MAX > 0U)) ? config->nc : 0U,
                           .offset = config->offset ? 1U : 0U };
 #endif
 }

@@ -47,7 +47,7 @@ static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
 
 /// Smaller statistic of the two other readings: that of the better explanation.
 EST_SHARED float est_trigger_best_rival(const est_trigger_t* const self) {
-    return (self->rival[0] < self->rival[1]) ? self->rival[0] : self->rival[1];
+    return est_min(self->rival[0], self->rival[1]);
 }
 
 /// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
@@ -59,7 +59,7 @@ static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
 /// was a slip: the recorded reading has passed the ceiling, and another reading explained the innovations. Otherwise
 /// the statistic continues from the best reading. At its term, by contrast, a doubt has seen the whole effect of an
 /// edge, and the recorded reading continues.
-static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
+EST_ROBUST_SHARED bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
         return true;  // MISRA D4
     }

@@ -76,14 +76,9 @@ EST_SHARED void est_whitener_set(est_whitener_t* const self, const float* const 
 
 /// Restart: the next equation is the first.
 static inline void est_whitener_restart(est_whitener_t* const self) {
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        self->precision[i] = 0.0F;
-    }
+    clear(self->precision, EST_NA_MAX);
     for (uint_fast8_t j = 0U; j <= EST_THETA_MAX; j++) {
-        for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-            self->past[j].x[i] = 0.0F;
-        }
+        clear(self->past[j].x, EST_NA_MAX);
     }
 }
 

@@ -105,7 +105,7 @@ static void find_region(est_fit_watch_t* const self, const est_t* const estimato
 
 /// Second difference of y, whitened, as the last equation predicted it [codes].
 static float predicted_difference(const est_t* const estimator, const float innovation) {
-    return estimator->whitener.past[est_theta_count(estimator)].x[0] - innovation;
+    return estimator->whitener.past[0].x[0] - innovation;
 }
 
 /// Enter an innovation into the sums that are costly. After an edge in doubt it says nothing on the state of the plant.

@@ -37,8 +37,10 @@ GCC = "arm-none-eabi-gcc"
 
 TIMEOUT_S = 2.0
 """Time-out of an answer: longer than a busy machine lets QEMU wait, and as short as a test can bear."""
-LONGEST = 450
-"""Samples of a scenario that a test plays under QEMU, at a thousand a second."""
+LONGEST = 750
+"""Samples of a scenario that a test plays under QEMU, at a thousand a second: more than the trigger's warm-up."""
+CHANGE_AT = 600
+"""Sample of the first change: the trigger is armed by then."""
 
 
 def play(description: DeviceDescription, scenario: Scenario) -> Run:
@@ -51,7 +53,7 @@ def shortened(name: str) -> Scenario:
     scenario = Scenario.load(name)
     if scenario.samples <= LONGEST:
         return scenario
-    at = scenario.tweaks[0].sample - LONGEST // 2 if scenario.tweaks else 0
+    at = scenario.tweaks[0].sample - CHANGE_AT if scenario.tweaks else 0
     tweaks = [dataclasses.replace(tweak, sample=tweak.sample - at) for tweak in scenario.tweaks]
     return dataclasses.replace(
         scenario, samples=LONGEST, tweaks=tuple(tweak for tweak in tweaks if tweak.sample + tweak.ramp_n < LONGEST)

@@ -47,6 +47,9 @@ WEIGHT_DUE, WEIGHT_OVERDUE = 0.5, 0.25
 DISPLACED, DISPLACED_SUM = 0.5, 1.5
 """Part of the energy that a displaced edge must explain, and the sum of the excess that suffices."""
 
+SLOPE_N = 5
+"""Samples after an edge of u within which another one is part of a slope."""
+
 BRIDGED_MAX, BRIDGE_PRECISION = 8, 0.6
 """Longest gap that is bridged, and smallest precision of the whitening at which it is."""
 
@@ -278,7 +281,7 @@ class ReferenceEstimator:
             self._forget()
             self.u = [u]
             return
-        is_slope = self.since_n == 0
+        is_slope = self.since_n < SLOPE_N
         self.since_n = 0 if edge else self.since_n + 1
         instants = "anywhere" if self.edges_vary else self.config.edge_instants
         if edge and instants == "anywhere":
@@ -501,7 +504,6 @@ class ReferenceEstimator:
     def _alarm(self) -> None:
         if self.config.trigger == "cusum":
             self.trigger.scale.begin_trial(self.delta)
-        self.misfit *= 0.5
         if self.config.reset == "all":
             self.delta = self._zero
         self.covariance.reset()
