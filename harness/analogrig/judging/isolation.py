@@ -72,7 +72,7 @@ class _Rivals:
         grid = _GRID[(factors[0] <= _GRID) & (factors[-1] >= _GRID)]
         information = self._information(_lagrange(factors, grid) @ courses)
         least = np.full(len(self._truth), np.inf)
-        is_fine = np.zeros(len(grid), np.bool_)
+        is_fine = np.isin(grid, factors[[0, -1]])  # no better rival is expected inside if an end is the best
         rejected_n = None
         for _ in range(_MOST_REFINEMENTS):
             rejected_n = first_at_level(np.minimum(least, information.min(axis=0)), ISOLATION_INFORMATION)
