@@ -65,7 +65,9 @@ def test_firmware_has_those_of_short_plays(core: str, tmp_path: Path) -> None:
     assert "4 passed" in run(tmp_path, f"qemu-{core}?exchange=stream&timeout_s=60", "-k", FIRMWARE)
 
 
-@pytest.mark.parametrize("dut", ["host?exchange=block", pytest.param("qemu-m4?exchange=stream&timeout_s=60", marks=needs_firmware)])
+@pytest.mark.parametrize(
+    "dut", ["host?exchange=block", pytest.param("qemu-m4?exchange=stream&timeout_s=60", marks=needs_firmware)]
+)
 def test_device_elsewhere_is_the_one_in_this_process_to_the_bit(dut: str) -> None:
     """Estimates, alarms and diagnoses, of plays with changes, with missing samples, and with none of either."""
     test = SequentialTest(good=1e-6, bad=DIFFERING, miss=MISS, false_alarm=MISS)
