@@ -48,7 +48,7 @@ def direct(description: InprocDevice) -> DirectDevice:
 
 def _prepare(device: Device) -> None:
     low_v, lsb_v = CARD.ranges_v[FORCE][0], float(CARD.lsb_v[FORCE])
-    device.prepare({"force": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
+    device.prepare({"u": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
 
 
 def settling_n(device: DirectDevice) -> int:

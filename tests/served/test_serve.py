@@ -138,7 +138,7 @@ def test_signal_ends_the_server_and_closes_connections(sign: signal.Signals) -> 
 def test_json_has_the_same_content(served: ServedByProcess) -> None:
     address = f"127.0.0.1:{served.port}"
     place = {"host": "127.0.0.1", "port": served.port, "address": address}
-    assert served.said == {"rig": "emulator-ideal", "plant": "front", "seed": 1995, **place}
+    assert served.said == {"rig": "emulator-ideal", "program": "front", "seed": 1995, **place}
 
 
 def test_server_listens_on_the_loopback_interface_only(served: ServedByProcess) -> None:
@@ -182,7 +182,7 @@ def status_of(*options: str) -> int:
         (["--host", "192.0.2.1"], "cannot listen at 192.0.2.1:0"),
         (["--host", ""], "cannot listen: the host is empty"),
         (["--port", "65536"], "argument --port: must be a whole number from 0 to 65535"),
-        (["--plant", "rear"], "argument --plant: invalid choice: 'rear'"),
+        (["--program", "rear"], "no program is called 'rear'"),
     ],
 )
 def test_unusable_description_is_one_line_and_status_2(
