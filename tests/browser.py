@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Locator, Page
+
+GRAVE = ("serious", "critical")
+"""Impacts of axe-core that no page may have."""
+
+VIEWS: tuple[tuple[Literal["light", "dark"], int], ...] = (("light", 1280), ("dark", 390))
+"""Schemes and widths: what may be wrong depends on the scheme or on the width, not on both."""
 
 COUNT_PIXELS = """(canvas, [r, g, b]) => {
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -12,6 +20,8 @@ COUNT_PIXELS = """(canvas, [r, g, b]) => {
     for (let i = 0; i < data.length; i += 4) count += data[i] === r && data[i + 1] === g && data[i + 2] === b;
     return count;
 }"""
+
+PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
 class Watched:
@@ -28,6 +38,21 @@ class Watched:
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(path.as_uri())
 
+    def faults(self) -> list[str]:
+        """Complaints, what is wider than the window, and what axe-core finds: light and dark, wide and narrow."""
+        if self.page.locator("script[type='application/json']").count():
+            self.page.wait_for_selector("html[data-drawn], [role=alert]:not([hidden])", state="attached")
+        found = []
+        for scheme, width in VIEWS:
+            self.page.emulate_media(color_scheme=scheme)
+            self.page.set_viewport_size({"width": width, "height": 900})
+            self.page.evaluate(PAINTED)
+            reach = self.page.evaluate("document.documentElement.scrollWidth")
+            found += [f"{scheme}: {reach} pixels on {width}"] if reach > width else []
+            grave = [each for each in Axe().run(self.page).response["violations"] if each["impact"] in GRAVE]
+            found += [f"{scheme}, {width} pixels: {each['id']}: {each['nodes'][0]['html'][:200]}" for each in grave]
+        return [*self.complaints, *found]
+
     def plots(self, within: str = "") -> list[Locator]:
         """Texts of the page, or of an element."""
         self.page.wait_for_selector("html[data-drawn]")
@@ -35,7 +60,7 @@ class Watched:
 
     def images(self, within: str = "") -> list[str]:
         """Pixels of each plot, after the browser has painted."""
-        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.page.evaluate(PAINTED)
         return [plot.evaluate("(canvas) => canvas.toDataURL()") for plot in self.plots(within)]
 
     def pixels(self, colour: tuple[int, int, int]) -> list[int]:

@@ -52,6 +52,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "program",
         "plant",
         "lazy",
+        "pages",
     ),
     ("run", "scenario", "header", "trust", "identity", "signals", "output"),
     ("links",),

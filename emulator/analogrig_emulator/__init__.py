@@ -5,6 +5,7 @@ Start with SuspensionComputer, Excitation and Sampler.
 
 from analogrig_emulator.card.acquisition import acquired, ahead_ticks, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.circuit import (
     Capacitor,
@@ -134,6 +135,7 @@ __all__ = [
     "ProgramCircuit",
     "ProgramError",
     "ProgramParameter",
+    "RecordedExcitation",
     "Repeat",
     "RepeatedPlay",
     "Resistor",

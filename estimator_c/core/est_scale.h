@@ -47,7 +47,7 @@
 #define EST_JUSTIFIED 4.0F
 
 /// A justified alarm is plain if the squared errors of the old estimate exceed 64 expected variances on average.
-#define EST_PLAIN (64.0F * (float)(EST_TRIAL_N - EST_TRIAL_BEGIN_N) * EST_CUSUM_GAIN)
+#define EST_PLAIN (64.0F * ((float)EST_TRIAL_N - (float)EST_TRIAL_BEGIN_N) * EST_CUSUM_GAIN)
 
 /// Number of alarms that may be justified in close succession without being plain, and its increase per block: one per
 /// 5,000 equations. A plant whose equations fit it only for a while justifies every alarm, but its squared errors stay

@@ -27,6 +27,9 @@
 /// Limit of an innovation in standard deviations, squared.
 #define CLIP 9.0F
 
+/// Innovations of a block, of which some may be lost.
+static const uint16_t BLOCK_N = EST_FIT_BLOCK_N;
+
 /// Memory of the level of y [draws].
 #define LEVEL_N 128U
 
@@ -91,8 +94,10 @@ static void find_region(est_fit_watch_t* const self, const est_t* const estimato
     const float moved = estimator->y[0] - estimator->y[1];
     const float bound = LEVEL_BOUND * self->spread;
     const float moves = MOVES * self->spread;
-    uint32_t    stage = (above < 0.0F) ? 0U : 1U;
-    uint32_t    trend = (moved < -moves) ? 0U : 1U;
+    uint32_t    stage = 0U;
+    uint32_t    trend = 0U;
+    stage += (above < 0.0F) ? 0U : 1U;
+    trend += (moved < -moves) ? 0U : 1U;
     stage += (above < -bound) ? 0U : 1U;
     stage += (above < bound) ? 0U : 1U;
     trend += (moved < moves) ? 0U : 1U;
@@ -157,7 +162,7 @@ static void evaluate_line(est_fit_watch_t* const self, const uint32_t line) {
     const float now    = self->now[line];
     const float before = self->before[line];
     self->now[line]    = (now * now) + (before * before) - ((RESONANCE[line] * now) * before);
-    if ((line <= 1U) || (self->now[line] > self->now[self->peak])) {
+    if ((line <= 1U) || (self->now[line] > self->now[self->peak])) {  // cppcheck F4
         self->peak = (uint8_t)line;
     }
 }
@@ -182,7 +187,7 @@ static float find_frequency(const est_fit_watch_t* const self) {
     }
     const float beside = share / (1.0F + share);
     const float line   = (float)self->peak + (upwards ? beside : -beside);
-    return line / (float)EST_FIT_BLOCK_N;
+    return line / (float)BLOCK_N;
 }
 
 // ---------------------------------------------         CAUSES         ---------------------------------------------
@@ -192,9 +197,7 @@ static float declared_variance(const est_fit_watch_t* const self) {
 }
 
 /// Number of innovations in the block.
-static float count_of(const est_fit_watch_t* const self) {
-    return (float)EST_FIT_BLOCK_N - (float)self->sums.all.lost_n;
-}
+static float count_of(const est_fit_watch_t* const self) { return (float)BLOCK_N - (float)self->sums.all.lost_n; }
 
 static float variance_of(const est_fit_watch_t* const self) { return self->sums.all.squares / count_of(self); }
 
@@ -232,7 +235,8 @@ static float weigh_hum(const est_fit_watch_t* const self) {
     const float share  = quotient(line, 0.5F * clear_count_of(self));
     const float part   = quotient(power, (float)EST_FIT_LINES_N * (self->sums.power - energy));
     const bool  is_hum = (part > LINE_SHARE) && (share > (REGIONS_HUM * share_of(self, self->sums.explained)));
-    return is_hum ? (line / LINE) : 0.0F;
+    const float weight = line / LINE;
+    return is_hum ? weight : 0.0F;
 }
 
 /// Weigh innovations that have grown with y since the first block, or that the state of the plant explains.
@@ -386,20 +390,19 @@ static void evaluate(est_fit_watch_t* const self, const est_t* const estimator, 
 
 /// Close a sum of the innovations: enter it into the block, and follow the noise.
 static void close_sum(est_fit_watch_t* const self, const est_t* const estimator) {
-    est_fit_moments_t* const all   = &self->sums.all;
-    const float              clear = self->pending.clear;
-    self->entered                  = clear;
-    self->limit                    = improve_root(self->limit, CLIP * est_noise_variance(estimator));
+    est_fit_moments_t* const all = &self->sums.all;
+    self->entered                = self->pending.clear;
+    self->limit                  = improve_root(self->limit, CLIP * est_noise_variance(estimator));
     if (self->settling_n > 0U) {
         self->settling_n--;
     } else {
-        all->clear += clear;
+        all->clear += self->pending.clear;
         all->doubted += self->pending.doubted;
         all->squares += self->pending.squares;
         all->fourths += self->pending.fourths;
         all->lost_n    = (uint16_t)(all->lost_n + self->pending.lost_n);
         all->doubted_n = (uint16_t)(all->doubted_n + self->pending.doubted_n);
-        self->sums.power += clear * clear;
+        self->sums.power += self->entered * self->entered;
         self->sum_n++;
     }
     if (edges_vary(estimator)) {

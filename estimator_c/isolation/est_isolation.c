@@ -272,7 +272,7 @@ static void drive_force(const est_isolation_t* const self, const uint16_t age_n,
     out[OFFSET]          = -b[0];
     out[GAIN]            = -b[0] * f[0];
     out[DELAY]           = 0.0F;
-    for (uint16_t i = 1U; i < n; i++) {
+    for (uint16_t i = 1U; i < n; i++) {  // cppcheck F5
         out[OFFSET] -= b[i];
         out[GAIN] -= b[i] * f[i];
         out[DELAY] -= b[i] * (f[i] - f[i - 1U]);

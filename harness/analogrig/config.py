@@ -200,12 +200,18 @@ def _toml_key(key: str) -> str:
     return key if key and all(c.isascii() and (c.isalnum() or c in "_-") for c in key) else json.dumps(key)
 
 
+_NOT_IN_LINES = {*map(chr, range(32)), "\x7f", '"', "\\"} - {"\n", "\t"}
+"""Characters that keep a text from being written as lines between triple quotes."""
+
+
 def _toml_value(value: Any) -> str:
     """TOML of strings, numbers, booleans and arrays of them, for which JSON text is valid TOML."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_toml_value, value))}]"
     if isinstance(value, float) and not math.isfinite(value):
         return "nan" if math.isnan(value) else "inf" if value > 0.0 else "-inf"
+    if isinstance(value, str) and "\n" in value and value.isascii() and not _NOT_IN_LINES & {*value}:
+        return f'"""\n{value}"""'
     return json.dumps(value)
 
 

@@ -14,12 +14,12 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from string import Template
 from types import TracebackType
 from typing import Any, Self
 
 from analogrig.errors import AnalogrigError, ConfigurationError, RecordingError
 from analogrig.identity import Identity
+from analogrig.pages import FOLDER, assemble_page
 from analogrig.signals import hold_signals, interruption
 
 VERDICT_FILE, RUN_FILE, REPORT_FILE, CAN_LOG = "verdict.json", "run.npz", "report.html", "can"
@@ -36,7 +36,7 @@ _PREVIOUS = ".previous"
 _PARTS = ".analogrig-parts"
 """Folder of unfinished files."""
 
-_PAGE = Path(__file__).parent / "reporting" / "status.html"
+_PAGE = FOLDER / "status.html"
 
 
 class OutputFolder:
@@ -206,9 +206,12 @@ class OutputFolder:
     def _stage_status(self, reason: str, identity: Mapping[str, Any]) -> None:
         shutil.rmtree(self.parts, ignore_errors=True)
         self.parts.mkdir()
-        texts = {"reason": reason, "command": self._command, "started": self._started}
-        page = Template(_PAGE.read_text(encoding="utf-8")).substitute(
-            {name: html.escape(text) for name, text in texts.items()}
+        page = assemble_page(
+            _PAGE,
+            title=html.escape(f"INCONCLUSIVE: {self._command}"),
+            reason=html.escape(reason),
+            command=html.escape(self._command),
+            started=html.escape(self._started),
         )
         (self.parts / self.page.name).write_text(page, encoding="utf-8", errors="replace")
         self._write_verdict({"outcome": "inconclusive", "valid": False, "reasons": [reason], "identity": identity})

@@ -17,10 +17,12 @@
     };
   }
 
+  const TRUTH_DASHES = { "first-truth": undefined, "second-truth": [14, 4], "third-truth": [4, 4] };
+
   function series({ label, ink: colour = "first", style }, ink) {
     return curve(label, ink(colour), {
-      width: colour === "truth" && style !== "dash" ? 3.5 : 1.5,
-      dash: style === "dash" ? [8, 5] : undefined,
+      width: colour.endsWith("truth") && style !== "dash" ? 3.5 : 1.5,
+      dash: style === "dash" ? [8, 5] : TRUTH_DASHES[colour],
       paths: style === "step" ? uPlot.paths.stepped({ align: 1 }) : undefined,
     });
   }
@@ -32,7 +34,7 @@
       const values = curves.map((each) => columns[each.column].values);
       return {
         place: document.querySelector(`[data-figure="${number}"]`),
-        frame: ["div", "h4"],
+        frame: ["div", "p"],
         caption: title,
         name: `Fig. ${number}, ${title}`,
         key: number,
@@ -49,6 +51,37 @@
     });
   }
 
+  // Filter by chapter and verdict. With a verdict, only the claims that have it are shown.
+  function filtered() {
+    const [chapter, verdict] = ["chapter", "verdict"].map((id) => document.getElementById(id));
+    const claims = [...document.querySelectorAll(".claim")];
+    const chapters = [...document.querySelectorAll("main > section")];
+    const isClaims = (part) => part.classList.contains("claim") || part.id.startsWith("claims-") || part.tagName === "H2";
+    function apply() {
+      for (const each of claims) each.hidden = Boolean(verdict.value) && each.dataset.verdict !== verdict.value;
+      for (const each of chapters) {
+        const claimed = each.querySelector(".claim:not([hidden])");
+        const isWanted = !chapter.value || each.dataset.chapter === chapter.value;
+        each.hidden = !isWanted || (Boolean(verdict.value) && !claimed);
+        for (const part of each.children) if (!part.classList.contains("claim")) part.hidden = Boolean(verdict.value) && !isClaims(part);
+      }
+      const shown = claims.filter((each) => !each.hidden && !each.closest("section").hidden);
+      document.getElementById("count").textContent = `${shown.length} of ${claims.length} claims`;
+    }
+    // A link to a part that is hidden shows all parts.
+    function follow() {
+      const goal = document.getElementById(decodeURIComponent(location.hash.slice(1)));
+      if (!goal?.closest("[hidden]")) return;
+      [chapter.value, verdict.value] = ["", ""];
+      apply();
+      goal.scrollIntoView();
+    }
+    for (const each of [chapter, verdict]) each.addEventListener("change", apply);
+    addEventListener("hashchange", follow);
+    apply();
+  }
+
+  filtered();
   begin(data.columns, data.deflated, (columns) => {
     const plots = drawn((ink) => data.figures.flatMap((figure) => described(figure, columns, ink)), HEIGHTS_PX);
     showEvery.addEventListener("change", () => plots().forEach((plot) => plot.setScale("x", plot.scales.x)));

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.pages import PLOTS, assemble_page
 from analogrig.reporting.markup import cell, heading, row, table, text
-from analogrig.reporting.page import SCRIPTS, STYLES, assemble_page
 from analogrig.reporting.payload import as_script, deflate
 from analogrig_thesis.models import NAMES, TrackQuality
 from analogrig_thesis.texts import Chapter, Drawing, Table
@@ -26,7 +26,7 @@ _VERDICTS = {
 }
 """CSS class and plural of each verdict."""
 
-_NUMBERS = ("Where", "What", "Printed", "Ours", "Deviation", "")
+_NUMBERS = (("Where", "What"), ("Printed", "Ours", "Deviation"), ("Note",))
 _ERRATA = ("Where", "Printed", "Right", "Because")
 _QUALITY = ("Scheme", "Latency", "Missed", "Extra alarms", "Converged after", "Scatter", "Spikes", "Instructions")
 _SEEDS = ("Scheme", "Missed", "Extra alarms", "Mean latency", "Median convergence")
@@ -40,8 +40,7 @@ def render(chapters: Sequence[Chapter], comparison: Table) -> str:
     counts = Counter(claim["verdict"] for chapter in chapters for claim in chapter.claims)
     return assemble_page(
         _FOLDER / "page.html",
-        STYLES,
-        (*SCRIPTS, _FOLDER / "page.js"),
+        (*PLOTS, _FOLDER / "page.js"),
         title="The thesis, reproduced",
         summary="".join(
             f'<li class="{css}"><strong>{counts[verdict]}</strong>'
@@ -49,6 +48,8 @@ def render(chapters: Sequence[Chapter], comparison: Table) -> str:
             for verdict, (css, plural) in _VERDICTS.items()
         ),
         contents="".join(map(_links, chapters)),
+        chapter_options="".join(_option(str(each.number), f"Chapter {each.number}") for each in chapters),
+        verdict_options="".join(_option(each, each) for each in _VERDICTS),
         chapters="\n".join(map(_chapter, chapters)),
         comparison="".join(_data(each, comparison["instructions"]) for each in comparison["data"])
         + _seeds(comparison["seeds"]),
@@ -88,7 +89,11 @@ def _links(chapter: Chapter) -> str:
     tables = {"numbers": chapter.numbers, "errata": chapter.errata, "claims": chapter.claims}
     parts = ", ".join(f'<a href="#{name}-{chapter.number}">{name}</a>' for name, rows in tables.items() if rows)
     title = f"Chapter {chapter.number}: {text(chapter.title)}"
-    return f'<div><h3><a href="#chapter-{chapter.number}">{title}</a></h3><p>Figures {figures}; {parts}</p></div>'
+    return f'<li><a href="#chapter-{chapter.number}">{title}</a><p>Figures {figures}; {parts}</p></li>'
+
+
+def _option(value: str, shown: str) -> str:
+    return f'<option value="{text(value)}">{text(shown)}</option>'
 
 
 def _anchor(figure: str) -> str:
@@ -97,13 +102,16 @@ def _anchor(figure: str) -> str:
 
 def _chapter(chapter: Chapter) -> str:
     n, errata = chapter.number, (_texts(each.values()) for each in chapter.errata)
+    slips = table(f"Slips of the printed chapter {n}", heading(_ERRATA), errata, "errata")
     figures = (_figure(*each) for each in chapter.figures.items())
-    numbers = table("", heading(_NUMBERS), map(_number, chapter.numbers)) if chapter.numbers else ""
+    caption = f"Numbers of chapter {n}, as printed and as found here"
+    numbers = table(caption, heading(*_NUMBERS), map(_number, chapter.numbers)) if chapter.numbers else ""
     return (
-        f'<section aria-labelledby="chapter-{n}"><h2 id="chapter-{n}">Chapter {n}: {text(chapter.title)}</h2>'
+        f'<section aria-labelledby="chapter-{n}" data-chapter="{n}">'
+        f'<h2 id="chapter-{n}">Chapter {n}: {text(chapter.title)}</h2>'
         f'<p>{chapter.introduction}</p><div class="figures">{"".join(figures)}</div>'
         + (f'<h3 id="numbers-{n}">Printed numbers</h3>{numbers}' if numbers else "")
-        + f'<h3 id="errata-{n}">Errata</h3>{table("", heading(_ERRATA), errata, "errata")}'
+        + f'<h3 id="errata-{n}">Errata</h3>{slips}'
         + f'<h3 id="claims-{n}">Claims</h3>{"".join(map(_claim, chapter.claims))}</section>'
     )
 
@@ -125,7 +133,7 @@ def _number(each: Table) -> str:
 def _claim(claim: Table) -> str:
     ident, verdict = claim["ident"], claim["verdict"]
     return (
-        f'<div class="claim {_VERDICTS[verdict][0]}" id="claim-{ident}">'
+        f'<div class="claim {_VERDICTS[verdict][0]}" id="claim-{ident}" data-verdict="{verdict}">'
         f"<h4>{verdict.capitalize()}<small>{ident} · section {text(claim['where'])}</small></h4>"
         f"<blockquote>{text(claim['quote'])}</blockquote><p>{claim['because']}</p></div>"
     )
@@ -135,7 +143,8 @@ def _data(data: Table, instructions: Table) -> str:
     rows = [_texts((NAMES[key], *_quality(each), instructions[key])) for key, each in data["schemes"].items()]
     if data["bound_n"]:
         rows.append(_texts(("first-order bound", _list(data["bound_n"]), *[""] * 6)))
-    return f"<h3>{text(data['name'][0].upper() + data['name'][1:])}</h3>{table('', heading(_QUALITY), rows)}"
+    name = data["name"][0].upper() + data["name"][1:]
+    return f"<h3>{text(name)}</h3>{table('Schemes, each on this data', heading(_QUALITY), rows)}"
 
 
 def _quality(each: TrackQuality) -> list[object]:
@@ -150,7 +159,7 @@ def _seeds(seeds: Mapping[str, Table]) -> str:
     rows = (_texts((NAMES[key], *_summary(each))) for key, each in seeds.items())
     return (
         f"<h3>Circuit, 12 bits, 1 LSB of noise: {some['changes'] // 4} seeds, {some['changes']} changes,"
-        f" {some['samples']:,} samples</h3>{table('', heading(_SEEDS), rows)}"
+        f" {some['samples']:,} samples</h3>{table('Schemes, over all seeds', heading(_SEEDS), rows)}"
     )
 
 

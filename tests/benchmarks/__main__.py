@@ -35,6 +35,7 @@ from . import (
     bench_properties,
     bench_reality,
     bench_self_test,
+    bench_silverbox,
     bench_statistics,
     bench_trials,
     bench_two_mass,
@@ -62,6 +63,7 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "properties": bench_properties.figures,
     "detectors": bench_detectors.figures,
     "reality": bench_reality.figures_of,
+    "silverbox": bench_silverbox.figures,
 }
 
 OPTIONED = {"campaign", "reality", "statistics"}

@@ -29,7 +29,8 @@ from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.tally import Task
 from analogrig.campaigns.trials import Trials
 from analogrig.campaigns.workers import ThisProcess
-from analogrig.reporting.campaign import write_json, write_page
+from analogrig.reporting.campaign import write_json
+from analogrig.reporting.campaign_page import write_page
 from tests import tools
 
 from .figure import Figure

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_campaign, bench_certificates, bench_detectors, bench_reality, bench_two_mass
+from . import bench_campaign, bench_certificates, bench_detectors, bench_reality, bench_silverbox, bench_two_mass
 
 FOLDER = Path("harness/docs/evidence")
 
@@ -28,10 +28,11 @@ TITLES: Mapping[str, str] = {
     "properties": "False failures of the shipped properties",
     "detectors": "Detectors at the same measured ARL0",
     "reality": "The shipped device under the conditions that users meet",
+    "silverbox": "Twin of the Silverbox",
 }
 """Page titles by the name of the benchmark."""
 
-CROSSED = {"certificates", "detectors", "reality"}
+CROSSED = {"certificates", "detectors", "reality", "silverbox"}
 """Benchmarks whose figures are named ROW: COLUMN, and whose page is a table of these."""
 
 NOTES: Mapping[str, str] = {
@@ -39,6 +40,7 @@ NOTES: Mapping[str, str] = {
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
     "reality": bench_reality.NOTE,
+    "silverbox": bench_silverbox.NOTE,
     "two-mass": bench_two_mass.NOTE,
 }
 """Paragraphs below the tables."""

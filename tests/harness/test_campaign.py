@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import signal
 import sqlite3
 import subprocess
@@ -508,6 +509,8 @@ DAMAGES: dict[str, str] = {
     "a place": "UPDATE trials SET first = first + 100",
     "a negative place": "UPDATE trials SET first = -first - 1",
     "no trials": "DELETE FROM trials",
+    "one part less": "DELETE FROM trials WHERE first = (SELECT max(first) FROM trials)",
+    "one summary less": "DELETE FROM cells WHERE cell = 0",
     "no plan": "DELETE FROM campaign",
     "another plan": "UPDATE campaign SET plan = '[]'",
     "a deep plan": "UPDATE campaign SET plan = '" + "[" * 100_000 + "'",
@@ -541,6 +544,7 @@ def test_damaged_results_are_one_line(
         said = capsys.readouterr().err
         assert "damaged.sqlite: " in said
         assert said.count("\n") == 1
+        assert not re.search("malformed|not a database|sqlite3", said)
 
 
 def trial(

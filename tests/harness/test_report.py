@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analogrig import pages
 from analogrig.errors import RecordingError
 from analogrig.judging.verdict import Outcome, judge
-from analogrig.reporting import page, render, write_report
+from analogrig.reporting import render, write_report
 from analogrig.run import Run
 from tests.harness.reported import (
     CLIPPED,
@@ -265,7 +266,7 @@ def test_page_of_the_thesis_is_small(source: str) -> None:
 def test_plot_library_that_was_not_built_is_one_clear_line(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page, "STYLES", (tmp_path / "uPlot.min.css",))
+    monkeypatch.setattr(pages, "FOLDER", tmp_path)
     with pytest.raises(RecordingError, match=r"uPlot.min.css.*make setup") as caught:
         write_report(run, reported_verdict(run), tmp_path / "report.html")
     assert "\n" not in str(caught.value)

@@ -62,6 +62,7 @@ def test_row_of_a_run_is_that_of_its_verdict(add: Callable[..., Path], tmp_path:
         "emulator",
         "mine",
         "01234567",
+        "",
         *figures,
     ] in page.rows
     assert 'href="a%20run/%3C1%3E/report.html"' in page.source
@@ -103,7 +104,8 @@ def test_run_that_has_not_ended_is_inconclusive_and_earlier_results_are_left_out
     with OutputFolder(tmp_path / "killed", "analogrig run", "2026-01-01T12:00:00+00:00"):
         session = found(tmp_path)
     assert [run.folder for run in session.runs] == ["run"]
-    assert session.unread == (f"{tmp_path}/killed/verdict.json: inconclusive: {NOT_ENDED}",)
+    assert session.unread == ()
+    assert session.unended == (f"{tmp_path}/killed/verdict.json: inconclusive: {NOT_ENDED}",)
     assert '<section class="outcome inconclusive"' in render(session)
 
 
@@ -137,6 +139,24 @@ def test_file_that_is_no_verdict_is_one_line_beside_the_others(
     assert lines[1].startswith(f"not read: {tmp_path}/bad/verdict.json: not a verdict")
     assert lines[2] == f"page: {tmp_path}/session.html"
     assert "bad/verdict.json" in (tmp_path / "session.html").read_text()
+
+
+def test_line_of_a_file_that_is_no_verdict_names_a_cure_and_no_python(
+    add: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (add("bad") / "verdict.json").write_bytes(b"[")
+    assert main(["report", str(tmp_path)]) == 2
+    line, _ = capsys.readouterr().out.splitlines()
+    place = f"{tmp_path}/bad/verdict.json"
+    assert line == f"not read: {place}: not a verdict of analogrig: run the command again, or remove it"
+
+
+def test_folder_with_runs_that_have_not_ended_alone_is_inconclusive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with OutputFolder(tmp_path / "killed", "analogrig run", "2026-01-01T12:00:00+00:00"):
+        assert main(["report", str(tmp_path)]) == 3
+    assert capsys.readouterr().out.startswith(f"no result: {tmp_path}/killed/verdict.json: inconclusive: {NOT_ENDED}")
 
 
 def test_folder_without_a_run_or_with_too_many_is_refused(

@@ -44,6 +44,27 @@ def test_every_figure_is_drawn_without_an_error_or_a_request(opened: Watched, cl
     assert [url.rpartition("/")[2] for url in opened.requests] == [PAGE]
 
 
+def test_page_is_accessible_in_both_schemes_and_widths(browser: Browser, reproduced: Path) -> None:
+    watched = Watched(browser, reproduced / PAGE)
+    assert watched.faults() == []
+    watched.page.close()
+
+
+def test_filter_shows_the_claims_of_a_chapter_and_verdict(browser: Browser, reproduced: Path, claims: Any) -> None:
+    watched = Watched(browser, reproduced / PAGE)
+    page = watched.page
+    page.get_by_role("combobox", name="Verdict").select_option("does not hold")
+    wanted = [f"claim-{each['ident']}" for each in claims["claims"] if each["verdict"] == "does not hold"]
+    assert [each.get_attribute("id") for each in page.locator(".claim:visible").all()] == wanted
+    assert page.locator("figure:visible").count() == 0
+    page.get_by_role("combobox", name="Chapter").select_option("3")
+    assert page.locator("#count").inner_text() == f"0 of {len(claims['claims'])} claims"
+    page.get_by_role("link", name="4.6", exact=True).click()
+    assert page.locator("#fig-4\\.6").is_visible()
+    assert page.locator(".claim:visible").count() == len(claims["claims"])
+    page.close()
+
+
 def test_page_is_below_5_mb_and_loads_nothing(reproduced: Path) -> None:
     page = (reproduced / PAGE).read_text(encoding="utf-8")
     assert len(page.encode()) < 5_000_000

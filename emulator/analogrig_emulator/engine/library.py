@@ -17,6 +17,7 @@ MAX_KINKS = 128
 MAX_OUTPUTS = 256
 MAX_UNKNOWNS = 256
 MAX_FACTOR_TERMS = 16
+DRIVE_TERMS = 5
 
 _HERE = Path(__file__).parents[1]
 _BUILD = "make setup"
@@ -49,6 +50,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_set_state", c_int, (c_void_p, c_void_p)),
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
     ("engine_play", c_int, (c_void_p, c_int64, POINTER(System), c_void_p, c_int64, *(c_void_p,) * 4)),
+    ("engine_drive", c_int, (c_void_p, c_int, c_int64, c_void_p)),
     ("engine_look_ahead", None, (c_void_p, c_int64)),
     ("engine_watch", None, (c_void_p, c_int64)),
     ("engine_get_overdue", None, (c_void_p, c_void_p)),

@@ -1,108 +1,173 @@
-"""Drawing of a patch as SVG: one row for each computing element, connections by the names of nodes.
+"""Drawing of a patch as SVG: computing elements in columns, pots at their inputs, and the wires between them.
 
-The drawing depends on the program alone: the same file gives the same bytes.
+The drawing depends on the program alone: the same file gives the same bytes. Groups with ``data-node`` are the wire and
+the output of a node; the output also has the id ``node-NAME``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from xml.sax.saxutils import escape
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+from xml.sax.saxutils import escape, quoteattr
 
 from analogrig_emulator.machine.compiler import PatchedCord, PatchedElement, PatchedProgram
+from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Box, Point, WirePath, lay_out
 from analogrig_emulator.machine.sheet import Inverter, input_text, inverters, signed
 from analogrig_emulator.machine.stages import StageKind
 
-_WIDTH = 900
-_LINE = 34
-_GAP = 22
-_LABEL_X, _POT_X, _BODY_X, _BODY_WIDTH = 20, 330, 420, 70
-_STYLE = (
-    "text{font:13px sans-serif;fill:#222}.small{font-size:11px;fill:#555}"
-    ".wire{stroke:#222;stroke-width:1.4;fill:none}.body{stroke:#222;stroke-width:1.6;fill:#fff}"
+PALETTE = (
+    "svg{--paper:#fff;--ink:#1a1a1a;--muted:#555;--line:#d5d5d5;--first:#0072b2;--second:#a84a00}"
+    "@media(prefers-color-scheme:dark){svg{--paper:#14171a;--ink:#ececec;--muted:#a8adb2;--line:#3a4046;"
+    "--first:#56b4e9;--second:#ff9a4d}}"
 )
+"""Colours of drawings that stand alone, light and dark: those of the pages."""
+
+_STYLE = (
+    f"{PALETTE}.patch text{{font:13px sans-serif;fill:var(--ink)}}"
+    ".patch .small{font-size:11px;fill:var(--muted)}.patch .wire{stroke:var(--first);stroke-width:1.5;fill:none}"
+    ".patch .joint{fill:var(--first)}.patch .body{stroke:var(--ink);stroke-width:1.6;fill:var(--paper)}"
+    ".patch .terminal{stroke:var(--first);fill:var(--paper)}.patch .paper{fill:var(--paper)}"
+)
+_POT_X, _BODY_X, _BODY_WIDTH = 34, 92, 64
+_LONGEST = 26
+
+_SYMBOLS = {
+    StageKind.PRODUCT: "×",
+    StageKind.QUOTIENT: "÷",
+    StageKind.ROOT: "√",
+    StageKind.FUNCTION: "f",
+    StageKind.RECTIFIER: "max",
+}
+"""Symbols of the elements that are drawn as squares; amplifiers are triangles."""
+
+
+class _Pin(NamedTuple):
+    """Input: its node, its term in words, its pot with the coefficient, and its gain."""
+
+    node: str
+    term: str
+    pot: str = ""
+    gain: int = 1
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Block as it is drawn: name, output node with its quantity, kind, and pins."""
+
+    name: str
+    node: str
+    quantity: str
+    kind: str
+    symbol: str = ""
+    has_bar: bool = False
+    pins: tuple[_Pin, ...] = ()
 
 
 def patch_drawing(program: PatchedProgram) -> str:
     """SVG of the patch.
 
     A triangle is an amplifier, with a bar for an integrator; a circle is a pot with its coefficient; a square is a
-    multiplier or a function generator. Each input names the node that it comes from, each output its node.
+    multiplier or another function. A name below an element is that of its output node.
     """
-    y = 70
-    rows: list[str] = []
-    for element in program.patch:
-        rows += _element(element, y)
-        y += _LINE * len(element.cords) + _GAP
-    for inverter in inverters(program):
-        rows += _inverter(inverter, y)
-        y += _LINE + _GAP
+    blocks = [*map(_element, program.patch), *map(_inverter, inverters(program))]
+    blocks = [*_sources(program, blocks), *blocks]
+    layout = lay_out([Box(each.node, tuple(pin.node for pin in each.pins)) for each in blocks])
     title = f"{program.name}: {program.equations.description}" if program.equations.description else program.name
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{y}" viewBox="0 0 {_WIDTH} {y}" role="img">'
-        f"<title>{escape(title)}</title><style>{_STYLE}</style>"
-        f'<rect width="{_WIDTH}" height="{y}" fill="#fff"/>'
+    size = f'width="{layout.width:g}" height="{layout.height:g}"'
+    view = f'viewBox="0 0 {layout.width:g} {layout.height:g}"'
+    label = quoteattr(f"patch of {title}")
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="patch" role="group" aria-label={label} {size} {view}>',
+        f"<title>{escape(title)}</title><style>{_STYLE}</style>",
+        f'<rect class="paper" {size}/>{_text(Point(16, 26), title)}',
+        *(_wire(node, wire) for node, wire in layout.wires.items()),
+    ]
+    for block, place in zip(blocks, layout.places, strict=True):
+        parts += _block(block, place)
+    return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _element(element: PatchedElement) -> _Drawn:
+    kind = element.stage.kind
+    return _Drawn(
+        element.name,
+        element.node,
+        signed(element.sign, element.stage.name),
+        kind.value + (f", {element.farad * 1e9:g} nF" if element.farad else ""),
+        _SYMBOLS.get(kind, ""),
+        kind is StageKind.INTEGRATOR,
+        tuple(_pin(element, cord) for cord in element.cords),
     )
-    sources = ", ".join(f"{name} at {node}" for name, node in program.input_nodes.items())
-    caption = _text(_LABEL_X, 28, title) + _text(_LABEL_X, 48, f"inputs: {sources}", small=True)
-    return "\n".join([head, caption, *rows, "</svg>"]) + "\n"
 
 
-def _element(element: PatchedElement, y: int) -> Iterator[str]:
-    height = _LINE * len(element.cords)
-    for i, cord in enumerate(element.cords):
-        yield from _input(element, cord, y + i * _LINE + _LINE // 2)
-    if element.stage.kind in (StageKind.PRODUCT, StageKind.FUNCTION):
-        sign = "x" if element.stage.kind is StageKind.PRODUCT else "f"
-        yield f'<rect class="body" x="{_BODY_X}" y="{y}" width="{_BODY_WIDTH}" height="{height}"/>'
-        yield _text(_BODY_X + 30, y + height // 2 + 5, sign)
-    else:
-        yield from _triangle(y, height, has_bar=element.stage.kind is StageKind.INTEGRATOR)
-    detail = element.stage.kind.value + (f", {element.farad * 1e9:g} nF" if element.farad else "")
-    yield from _output(element.name, element.node, signed(element.sign, element.stage.name), detail, y + height // 2)
+def _pin(element: PatchedElement, cord: PatchedCord) -> _Pin:
+    pot = f"{cord.pot} {cord.coefficient / cord.gain:.4f}" if cord.pot else ""
+    return _Pin(cord.node, input_text(element, cord), pot, cord.gain)
 
 
-def _inverter(inverter: Inverter, y: int) -> Iterator[str]:
-    middle = y + _LINE // 2
-    yield _text(_LABEL_X, middle + 4, f"{inverter.node}: {signed(inverter.sign, inverter.quantity)}")
-    yield _wire(_POT_X - 20, _BODY_X, middle)
-    yield from _triangle(y, _LINE, has_bar=False)
+def _inverter(inverter: Inverter) -> _Drawn:
     output = signed(-inverter.sign, inverter.quantity)
-    yield from _output(inverter.name, inverter.name.lower(), output, "inverter", middle)
+    pins = (_Pin(inverter.node, signed(inverter.sign, inverter.quantity)),)
+    return _Drawn(inverter.name, inverter.name.lower(), output, "inverter", pins=pins)
 
 
-def _input(element: PatchedElement, cord: PatchedCord, y: int) -> Iterator[str]:
-    yield _text(_LABEL_X, y + 4, f"{cord.node}: {_short(input_text(element, cord))}")
-    yield _wire(_POT_X - 20, _BODY_X, y)
-    if cord.pot:
-        yield f'<circle class="body" cx="{_POT_X + 12}" cy="{y}" r="12"/>'
-        yield _text(_POT_X + 28, y - 3, f"{cord.pot} {cord.coefficient / cord.gain:.4f}", small=True)
-    if cord.gain != 1:
-        yield _text(_BODY_X - 16, y + 12, str(cord.gain), small=True)
+def _sources(program: PatchedProgram, blocks: list[_Drawn]) -> list[_Drawn]:
+    """Inputs of the program and reference voltages: the nodes that no element drives."""
+    names: Mapping[str, str] = {node: name for name, node in program.input_nodes.items()}
+    driven = {each.node for each in blocks}
+    nodes = dict.fromkeys(pin.node for each in blocks for pin in each.pins if pin.node not in driven)
+    return [_Drawn("", node, names.get(node, "reference"), "input" if node in names else "source") for node in nodes]
 
 
-def _triangle(y: int, height: int, *, has_bar: bool) -> Iterator[str]:
-    left, right, middle = _BODY_X, _BODY_X + _BODY_WIDTH, y + height / 2
-    yield f'<path class="body" d="M{left} {y}L{right} {middle:g}L{left} {y + height}Z"/>'
-    if has_bar:
-        yield f'<rect class="body" x="{left - 6}" y="{y}" width="6" height="{height}"/>'
+def _wire(node: str, wire: WirePath) -> str:
+    path = "".join(f"M{start.x:g} {start.y:g}L{end.x:g} {end.y:g}" for start, end in wire.lines)
+    joints = "".join(f'<circle class="joint" cx="{at.x:g}" cy="{at.y:g}" r="3"/>' for at in wire.joints)
+    return f'<g class="net" data-node={quoteattr(node)}><path class="wire" d="{path}"/>{joints}</g>'
 
 
-def _output(name: str, node: str, quantity: str, detail: str, y: int) -> Iterator[str]:
-    right = _BODY_X + _BODY_WIDTH
-    yield _wire(right, right + 30, y)
-    yield _text(_BODY_X + 6, y + 5, name if len(name) < 4 else "", small=True)
-    yield _text(right + 36, y, f"{node}: {_short(quantity)}")
-    yield _text(right + 36, y + 15, f"{name}, {detail}", small=True)
+def _block(block: _Drawn, place: Point) -> Iterator[str]:
+    height = ROW * max(1, len(block.pins))
+    left, right, middle = place.x + _BODY_X, place.x + _BODY_X + _BODY_WIDTH, place.y + height / 2
+    terms = "; ".join(f"{pin.node}: {pin.term}" for pin in block.pins)
+    title = ", ".join(filter(None, (block.name, block.kind, f"{block.node}: {block.quantity}", terms)))
+    yield f'<g class="element"><title>{escape(title)}</title>'
+    for i, pin in enumerate(block.pins):
+        yield from _input(pin, Point(place.x, place.y + (i + 0.5) * ROW), left)
+    if block.symbol:
+        yield f'<rect class="body" x="{left:g}" y="{place.y:g}" width="{_BODY_WIDTH}" height="{height}"/>'
+        yield _text(Point(left + _BODY_WIDTH / 2, middle + 5), block.symbol, anchor="middle")
+        yield _text(Point(left + 4, place.y + 12), block.name, is_small=True)
+    elif block.pins:
+        yield f'<path class="body" d="M{left:g} {place.y:g}L{right:g} {middle:g}L{left:g} {place.y + height:g}Z"/>'
+        if block.has_bar:
+            yield f'<rect class="body" x="{left - 6:g}" y="{place.y:g}" width="6" height="{height}"/>'
+        yield _text(Point(left + 6, middle + 4), block.name, is_small=True)
+    label, end = f"{block.node}: {block.quantity}", place.x + BLOCK_WIDTH
+    below, beside = Point(right, place.y + height + 14), Point(end - 10, middle + 4)
+    yield _text(below if block.pins else beside, _short(label), anchor="end", is_small=True)
+    yield "</g>"
+    start = right if block.pins else end
+    yield (
+        f"<g id={quoteattr(f'node-{block.node}')} data-node={quoteattr(block.node)}><title>{escape(label)}</title>"
+        f'<path class="wire" d="M{start:g} {middle:g}H{end:g}"/>'
+        f'<circle class="terminal" cx="{end:g}" cy="{middle:g}" r="4"/></g>'
+    )
 
 
-def _wire(start: int, stop: int, y: int) -> str:
-    return f'<path class="wire" d="M{start} {y}H{stop}"/>'
+def _input(pin: _Pin, at: Point, left: float) -> Iterator[str]:
+    yield f'<path class="wire" d="M{at.x:g} {at.y:g}H{left:g}"/>'
+    if pin.pot:
+        yield f'<circle class="body" cx="{at.x + _POT_X:g}" cy="{at.y:g}" r="9"/>'
+        yield _text(Point(at.x + 2, at.y - 11), pin.pot, is_small=True)
+    if pin.gain != 1:
+        yield _text(Point(left - 22, at.y - 3), str(pin.gain), is_small=True)
 
 
-def _text(x: int, y: int, text: str, *, small: bool = False) -> str:
-    style = ' class="small"' if small else ""
-    return f'<text x="{x}" y="{y}"{style}>{escape(text)}</text>'
+def _text(at: Point, text: str, *, anchor: str = "start", is_small: bool = False) -> str:
+    style = ' class="small"' if is_small else ""
+    return f'<text x="{at.x:g}" y="{at.y:g}" text-anchor="{anchor}"{style}>{escape(text)}</text>'
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= 38 else f"{text[:35]}..."
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

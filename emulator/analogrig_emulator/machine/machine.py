@@ -41,7 +41,7 @@ from analogrig_emulator.circuit.nodal import Nodal, analyse
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Kink, PiecewiseLinear
 from analogrig_emulator.errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
 from analogrig_emulator.machine.patching import Patch, patches
 
@@ -194,7 +194,9 @@ class AnalogComputer:
         nodes = self._patched.nodes
         probe = Engine(self._system, nodes, self._sample_rate_hz)
         probe.state = self._engine.state
-        volts = probe.run(1, {name: Edges(np.zeros(1, np.int64), np.array([v])) for name, v in self._levels_v.items()})
+        driven_v = {name: drive.at(max(self._engine.now_tick, 0)) for name, drive in self._drives.items()}
+        levels_v = self._levels_v | driven_v
+        volts = probe.run(1, {name: Edges(np.zeros(1, np.int64), np.array([v])) for name, v in levels_v.items()})
         return dict(zip(nodes, volts[0].tolist(), strict=True))
 
     # ---- pots
@@ -275,12 +277,17 @@ class AnalogComputer:
 
     # ---- operation
 
-    def restart(self, mode: Mode = Mode.INITIAL_CONDITION, ahead_ticks: int = 0) -> None:
+    def restart(
+        self,
+        mode: Mode = Mode.INITIAL_CONDITION,
+        ahead_ticks: int = 0,
+        drives: Mapping[str, Drive] = MappingProxyType({}),
+    ) -> None:
         """Restart in a mode: empty capacitors, inputs at 0 V, dark lamps, clock before sample 0.
 
-        Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks: as for Engine.
+        Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks, drives: as for Engine.
         """
-        self._mode, self._ahead_ticks = mode, ahead_ticks
+        self._mode, self._ahead_ticks, self._drives = mode, ahead_ticks, dict(drives)
         self._dials |= self._wipers.contacts_at_rest(self._turns)
         self._turns = {}
         self._levels_v = {source.name: 0.0 for source in self._patched.inputs}
@@ -388,7 +395,9 @@ class AnalogComputer:
     def _engine(self) -> Engine:
         """Engine, made on first use after a restart: most machines have their pots set before they are played."""
         if self._powered is None:
-            self._powered = Engine(self._system, self._readings, self._sample_rate_hz, ahead_ticks=self._ahead_ticks)
+            self._powered = Engine(
+                self._system, self._readings, self._sample_rate_hz, ahead_ticks=self._ahead_ticks, drives=self._drives
+            )
             self._powered.watch(self._lamp_delay_ticks)
             self._charge_at_once(self._powered)
         return self._powered

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
-from analogrig_emulator.engine.system import Edges, is_integer
+from analogrig_emulator.engine.system import Drive, Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
 from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
@@ -131,7 +132,7 @@ class SuspensionComputer:
 
     def play(
         self,
-        excitation: Excitation,
+        excitation: Excitation | RecordedExcitation,
         samples: int,
         changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
@@ -141,7 +142,7 @@ class SuspensionComputer:
 
         If ahead_ticks is not 0, a row has 8 volts: those of the sample, and those so many ticks later, as for Engine.
 
-        The excitation's first level applies at sample 0. A change takes effect right after its sample is
+        The excitation's first level or sample applies at sample 0. A change takes effect right after its sample is
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
         Raises PotError, ExcitationError and EngineError; for invalid arguments before anything is played.
         """
@@ -149,7 +150,7 @@ class SuspensionComputer:
 
     def play_planned(
         self,
-        excitation: Excitation,
+        excitation: Excitation | RecordedExcitation,
         samples: int,
         turns: Sequence[PotTurn],
         block_samples: int = BLOCK_SAMPLES,
@@ -158,20 +159,26 @@ class SuspensionComputer:
         """Play like play(), with turns from plan()."""
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
-        excitation.period_ticks(self.sample_rate_hz)
-        self.machine.restart(Mode.OPERATE, ahead_ticks)
+        drives: dict[str, Drive] = {}
+        generator = None if isinstance(excitation, RecordedExcitation) else excitation
+        if isinstance(excitation, RecordedExcitation):
+            drives[SOURCE] = excitation.drive
+        else:
+            excitation.period_ticks(self.sample_rate_hz)
+        self.machine.restart(Mode.OPERATE, ahead_ticks, drives)
         self._plays += 1
-        return self._blocks(self._plays, excitation, samples, list(turns), block_samples)
+        return self._blocks(self._plays, generator, samples, list(turns), block_samples)
 
     # ---- playing
 
     def _blocks(
-        self, play: int, excitation: Excitation, samples: int, turns: list[PotTurn], block_samples: int
+        self, play: int, excitation: Excitation | None, samples: int, turns: list[PotTurn], block_samples: int
     ) -> Iterator[NDArray[np.float64]]:
         for start in range(0, samples, block_samples):
             stop = min(start + block_samples, samples)
             parts = []
-            edges = excitation.edges(*self.machine.window(stop - start), self.sample_rate_hz)
+            window = self.machine.window(stop - start)
+            edges = None if excitation is None else excitation.edges(*window, self.sample_rate_hz)
             while play == self._plays and self.machine.recorded < stop:
                 now = [turn for turn in turns if turn.sample < stop]
                 if not self.machine.is_turning and not any(turn.ramp_n for turn in now):
@@ -187,9 +194,9 @@ class SuspensionComputer:
                 raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _advance(self, edges: Edges, samples: int, turns: Sequence[PotTurn] = ()) -> NDArray[np.float64]:
+    def _advance(self, edges: Edges | None, samples: int, turns: Sequence[PotTurn] = ()) -> NDArray[np.float64]:
         """Volts of the next samples, with these turns, all at once: (samples, channels)."""
-        trains = {SOURCE: edges.within(*self.machine.window(samples))}
+        trains = {} if edges is None else {SOURCE: edges.within(*self.machine.window(samples))}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
         by_instant = volts.reshape(samples, -1, len(self._signs))

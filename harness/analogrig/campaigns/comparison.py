@@ -345,7 +345,9 @@ def load(path: Path) -> Recorded | Campaign:
     with Store.read(path) as store:
         if not store.is_ended:
             raise RecordingError(f"{path}: a campaign that has not ended: the command that began it goes on")
-        return Campaign(path, store.plan())
+        plan = store.plan()
+        store.check_whole(plan)
+        return Campaign(path, plan)
 
 
 def compare_sides(a: Recorded | Campaign, b: Recorded | Campaign, alpha: float = 0.01) -> Comparison:

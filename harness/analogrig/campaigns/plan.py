@@ -184,6 +184,13 @@ class Plan:
         """Scenario before the values of a cell are set."""
         return Scenario.from_table(self.scenario, "the campaign's scenario")
 
+    def axis(self, name: str) -> tuple[str, str]:
+        """Name and unit of an axis in words."""
+        if name == NOISE:
+            return "noise", "LSB rms"
+        program = self._base.program
+        return name.replace("_", " "), program.unit(self._starts[name]) if name in self._starts else ""
+
     @property
     def estimates(self) -> tuple[str, ...]:
         """Parameters whose estimates the results keep."""

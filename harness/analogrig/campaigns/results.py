@@ -70,9 +70,10 @@ def load_ended(store: Store) -> Results:
     plan = store.plan()
     if not store.is_ended:
         raise RecordingError(f"{store.path}: a campaign that has not ended: the command that began it goes on")
+    store.check_whole(plan)
     tally = tally_of(store, plan)
     if not all(map(tally.has_ended, range(plan.size))):
-        raise RecordingError(f"{store.path}: damaged results of a campaign (trials are missing)")
+        raise store.damage("trials are missing")
     return Results.of(plan, tally, store.commands())
 
 

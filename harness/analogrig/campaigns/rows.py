@@ -45,7 +45,7 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
     """
     return _row(
         run.conditions.seed,
-        verdict.outcome,
+        verdict.outcome if verdict.valid else "inconclusive",
         drawn,
         why=verdict.reasons[0] if verdict.reasons else "",
         samples=run.samples,

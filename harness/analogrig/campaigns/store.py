@@ -129,6 +129,28 @@ class Store:
         with self._checked():
             return Plan.from_json(self.plan_text)
 
+    def damage(self, what: str) -> RecordingError:
+        """Error of a file that no campaign leaves."""
+        cure = "take another copy of the file, or remove it and play the campaign again"
+        return RecordingError(f"{self.path}: damaged results of a campaign ({what}): {cure}")
+
+    def check_whole(self, plan: Plan) -> None:
+        """Check that an ended campaign has as many trials of each cell as its summary says.
+
+        :raises RecordingError: trials were removed or added.
+        """
+        found, trials = [0] * plan.size, plan.spec.trials
+        with self._wrapped(), self._checked():
+            for first, count in self._file.execute("SELECT first, count FROM trials"):
+                found[first // trials] += count
+            rows = self._file.execute("SELECT cell, summary FROM cells ORDER BY cell LIMIT ?", (plan.size + 1,))
+            expected = {cell: json.loads(text)["trials"] for cell, text in rows}
+            if list(expected) != list(range(plan.size)):
+                raise ValueError("not one summary for each cell")
+            for cell, count in expected.items():
+                if found[cell] != count:
+                    raise ValueError(f"{found[cell]} trials of cell {cell}, {count} in its summary")
+
     def commands(self) -> tuple[Identity, ...]:
         """Commands that have played a part, in order."""
         query = "SELECT identity FROM commands ORDER BY number LIMIT ?"
@@ -212,12 +234,12 @@ class Store:
     def _check_schema(self) -> None:
         found = dict(self._file.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall())
         if found != _SCHEMA:
-            raise RecordingError(f"{self.path}: damaged results of a campaign (other tables)")
+            raise self.damage("other tables")
 
     def _read_plan(self) -> str:
         rows = self._file.execute("SELECT plan FROM campaign LIMIT 2").fetchall()
         if len(rows) != 1 or not isinstance(rows[0][0], str) or len(rows[0][0]) > _MOST_PLAN_CHARACTERS:
-            raise RecordingError(f"{self.path}: damaged results of a campaign (no plan)")
+            raise self.damage("no plan")
         return str(rows[0][0])
 
     @contextlib.contextmanager
@@ -241,7 +263,9 @@ class Store:
         except sqlite3.Error as error:
             if _BUSY in str(error):
                 raise ConfigurationError(f"{self.path}: another campaign is writing to it") from error
-            raise RecordingError(f"{self.path}: {error}") from error
+            if isinstance(error, sqlite3.OperationalError):  # of the disk, not of what is in the file
+                raise RecordingError(f"{self.path}: {error}") from error
+            raise self.damage("no sound SQLite file") from error
 
     @contextlib.contextmanager
     def _checked(self) -> Iterator[None]:
@@ -251,7 +275,7 @@ class Store:
         except RecordingError:
             raise
         except (AnalogrigError, LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as e:
-            raise RecordingError(f"{self.path}: damaged results of a campaign ({e})") from e
+            raise self.damage(str(e)) from e
 
 
 class NotAStoreError(RecordingError):

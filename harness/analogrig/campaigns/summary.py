@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.campaigns.trials import EXISTS, FAILED, INCONCLUSIVE, LATE, MISSED, MOST_ERRORS, PASSED, Trials
+from analogrig.campaigns.trials import EXISTS, FAILED, INCONCLUSIVE, LATE, MISSED, MOST_ERRORS, OUTCOMES, PASSED, Trials
 from analogrig.judging.bursts import BURST, ConfidenceSequence, dispersion
 
 CONFIDENCE = 0.95
@@ -26,6 +26,9 @@ COUNTED = ("samples", "armed", "false_alarms", "visible", "missed")
 """
 
 _PER_BLOCK = ("false_alarms", "armed", "missed", "visible")
+
+MOST_NOT_PASSED = 3
+"""Largest number of trials of a cell that are named because they have not passed."""
 
 MOST_BLOCKS = 1000
 """Largest number of blocks whose counts are kept for a test of dispersion."""
@@ -133,6 +136,8 @@ class Aggregate:
     blocks: list[Blocks] = field(default_factory=lambda: [Blocks()])
     doubt: str = ""
     """Seed of the first inconclusive trial, with the reason; empty if there is none."""
+    not_passed: list[tuple[int, str, str]] = field(default_factory=list)
+    """Seed, outcome and reason of the first trials that have not passed."""
 
     def add(self, trials: Trials, first_seed: int) -> None:
         """Fold the next trials."""
@@ -144,6 +149,8 @@ class Aggregate:
         if outcomes[INCONCLUSIVE] and not self.doubt:
             i = int(np.argmax(trials.outcome == INCONCLUSIVE))
             self.doubt = f"seed {first_seed + i}: {trials.why[i]}"
+        for i in np.flatnonzero(trials.outcome != PASSED)[: MOST_NOT_PASSED - len(self.not_passed)].tolist():
+            self.not_passed.append((first_seed + i, OUTCOMES[trials.outcome[i]], trials.why[i]))
         sound = slice(None) if not outcomes[INCONCLUSIVE] else trials.is_valid
         change, latency_n, bound_n = trials.change[sound], trials.latency_n[sound], trials.bound_n[sound]
         exists = (change & EXISTS) > 0

@@ -73,7 +73,8 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import WorkerError
     from analogrig.identity import Identity
     from analogrig.output import move_aside
-    from analogrig.reporting.campaign import as_json, places_of, text, write_json, write_page
+    from analogrig.reporting.campaign import as_json, places_of, text, write_json
+    from analogrig.reporting.campaign_page import write_page
 
     plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.sqlite"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli.options import add_command, add_json
-from analogrig.cli.terminal import PASSED, show, show_result, show_work
+from analogrig.cli.terminal import INCONCLUSIVE, PASSED, USAGE, show, show_result, show_work
 
 
 def add(commands: Any) -> None:
@@ -33,16 +33,19 @@ def _run(arguments: argparse.Namespace) -> int:
     with show_work(f"reading the runs in {arguments.folder}"):
         session = find_session(arguments.folder, page)
         write_session(session, page)
+    status = PASSED if session.runs else INCONCLUSIVE if session.unended else USAGE
     if arguments.json:
         show_result({**asdict(session), "page": str(page)}, arguments)
-        return PASSED
+        return status
     for run in session.runs:
         ratio = "-" if run.ratio is None else f"{run.ratio:.2f}"
         show(
             f"{run.outcome:12} {run.folder}: {run.missed} of {run.changes} missed, {ratio} bounds,"
             f" {run.false_alarms} false alarms"
         )
+    for line in session.unended:
+        show(f"no result: {line}")
     for line in session.unread:
         show(f"not read: {line}")
     show(f"page: {page}")
-    return PASSED
+    return status

@@ -162,8 +162,8 @@ def _warm_up(run: Run) -> Iterator[str]:
 
 
 def _excitation(run: Run) -> Excitation | None:
-    """Recorded excitation; None if the scenario has none."""
-    table = run.conditions.scenario.get("excitation")
+    """Recorded excitation; None if the scenario has none, or nothing is known of it."""
+    table = run.conditions.scenario.get("excitation") if run.conditions.segments else None
     return None if table is None else config.build(Excitation, table, "the recorded excitation")
 
 

@@ -38,7 +38,11 @@ LARGEST_LEVEL = 700.0
 
 _NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
 
-Outcome = Literal["passed", "failed", "inconclusive"]
+Outcome = Literal["passed", "failed", "inconclusive", "unjudged"]
+"""``unjudged``: nothing is known of the plant, so that no alarm can be true or false."""
+
+UNKNOWN_PLANT = "nothing is known of the plant and its changes: pass a scenario that holds them with --scenario"
+"""Reason of an unjudged run."""
 
 Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not judged"]
 """Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
@@ -241,9 +245,9 @@ class SegmentEstimate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a run: ``passed``, ``failed`` or ``inconclusive``, with the reasons and the figures behind it.
+    """Verdict on a run, with the reasons and the figures behind it. Instants are sample indices.
 
-    Instants are sample indices. An inconclusive verdict is never a passed one.
+    An inconclusive verdict and an unjudged run never count as passed.
     """
 
     outcome: Outcome
@@ -274,6 +278,8 @@ class Verdict:
     """Periods of a misfit, in order; None if the device does not watch whether its model fits."""
     channel_faults: tuple[ChannelFault, ...] = ()
     """Faults of the channels that the device diagnosed, in order. No scenario contains one."""
+    knows_truth: bool = True
+    """False if nothing is known of the plant: the alarms are then neither detections nor false."""
 
     def __bool__(self) -> bool:
         raise TypeError('a verdict is neither true nor false: ask for verdict.outcome == "passed"')
@@ -281,7 +287,7 @@ class Verdict:
     @property
     def valid(self) -> bool:
         """True if the run permits a verdict on the device."""
-        return self.outcome != "inconclusive"
+        return self.outcome not in {"inconclusive", "unjudged"}
 
 
 def is_captured(run: Run) -> bool:
@@ -307,6 +313,9 @@ def judge(run: Run) -> Verdict:
     outcome, reasons = _decide_outcome(results, expect)
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
     possible = {index for each in results for index in each.false_alarms}
+    knows_truth = bool(run.conditions.segments) or not run.samples
+    if not knows_truth:
+        outcome, reasons, certain, possible = "unjudged", [UNKNOWN_PLANT], set(), set()
     return Verdict(
         outcome="inconclusive" if invalid else outcome,
         reasons=(*invalid, *reasons),
@@ -324,6 +333,7 @@ def judge(run: Run) -> Verdict:
         overloads=dict(run.conditions.overloads),
         fit=misfit_periods(run) if sheet.misfits else None,
         channel_faults=channel_faults(run),
+        knows_truth=knows_truth,
     )
 
 
@@ -610,7 +620,8 @@ def invalid_reasons(run: Run, shown: Exposure, expect: Expectations) -> list[str
     refused = run.conditions.counters.get("refused", 0)
     reasons += [f"the device refused {number_of(refused, 'sample')}"] if refused else []
     reasons += expect.excess_missing(run.samples, int(np.count_nonzero(run.missing)), missing_text(run))
-    return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence and run.samples else [])
+    is_evidence = bool(run.conditions.segments) or shown.non_finite > 0  # alarms of an unknown plant prove nothing
+    return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence and run.samples and is_evidence else [])
 
 
 def _loss_reasons(run: Run) -> list[str]:

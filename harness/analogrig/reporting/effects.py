@@ -10,12 +10,14 @@ from xml.sax.saxutils import escape
 
 from analogrig.storage import replace_file
 from analogrig_emulator.effects import SAMPLES, Effect, measure_effects
+from analogrig_emulator.machine.drawing import PALETTE
 
 EffectsBySet = Mapping[str, Sequence[Effect]]
 """Effects by parameter set; each set has the same effects in the same order."""
 
 _FIGURES = ("median_lsb", "largest_lsb", "draws")
-_COLOURS = ("#2b6cb0", "#c05621")
+_COLOURS = ("var(--first)", "var(--second)")
+_STYLE = f"{PALETTE}.effects text{{fill:var(--ink)}}"
 _LEAST_LSB, _MOST_LSB = 1e-3, 1e3
 
 
@@ -63,17 +65,19 @@ def write_picture(table: EffectsBySet, path: Path) -> None:
     names = [row.name for row in next(iter(table.values()))]
     bottom_px = top_px + row_px * len(names)
     height = bottom_px + 48
+    size = f'width="760" height="{height}" viewBox="0 0 760 {height}"'
     font = 'font-family="sans-serif" font-size="12"'
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="760" height="{height}" {font}>',
-        f'<rect width="760" height="{height}" fill="white"/>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="effects" role="group" aria-label="effects" {size} {font}>',
+        f"<style>{_STYLE}</style>",
+        f'<rect width="760" height="{height}" fill="var(--paper)"/>',
         '<text x="16" y="22" font-size="15">What matters at 12 bits: change of the displacement, in LSB</text>',
     ]
     for i, name in enumerate(table):
         parts.append(f'<rect x="{250 + 90 * i}" y="32" width="10" height="10" fill="{_COLOURS[i]}"/>')
         parts.append(f'<text x="{265 + 90 * i}" y="41">{escape(name)}</text>')
     for decade in range(round(math.log10(_LEAST_LSB)), round(math.log10(_MOST_LSB)) + 1):
-        x, colour = _x_px(10.0**decade), "#ddd" if decade else "#888"
+        x, colour = _x_px(10.0**decade), "var(--line)" if decade else "var(--muted)"
         parts.append(f'<path d="M{x:.1f} {top_px - 6}V{bottom_px - 2}" stroke="{colour}"/>')
         parts.append(f'<text x="{x:.1f}" y="{bottom_px + 14}" text-anchor="middle">{10.0**decade:g}</text>')
     middle = (_x_px(_LEAST_LSB) + _x_px(_MOST_LSB)) / 2.0
@@ -93,7 +97,7 @@ def _bar(effect: Effect, y: float, colour: str) -> str:
     return (
         f'<rect x="{left:.1f}" y="{y}" width="{right - left:.1f}" height="9" fill="{colour}">'
         f"<title>{escape(effect.name)}: {effect.median_lsb:.3g} LSB</title></rect>"
-        f'<text x="{right + 4:.1f}" y="{y + 8.5}" font-size="9" fill="#444">{_format_lsb(effect.median_lsb)}</text>'
+        f'<text x="{right + 4:.1f}" y="{y + 8.5}" font-size="9">{_format_lsb(effect.median_lsb)}</text>'
     )
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable
 
-_MOST_ROWS = 500
-"""Largest number of rows in any table."""
+MOST_ROWS = 500
+"""Largest number of rows in most tables."""
 
 
 def text(value: object) -> str:
@@ -24,9 +24,10 @@ def number(value: float | None, form: str = ".4g") -> str:
     return cell("–" if value is None else format(value, form), "number")
 
 
-def row(cells: Iterable[str]) -> str:
-    """Row of cells."""
-    return f"<tr>{''.join(cells)}</tr>"
+def row(cells: Iterable[str], ident: str = "") -> str:
+    """Row of cells; ``ident`` is the target of links to it."""
+    start = f'<tr id="{ident}">' if ident else "<tr>"
+    return f"{start}{''.join(cells)}</tr>"
 
 
 def heading(texts: Iterable[str], numbers: Iterable[str] = (), more: Iterable[str] = ()) -> str:
@@ -35,14 +36,24 @@ def heading(texts: Iterable[str], numbers: Iterable[str] = (), more: Iterable[st
     return row(f'<th scope="col"{kind}>{text(name)}</th>' for names, kind in kinds for name in names)
 
 
-def table(caption: str, head: str, rows: Iterable[str], kind: str = "numbers") -> str:
-    """Table of finished rows, of which the first are shown; ``kind`` is a style class."""
+def scroll(label: str, content: str) -> str:
+    """Content that scrolls sideways where the window is narrower, also by keyboard."""
+    return f'<div class="scroll" role="group" aria-label="{text(label)}" tabindex="0">{content}</div>'
+
+
+SORTABLE = "numbers sortable"
+"""Style class of a table that its reader can sort."""
+
+
+def table(caption: str, head: str, rows: Iterable[str], kind: str = "numbers", most: int = MOST_ROWS) -> str:
+    """Table of finished rows, of which the first ``most`` are shown; ``kind`` is a style class."""
     shown = list(rows)
-    if len(shown) > _MOST_ROWS:
-        caption += f"; the first {_MOST_ROWS} of {len(shown):,} rows"
-    return (
-        f'<div class="scroll"><table class="{kind}">{f"<caption>{text(caption)}</caption>" if caption else ""}'
-        f"{f'<thead>{head}</thead>' if head else ''}<tbody>{''.join(shown[:_MOST_ROWS])}</tbody></table></div>"
+    if len(shown) > most:
+        caption += f"; the first {most:,} of {len(shown):,} rows"
+    return scroll(
+        caption,
+        f'<table class="{kind}"><caption>{text(caption)}</caption>'
+        f"{f'<thead>{head}</thead>' if head else ''}<tbody>{''.join(shown[:most])}</tbody></table>",
     )
 
 

@@ -213,6 +213,11 @@
     return plotOf(ink, `${name}: estimate and truth`, curves, estimateRange(found.of, known), [axis("left", `${name} [${unit}]`, 3, ink)]);
   }
 
+  function gainUnit(signals) {
+    const [input, output] = run.channels;
+    return `${signals[output].unit}/${signals[input].unit}`;
+  }
+
   function innovation(signals, ink) {
     const caption = "Innovation: the measured output less the predicted one";
     const curves = [{ of: signals.innovation.values, label: "innovation", colour: "first", unit: "codes" }];
@@ -245,6 +250,11 @@
       pair(signals, ink, ...run.channels.slice(0, 2)),
       ...(run.channels.length > 2 ? [pair(signals, ink, ...run.channels.slice(2, 4))] : []),
       ...run.estimates.map(({ name, unit }) => estimate(signals, ink, name, unit)),
+      ...(signals.resonance ? [ // of an unknown plant
+        estimate(signals, ink, "resonance", "Hz"),
+        estimate(signals, ink, "damping", "1"),
+        estimate(signals, ink, "gain", gainUnit(signals)),
+      ] : []),
       ...(signals.innovation ? [innovation(signals, ink)] : []),
       ...(signals.statistic ? [statistic(signals, ink)] : []),
     ].map((plot) => ({

@@ -34,6 +34,9 @@ _MOST_MOMENTS = 100
 _LONGEST_REACH = 1_000
 """Samples on either side of a moment."""
 
+_MODE = ("resonance", "damping", "gain")
+"""Estimates of a plant of which nothing is known."""
+
 _DISPLAY_UNITS = {"m": ("mm", 1000.0)}
 """Units that the page displays as others, with the factor."""
 
@@ -231,8 +234,9 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
     missing = missing_samples(run.clipped[part]).astype(np.uint8)
     reported: dict[str, NDArray[Any]] = {}
     if run.datasheet.model is not None:
-        estimates = condense(trajectory(run, part).astype(np.float32), size)
-        reported |= {name: estimates[:, i] for i, name in enumerate(run.conditions.program.estimates)}
+        names, estimates = _estimates(run, part)
+        shown_estimates = condense(estimates.astype(np.float32), size)
+        reported |= {name: shown_estimates[:, i] for i, name in enumerate(names)}
     if run.datasheet.innovation:
         reported["innovation"] = condense(run.innovation[part], size)
     if run.datasheet.statistic:
@@ -243,6 +247,17 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
         "missing": np.repeat(condense(missing, size)[1::2], 2) if size > 1 else missing,
         **reported,
     }
+
+
+def _estimates(run: Run, part: slice) -> tuple[Sequence[str], NDArray[np.float64]]:
+    """Names and values (n, m) of the estimates; of an unknown plant its resonance, damping and gain."""
+    found = trajectory(run, part)
+    if run.conditions.segments:
+        return run.conditions.program.estimates, found
+    with np.errstate(all="ignore"):
+        mass, damping, stiffness = found.T
+        resonance_hz = np.sqrt(stiffness / mass) / (2.0 * np.pi) * run.conditions.time_scale
+        return _MODE, np.stack([resonance_hz, damping / (2.0 * np.sqrt(stiffness * mass)), 1.0 / stiffness], axis=1)
 
 
 def _units(run: Run, name: str) -> dict[str, Any]:

@@ -213,6 +213,12 @@ const plotting = (() => {
     };
   }
 
+  // Style of a curve's line in the legend.
+  function styleOf(u, i) {
+    const [long, gap] = u.series[i].dash ?? [];
+    return !long ? "solid" : long > gap ? "dashed" : "dotted";
+  }
+
   // The pointer reads out all plots with the same key. Dragging zooms all of them. `under` and `over` draw more below
   // and above the signals.
   function options({ key, right_px, scales, axes, series, marks, under = [], over = [] }, width, height, ink) {
@@ -221,6 +227,7 @@ const plotting = (() => {
       height,
       padding: [20, right_px, 0, 0],
       cursor: { y: false, sync: { key, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 }, bind: { mousedown: pressed } },
+      legend: { markers: { dash: styleOf } },
       scales,
       axes,
       series,

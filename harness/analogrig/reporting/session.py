@@ -14,8 +14,9 @@ from urllib.parse import quote
 from analogrig.config import read_bounded
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.output import FORMAT, FORMAT_VERSION, REPORT_FILE, VERDICT_FILE
-from analogrig.reporting.markup import cell, heading, number, row, table, text
-from analogrig.reporting.page import FOLDER, assemble_page
+from analogrig.pages import FOLDER, TABLES, assemble_page
+from analogrig.reporting.markings import figure, levels, words
+from analogrig.reporting.markup import SORTABLE, cell, heading, number, row, table, text
 from analogrig.storage import replace_file
 from analogrig.wording import number_of
 
@@ -28,11 +29,15 @@ _MOST_BYTES = 16_000_000
 """Largest verdict that is read."""
 
 _MOST_TRENDS = 40
-_WIDTH, _HEIGHT, _LEFT, _TOP, _BELOW = 640, 180, 56, 14, 44
-_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
-_STYLES = {"passed": "good", "failed": "bad", "inconclusive": "neutral"}
-_COLOURS = {"passed": "#009e73", "failed": "#d55e00", "inconclusive": "#e69f00"}
-"""Okabe and Ito."""
+_WIDTH, _HEIGHT, _LEFT, _TOP, _BELOW = 600, 180, 56, 26, 62
+_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?", "unjudged": "–"}
+_STYLES = {"passed": "good", "failed": "bad", "inconclusive": "neutral", "unjudged": "neutral"}
+_COLOURS = {
+    "passed": "var(--alarm)",
+    "failed": "var(--false)",
+    "inconclusive": "var(--truth)",
+    "unjudged": "var(--truth)",
+}
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,9 @@ class Entry:
     started: str
     """Start of the play, ISO 8601; empty if unknown."""
     build: str
-    """Build of the device: the first digits of its file's SHA-256; the commit of analogrig if it has no file."""
+    """Build of the device: the first digits of its file's SHA-256; empty if it has no file."""
+    commit: str
+    """Commit of analogrig; empty if unknown."""
     page: str
     """Page of the run, relative to that of the session; empty without one."""
 
@@ -70,8 +77,10 @@ class RunList:
     """Runs below a folder, in the order of their start."""
 
     runs: tuple[Entry, ...]
-    unread: tuple[str, ...]
-    """One line for each run that has not ended or failed before its first sample, and each file that is no verdict."""
+    unended: tuple[str, ...] = ()
+    """One line for each run that has not ended, or failed before its first sample."""
+    unread: tuple[str, ...] = ()
+    """One line for each file that is no verdict."""
 
     def count(self, outcome: str) -> int:
         """Number of runs with an outcome."""
@@ -87,28 +96,36 @@ def find_session(folder: Path, page: Path) -> RunList:
     if not folder.is_dir():
         raise ConfigurationError(f"{folder}: no such folder")
     runs: list[Entry] = []
+    unended: list[str] = []
     unread: list[str] = []
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(each for each in folders if not each.endswith(".previous"))  # of earlier commands
         if VERDICT_FILE not in files:
             continue
-        if len(runs) + len(unread) == MOST_RUNS:
+        if len(runs) + len(unended) + len(unread) == MOST_RUNS:
             raise ConfigurationError(f"{folder}: more than {MOST_RUNS:,} runs: name a folder within it")
         try:
             entry = _read(Path(parent), folder, page.parent)
+        except _NoResultError as error:
+            unended.append(str(error))
         except (ConfigurationError, RecordingError) as error:
             unread.append(str(error))
         else:
             runs += [entry] if entry else []
-    if not runs and not unread:
+    if not (runs or unended or unread):
         raise ConfigurationError(f"{folder}: holds no run: no {VERDICT_FILE} of analogrig run, replay or judge")
-    return RunList(tuple(sorted(runs, key=lambda run: (run.started, run.folder))), tuple(unread))
+    return RunList(tuple(sorted(runs, key=lambda run: (run.started, run.folder))), tuple(unended), tuple(unread))
+
+
+class _NoResultError(RecordingError):
+    """The verdict is that of a run without results."""
 
 
 def _read(parent: Path, folder: Path, start: Path) -> Entry | None:
     """Run in ``parent``; None if its verdict is that of another command, such as ``thesis``.
 
-    :raises ConfigurationError: the verdict cannot be read, is none, or is that of a run without results.
+    :raises ConfigurationError: the verdict cannot be read, or is none.
+    :raises _NoResultError: the run has no results.
     """
     path = parent / VERDICT_FILE
     try:
@@ -117,13 +134,13 @@ def _read(parent: Path, folder: Path, start: Path) -> Entry | None:
             raise ConfigurationError(f"{path}: not a verdict of this version: run analogrig judge again")
         if "scenario" not in table:
             if table["outcome"] == "inconclusive":
-                raise ConfigurationError(f"{path}: inconclusive: {', '.join(map(str, table['reasons']))}")
+                raise _NoResultError(f"{path}: inconclusive: {', '.join(map(str, table['reasons']))}")
             return None
         return _entry(table, parent, folder, start)
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror or error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError, ArithmeticError) as error:
-        raise ConfigurationError(f"{path}: not a verdict of analogrig: {type(error).__name__}") from error
+        raise ConfigurationError(f"{path}: not a verdict of analogrig: run the command again, or remove it") from error
 
 
 def _entry(table: Mapping[str, Any], parent: Path, folder: Path, start: Path) -> Entry:
@@ -145,14 +162,10 @@ def _entry(table: Mapping[str, Any], parent: Path, folder: Path, start: Path) ->
         false_alarms=len(table["false_alarms"]),
         ratio=latency / bound if exact else None,
         started=str(by.get("started", "")),
-        build=_build(by),
+        build=next((str(each["sha256"])[:8] for each in by.get("devices", []) if each.get("sha256")), ""),
+        commit=str(by.get("commit") or "")[:12],
         page=os.path.relpath(parent / REPORT_FILE, start) if (parent / REPORT_FILE).is_file() else "",
     )
-
-
-def _build(recorded_by: Mapping[str, Any]) -> str:
-    files = [str(each["sha256"]) for each in recorded_by.get("devices", []) if each.get("sha256")]
-    return files[0][:8] if files else str(recorded_by.get("commit") or "")[:12]
 
 
 def write_session(session: RunList, path: Path) -> None:
@@ -166,14 +179,15 @@ def write_session(session: RunList, path: Path) -> None:
 
 def render(session: RunList) -> str:
     """The page as text."""
-    counts = ", ".join(f"{session.count(outcome)} {outcome}" for outcome in _SIGNS)
-    worst = next((outcome for outcome in ("failed", "inconclusive") if session.count(outcome)), "passed")
-    worst = "inconclusive" if worst == "passed" and session.unread else worst
-    unread = "".join(f"<li>{text(line)}</li>" for line in session.unread)
+    shown = [outcome for outcome in _SIGNS if outcome != "unjudged" or session.count(outcome)]
+    counts = ", ".join(f"{session.count(outcome)} {outcome}" for outcome in shown)
+    worst = next((outcome for outcome in ("failed", "inconclusive", "unjudged") if session.count(outcome)), "passed")
+    lines = (*session.unended, *session.unread)
+    worst = "inconclusive" if worst == "passed" and lines else worst
+    unread = "".join(f"<li>{text(line)}</li>" for line in lines)
     return assemble_page(
         FOLDER / "session.html",
-        (FOLDER / "page.css",),
-        (),
+        (TABLES,),
         title=text(f"{number_of(len(session.runs), 'run')}: {counts}"),
         outcome=worst,
         heading=text(number_of(len(session.runs), "run")),
@@ -186,16 +200,17 @@ def render(session: RunList) -> str:
 
 def _table(runs: Sequence[Entry]) -> str:
     head = heading(
-        ("Started", "Outcome", "Run", "Scenario", "Rig", "Device", "Build"),
+        ("Started", "Outcome", "Run", "Scenario", "Rig", "Device", "Build", "Commit"),
         ("Seed", "Samples", "Changes", "Missed", "False alarms", "Latency / bound"),
     )
-    return table("In the order of their start; latency over bound of all detected changes", head, map(_row, runs))
+    caption = "In the order of their start; latency over bound of all detected changes"
+    return table(caption, head, map(_row, runs), SORTABLE, MOST_RUNS)
 
 
 def _row(run: Entry) -> str:
     name = text(run.folder if run.folder != "." else "here")
     link = f'<a href="{text(quote(run.page))}">{name}</a>' if run.page else name
-    words = [run.scenario, run.rig, run.device, run.build]
+    places = [run.scenario, run.rig, run.device, run.build, run.commit]
     numbers = [run.seed, run.samples, run.changes, run.missed, run.false_alarms]
     outcome = cell(f"{_SIGNS[run.outcome]} {run.outcome}", f"text {_STYLES[run.outcome]}")
     return row(
@@ -203,7 +218,7 @@ def _row(run: Entry) -> str:
             cell(run.started[:19].replace("T", " "), "date"),
             outcome,
             f'<th scope="row">{link}</th>',
-            *map(cell, words),
+            *map(cell, places),
             *(number(value, ",d") for value in numbers),
             number(run.ratio, ".2f"),
         ]
@@ -221,57 +236,52 @@ def _trends(runs: Sequence[Entry]) -> str:
 
 
 def _trend(kind: tuple[str, str, str], runs: Sequence[Entry]) -> str:
-    """Plot of the delay in bounds over the runs, in the order of their start; ticks where the build changes."""
-    most = 1.1 * max([run.ratio for run in runs if run.ratio is not None], default=1.0)
-    most = max(most, 1.1)
+    """Plot of the delay in bounds over the runs, in the order of their start; ticks where build or commit change."""
+    most = 1.1 * max([1.0, *(run.ratio for run in runs if run.ratio is not None)])
     step = (_WIDTH - _LEFT - 20) / max(1, len(runs) - 1)
     places = [(run, _LEFT + i * step, _TOP + _HEIGHT * (1.0 - (run.ratio or 0.0) / most)) for i, run in enumerate(runs)]
-    parts = [_level(value, most) for value in _levels(most)]
-    free, build = -math.inf, ""
+    parts = [words(_LEFT, 12, "latency / bound", "start", is_faint=True)]
+    parts += [_level(value, most) for value in levels(most)]
+    free, made_by = -math.inf, ("", "")
     for run, x, _ in places:
-        if run.build != build and x >= free:
-            parts.append(_words(x, _TOP + _HEIGHT + 16, run.build or "unknown", "start"))
-            parts.append(f'<path d="M{x:.1f} {_TOP}v{_HEIGHT}" stroke="currentColor" stroke-opacity=".2"/>')
-            free = x + 80
-        build = run.build
+        if (run.build, run.commit) != made_by and x >= free:
+            parts.append(words(x, _TOP + _HEIGHT + 16, run.build or "–", "start"))
+            parts.append(words(x, _TOP + _HEIGHT + 32, run.commit or "–", "start"))
+            parts.append(f'<path d="M{x:.1f} {_TOP}v{_HEIGHT}" stroke="var(--line)"/>')
+            free = x + 110
+        made_by = run.build, run.commit
     line = " ".join(f"{x:.1f},{y:.1f}" for run, x, y in places if run.ratio is not None)
-    parts.append(f'<polyline points="{line}" fill="none" stroke="currentColor" stroke-opacity=".5"/>')
+    parts.append(f'<polyline points="{line}" fill="none" stroke="var(--muted)"/>')
     parts += [_point(run, x, y) for run, x, y in places]
-    parts.append(_words(_LEFT, _TOP + _HEIGHT + 34, "build of the device, in the order of the runs", "start"))
-    caption = f"{kind[0]} on {kind[1]}, device {kind[2]}: latency / bound"
-    return (
-        f'<figure><figcaption>{text(caption)}</figcaption><div class="scroll">'
-        f'<svg role="img" aria-label="{text(caption)}; the numbers are in the table below"'
-        f' width="{_WIDTH}" height="{_TOP + _HEIGHT + _BELOW}" font-size="12">{"".join(parts)}</svg></div></figure>'
+    below = "build of the device and commit of analogrig, in the order of the runs"
+    parts.append(words(_LEFT, _TOP + _HEIGHT + 52, below, "start", is_faint=True))
+    caption = f"{kind[0]} on {kind[1]}, device {kind[2]}"
+    has_links = any(run.page for run in runs)
+    return figure(
+        caption, f"{caption}: latency over bound", _WIDTH, _TOP + _HEIGHT + _BELOW, parts, has_links=has_links
     )
-
-
-def _levels(most: float) -> list[float]:
-    """Round values from 0 to ``most`` for the axis."""
-    step = 10.0 ** math.floor(math.log10(most))
-    step *= next(factor for factor in (0.2, 0.5, 1.0, 2.0) if most / (factor * step) <= 6.0)
-    return [i * step for i in range(int(most / step) + 1)]
 
 
 def _level(value: float, most: float) -> str:
     y = _TOP + _HEIGHT * (1.0 - value / most)
-    line = f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - 10}" stroke="currentColor" stroke-opacity=".2"/>'
-    return line + _words(_LEFT - 8, y + 4, f"{value:g}", "end")
+    line = f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - 10}" stroke="var(--line)"/>'
+    return line + words(_LEFT - 8, y + 4, f"{value:g}", "end")
 
 
 def _point(run: Entry, x: float, y: float) -> str:
-    """Mark of a run: a disc, and a cross or a ring around it where it did not pass."""
+    """Mark of a run, which leads to its page: a disc if it passed, a cross if it failed, else a ring."""
     colour = _COLOURS[run.outcome]
+    ring = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="none" stroke="{colour}" stroke-width="2"/>'
     shapes = {
         "passed": f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>',
         "failed": f'<path d="M{x - 5:.1f} {y - 5:.1f}l10 10m0 -10l-10 10" stroke="{colour}" stroke-width="3"/>',
-        "inconclusive": f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="none" stroke="{colour}" stroke-width="2"/>',
+        "inconclusive": ring,
+        "unjudged": ring,
     }
     ratio = "no change detected" if run.ratio is None else f"{run.ratio:.2f} bounds"
     alarms = number_of(run.false_alarms, "false alarm")
     title = f"{run.folder}, seed {run.seed}: {run.outcome}, {ratio}, {run.missed} missed, {alarms}"
-    return f"<g>{shapes[run.outcome]}<title>{text(title)}</title></g>"
-
-
-def _words(x: float, y: float, words: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="currentColor">{text(words)}</text>'
+    mark = f"{shapes[run.outcome]}<title>{text(title)}</title>"
+    if not run.page:
+        return f"<g>{mark}</g>"
+    return f'<a href="{text(quote(run.page))}" aria-label="{text(title)}">{mark}</a>'

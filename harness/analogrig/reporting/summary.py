@@ -17,6 +17,7 @@ from analogrig.judging.verdict import (
 )
 from analogrig.program import Program
 from analogrig.protocol.bus_load import BusLoad, load_of
+from analogrig.reporting import measured
 from analogrig.run import Run
 from analogrig.wording import counter_text, number_of
 
@@ -43,8 +44,9 @@ def summary(run: Run, verdict: Verdict) -> str:
             *(_diagnosis_line(*each, width) for each in diagnoses),
         ]
     load = load_of(run)
+    raised = verdict.false_alarms if verdict.knows_truth else run.alarm_index.tolist()
     facts = {
-        "false alarms": f"{_alarms(verdict.false_alarms)} in {number_of(run.samples, 'sample')}",
+        "false alarms" if verdict.knows_truth else "alarms": f"{_alarms(raised)} in {number_of(run.samples, 'sample')}",
         "false or not, depending on the instants of the changes": verdict.doubtful_alarms
         and f"alarms at {', '.join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))}",
         "faults of channels": verdict.channel_faults and channel_faults_text(verdict.channel_faults),
@@ -55,7 +57,9 @@ def summary(run: Run, verdict: Verdict) -> str:
         "bus": load and load_text(load),
     }
     lines += ["", *(f"  {name}: {text}" for name, text in facts.items() if text)]
-    if ESTIMATES not in verdict.not_judged:
+    if not verdict.knows_truth:
+        lines += ["", *measured.lines(run)]
+    elif ESTIMATES not in verdict.not_judged:
         lines += ["", _estimates_head(conditions.program)]
         lines += [_segment_line(segment) for segment in verdict.estimates]
     digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"

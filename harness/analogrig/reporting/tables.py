@@ -35,12 +35,13 @@ _MAX_MISFITS = 20
 _MAX_CHANNEL_FAULTS = 20
 """Rows in the table of faults of the channels."""
 
-_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
+_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?", "unjudged": "–"}
 
 _SENTENCES = {
     "passed": "The device met the expectations of the scenario.",
     "failed": "The device did not meet the expectations of the scenario.",
     "inconclusive": "This run is not valid. The figures below prove nothing about the device.",
+    "unjudged": "Nothing is known of the plant: no figure below is a verdict on the device.",
 }
 
 _NO_DIAGNOSES = "<p>Not judged: the device does not report diagnoses.</p>"
@@ -102,6 +103,8 @@ def provenance(identity: Identity | None) -> list[tuple[str, str]]:
 
 def tweaks(run: Run, verdict: Verdict) -> str:
     """Table of the changes of the plant, with latency, bound and result."""
+    if not verdict.knows_truth:
+        return "<p>Not judged: nothing is known of the plant.</p>"
     if not verdict.tweaks:
         return "<p>The plant did not change in this run.</p>"
     assumed = f"the bound is of first order, for one false alarm in {verdict.arl0:,.0f} samples"
@@ -141,6 +144,8 @@ def channel_faults(run: Run, verdict: Verdict) -> str:
 def false_alarms(run: Run, verdict: Verdict) -> str:
     """Table of the false alarms."""
     count = len(verdict.false_alarms)
+    if not verdict.knows_truth:
+        return f"<p>Not judged: {number_of(len(run.alarm_index), 'alarm', form=',')}, each false or not.</p>"
     if not count and verdict.doubtful_alarms:
         at = ", ".join(map(str, verdict.doubtful_alarms[:_MAX_FALSE_ALARMS]))
         return f"<p>None for certain. Depending on the instants of the changes, the alarms at {at} are false.</p>"

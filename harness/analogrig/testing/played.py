@@ -40,7 +40,7 @@ def _statement(
         if played.verdict.valid:
             finding = judge(played, *args, **kwargs)
         else:
-            finding = Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}")
+            finding = Finding(holds=False, why=f"{played.verdict.outcome.upper()}: {played.verdict.reasons[0]}")
         statement = statement_of(judge_and_note, played, *args, **kwargs)
         finding = dataclasses.replace(finding, statement=statement, run=played.run)
         played.note(finding)
@@ -54,8 +54,8 @@ def _statement(
 class Played:
     """One play of a scenario, its verdict, and statements about it, each of which returns a Finding.
 
-    No statement holds for a play that is INCONCLUSIVE. ``hil_play`` fails the test instead of returning such a play,
-    unless called with ``allow_inconclusive=True``. ValueError: a limit of a statement is not finite.
+    No statement holds for a play that is INCONCLUSIVE or UNJUDGED. ``hil_play`` fails the test instead of returning
+    such a play, unless called with ``allow_inconclusive=True``. ValueError: a limit of a statement is not finite.
     """
 
     run: Run
