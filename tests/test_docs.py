@@ -110,6 +110,7 @@ def test_every_toml_file_of_a_page_is_accepted(page: Path, tmp_path: Path) -> No
             describe(str(path))
         elif "equations" in table:
             load_program(path)
+            path.rename(tmp_path / f"{table['name']}.toml")  # for the scenarios of the page
         elif "input" in table:
             config.build(ImportDescription, table, "example")
         elif "trials" in table:

@@ -23,7 +23,7 @@ from analogrig.links.wire import Clock
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Conditions, Run
+from analogrig.run import Conditions, Run
 from analogrig.scenario import Scenario
 
 Progress = Callable[[int, int], None]
@@ -45,10 +45,10 @@ class RunBuilder:
     The arrays are allocated for all samples asked. The operating system provides only the pages that are written.
     """
 
-    def __init__(self, samples_asked: int, sheet: Datasheet) -> None:
+    def __init__(self, samples_asked: int, channels: int, sheet: Datasheet) -> None:
         n = samples_asked
-        self._codes = np.empty((n, len(CHANNELS)), np.uint16)
-        self._clipped = np.empty((n, len(CHANNELS)), np.bool_)
+        self._codes = np.empty((n, channels), np.uint16)
+        self._clipped = np.empty((n, channels), np.bool_)
         self._theta = np.empty((n, sheet.theta_n), np.float32)
         self._innovation = np.empty(n, np.float32) if sheet.innovation else np.zeros(n, np.float32)
         self._statistic = np.empty(n, np.float32) if sheet.statistic else np.zeros(n, np.float32)
@@ -194,11 +194,11 @@ class Bench:
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._pace_blocks(performance)
-        self.dut.prepare(performance.channels, performance.sample_period_s)
+        self.dut.prepare(performance.of_device, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
-        builder = self._builder(scenario.samples, self.dut.datasheet)
-        faults = (*scenario.caveats, *self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
+        builder = self._builder(scenario.samples, len(scenario.program.channels), self.dut.datasheet)
+        faults = tuple(self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
         conditions = self._final_conditions(initial, performance.hindsight(), faults, builder)
         return builder.build(conditions)
 
@@ -219,6 +219,7 @@ class Bench:
             link=self.dut.link_name,
             line=self.dut.line,
             real_time=self._real_time or 0.0,
+            program=scenario.program,
         )
 
     def _collect_samples(

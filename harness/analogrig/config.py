@@ -219,6 +219,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     """``table`` as an instance of the dataclass ``cls``; ``where`` (file and table) leads every error.
 
     Field types may be bool, int, float, str, Literal, a dataclass, Mapping[str, X], tuple[X, ...], and unions of these.
+    The value of a dataclass may be an instance of it.
 
     :raises ConfigurationError: unknown or lacking key, wrong type, or a value that ``cls`` refuses by ValueError.
     """
@@ -257,7 +258,8 @@ def convert(hint: Any, value: Any, where: str) -> Any:
             return value
         raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_quote(value)}")
     if dataclasses.is_dataclass(hint):
-        return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
+        cls = typing.cast(Any, hint)
+        return value if isinstance(value, cls) else build(cls, _expect(dict, value, "a table", where), where)
     if origin is tuple:
         return _convert_tuple(arguments, value, where)
     if origin in (Mapping, dict):

@@ -39,6 +39,7 @@ from . import (
     bench_silverbox,
     bench_statistics,
     bench_trials,
+    bench_two_mass,
     pages,
 )
 from .figure import Figure
@@ -55,6 +56,7 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "isolation": bench_isolation.figures,
     "fit": bench_fit.figures,
     "trials": bench_trials.figures,
+    "two-mass": bench_two_mass.figures,
     "certificates": bench_certificates.figures,
     "calibration": bench_calibration.figures,
     "campaign": bench_campaign.figures,

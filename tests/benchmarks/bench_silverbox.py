@@ -19,8 +19,8 @@ from analogrig.hardware.calibration.recorded import RecordedPlant, fit_program
 from analogrig.reporting.measured import Oscillation, mode_of
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.rigs.recording import RecordingRig
-from analogrig.run import CHANNELS, MEASURED, Run
-from analogrig_emulator import PatchedProgram, load_program
+from analogrig.run import Run
+from analogrig_emulator import CHANNELS, PatchedProgram, load_program
 from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.program_file import parse_program
 
@@ -98,12 +98,12 @@ def play(run: Run, device: str) -> Run:
 
 def batch(run: Run) -> Oscillation:
     """Resonance, damping and gain of y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k) + .. + b2 u(k-2) + d by least squares."""
-    u, y = (run.codes[:, CHANNELS.index(name)].astype(float) for name in MEASURED)
+    u, y = (run.codes[:, CHANNELS.index(name)].astype(float) for name in CHANNELS[:2])
     regressors = [-y[1:-1], -y[:-2], u[2:], u[1:-1], u[:-2], np.ones(len(y) - 2)]
     theta = np.linalg.lstsq(np.stack(regressors, axis=1), y[2:], rcond=None)[0]
     poles = np.roots([1.0, *theta[:2]]).astype(complex)
     rate = np.log(poles[0]) * RATE_HZ
-    scales = [run.conditions.channels[name].lsb for name in MEASURED]
+    scales = [run.conditions.channels[name].lsb for name in CHANNELS[:2]]
     gain = theta[2:5].sum() / (1.0 + theta[:2].sum()) * scales[1] / scales[0]
     return Oscillation(abs(rate) / (2.0 * np.pi), -rate.real / abs(rate), gain)
 

@@ -27,7 +27,6 @@ from .played import (
     CARD,
     DISPLACEMENT,
     FORCE,
-    PARAMETERS,
     Array,
     Change,
     Played,
@@ -99,8 +98,8 @@ class Emulated:
             sample_rate_hz=card.true_rate_hz * probes_per_sample(card),
         )
         if change is not None:
-            setting, value = list(machine.program.values.items())[PARAMETERS.index(change.parameter)]
-            turns = [*turns, PotTurn(change.sample, {setting: value * change.factor})]
+            (setting,) = machine.program.pots[change.parameter].settings
+            turns = [*turns, PotTurn(change.sample, {setting: machine.program.values[setting] * change.factor})]
         excitation = self.draw(Stream.EXCITATION.generator(seed), samples)
         jitter = Stream.APERTURE.generator(seed)
         (volts,) = acquired(machine, card, excitation, samples, turns, rng=jitter, block_samples=samples)

@@ -6,7 +6,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_campaign, bench_certificates, bench_detectors, bench_live, bench_reality, bench_silverbox
+from . import (
+    bench_campaign,
+    bench_certificates,
+    bench_detectors,
+    bench_live,
+    bench_reality,
+    bench_silverbox,
+    bench_two_mass,
+)
 
 FOLDER = Path("harness/docs/evidence")
 
@@ -20,6 +28,7 @@ TITLES: Mapping[str, str] = {
     "isolation": "Isolation",
     "fit": "Watch of the fit",
     "trials": "Closed-loop trials and certificates",
+    "two-mass": "Two-mass quarter car",
     "certificates": "Error probabilities of certificates",
     "calibration": "Calibration of drawn rigs",
     "campaign": "Campaigns of many trials",
@@ -42,6 +51,7 @@ NOTES: Mapping[str, str] = {
     "live": bench_live.NOTE,
     "reality": bench_reality.NOTE,
     "silverbox": bench_silverbox.NOTE,
+    "two-mass": bench_two_mass.NOTE,
 }
 """Paragraphs below the tables."""
 

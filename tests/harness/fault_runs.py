@@ -39,9 +39,9 @@ from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
 from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Channel, Run
+from analogrig.run import Channel, Run
 from analogrig.scenario import Scenario
-from analogrig_emulator import Excitation
+from analogrig_emulator import CHANNELS, Excitation
 from tests.harness.fed import Fed, fed
 
 N = 60

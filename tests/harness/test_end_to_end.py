@@ -21,11 +21,12 @@ import pytest
 from analogrig.cli import main
 from analogrig.config import locate
 from analogrig.devices.host import HOST_PROGRAM
-from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.firmware import CORES, needs_firmware
 from tests.harness.processes import LONG_S, descendants
 from tests.harness.runs import made_run
+
+from .plants import front
 
 ENVIRONMENT = {key: value for key, value in os.environ.items() if not key.startswith("ANALOGRIG_")}
 
@@ -386,7 +387,7 @@ def test_run_whose_output_nobody_hears_is_kept_and_judged(tmp_path: Path) -> Non
 
 
 def test_recording_without_a_sample_is_named(tmp_path: Path) -> None:
-    made_run(np.zeros(0), [(0, Plant(115.0, 3021.0, 24500.0))], samples_asked=10).save(tmp_path / "none.npz")
+    made_run(np.zeros(0), [(0, front(115.0, 3021.0, 24500.0))], samples_asked=10).save(tmp_path / "none.npz")
     assert "holds no samples" in refusal("replay", "none.npz", cwd=tmp_path)
 
 

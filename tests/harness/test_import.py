@@ -20,9 +20,10 @@ from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.recordings import column_reader, columns, imported
 from analogrig.recordings.columns import read_columns
 from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
-from analogrig.run import CHANNELS, Run
+from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
+from analogrig_emulator import CHANNELS
 
 RATE_HZ = 1000.0
 SAMPLES = 600

@@ -234,6 +234,14 @@ class AnalogComputer:
         if pot not in self._wipers.pots:
             raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._wipers.pots)) or 'none'}")
 
+    def operating(self, dials: Mapping[str, float]) -> PiecewiseLinear:
+        """State space of OPERATE with pots at these dials, windings left out; the others as they stand.
+
+        The machine does not change. Raises PotError and CircuitError.
+        """
+        settled = self._dials | dict(dials) | self._wipers.contacts_at_rest(dials)
+        return self._nodals[Mode.OPERATE].at(settled, self._closed)
+
     def throw(self, closed: Mapping[str, bool]) -> None:
         """Throw switches of the circuit, in any mode.
 

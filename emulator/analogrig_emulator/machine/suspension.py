@@ -21,11 +21,11 @@ from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_
 from analogrig_emulator.engine.system import Drive, Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
-from analogrig_emulator.machine.program import SOURCE, Program, Scales
+from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK
 from analogrig_emulator.machine.two_mass import TWO_MASS
 
-PROGRAMS: Mapping[str, Program] = MappingProxyType(
+PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType(
     {program.name: program for program in (FRONT, SHOCK, BUMP_STOP, TWO_MASS)}
 )
 """Programs by name."""
@@ -48,7 +48,7 @@ class SuspensionComputer:
 
     def __init__(
         self,
-        program: str | Program = "front",
+        program: str | ProgramCircuit = "front",
         *,
         opamp: str | OpAmpModel = "tl07x",
         components: Components = NOMINAL,
@@ -102,7 +102,7 @@ class SuspensionComputer:
         return {pot: self._pots[pot].coefficient(dial) for pot, dial in self.dials.items()}
 
     def set(self, ramp_n: int = 0, /, **settings: float) -> None:
-        """Set pots by value (front: M_kg, B_n_s_per_m, K_n_per_m) or by dial (M_dial, B_dial, K_dial, 0..1).
+        """Set pots by value (front: M, B, K) or by dial (M_dial, B_dial, K_dial, 0..1).
 
         Values set the coefficient under load, as in pot-set mode. A running machine keeps its voltages. With ramp_n
         the pots arrive so many samples after the last one taken.
@@ -115,6 +115,10 @@ class SuspensionComputer:
     def dials_for(self, **settings: float) -> dict[str, float]:
         """Dials to which set(**settings) turns the pots."""
         return self.machine.resting(self._resolve(settings, dict(self._values)))
+
+    def dials_between(self, settings: Mapping[str, float]) -> dict[str, float]:
+        """Dials for settings on continuous tracks, between windings. Raises PotError."""
+        return self._resolve(settings, dict(self._values))
 
     def plan(self, changes: Sequence[PotTurn], samples: int) -> list[PotTurn]:
         """Dials by pot that play(..., samples, changes) sets, in order of time. Raises PotError."""
@@ -278,19 +282,21 @@ class _LoadedPot:
 _LoadedPots: TypeAlias = dict[str, _LoadedPot]
 
 
-def _wired(program: Program, models: Sequence[OpAmpModel], components: Components) -> tuple[Circuit, _LoadedPots]:
+def _wired(
+    program: ProgramCircuit, models: Sequence[OpAmpModel], components: Components
+) -> tuple[Circuit, _LoadedPots]:
     """Circuit of a program with these op-amps and components, and its pots."""
     circuit = Circuit(components.fit(program.netlist(models)))
     return circuit, _pots(program, circuit, components)
 
 
 @functools.lru_cache(maxsize=8)
-def _nominal(program: Program, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
+def _nominal(program: ProgramCircuit, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
     """The same with perfect components. Equal machines share their circuit, and with it its equations."""
     return _wired(program, [model] * program.amplifiers, NOMINAL)
 
 
-def _pots(program: Program, circuit: Circuit, components: Components) -> _LoadedPots:
+def _pots(program: ProgramCircuit, circuit: Circuit, components: Components) -> _LoadedPots:
     loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
     tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
@@ -299,8 +305,8 @@ def _pots(program: Program, circuit: Circuit, components: Components) -> _Loaded
     }
 
 
-def _program(program: str | Program) -> Program:
-    if isinstance(program, Program):
+def _program(program: str | ProgramCircuit) -> ProgramCircuit:
+    if isinstance(program, ProgramCircuit):
         return program
     if program not in PROGRAMS:
         raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}")

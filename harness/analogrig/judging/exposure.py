@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import Datasheet
-from analogrig.run import CHANNELS, CHUNK_SAMPLES, LOST, UNARMED, Run
+from analogrig.run import CHUNK_SAMPLES, INPUT, LOST, UNARMED, Run
 from analogrig.wording import number_of
 
 EDGE_NOISES = 9.0
@@ -23,7 +23,6 @@ pairs."""
 
 _QUANTISATION_LSB = 12.0**-0.5
 
-_FORCE = CHANNELS.index("force")
 
 _NOT_PROCESSED = np.uint8(SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST)
 
@@ -81,14 +80,14 @@ class ObservedRecord:
 
 def exposure(run: Run) -> Exposure:
     """Exposure of a run: the sum over its records, each of which the device starts afresh."""
-    sheet, noise_lsb = run.datasheet, run.conditions.channels["force"].noise_lsb
+    sheet, noise_lsb = run.datasheet, run.conditions.input.noise_lsb
     are_finite = np.isfinite(run.innovation) & np.isfinite(run.statistic)
     for column in run.theta.T:
         are_finite &= np.isfinite(column)
     parts = [
         record_exposure(
             ObservedRecord(
-                run.codes[start:end, _FORCE],
+                run.codes[start:end, INPUT],
                 run.flags[start:end],
                 are_finite[start:end],
                 run.alarm_index[(run.alarm_index >= start) & (run.alarm_index < end)] - start,

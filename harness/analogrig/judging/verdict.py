@@ -25,8 +25,10 @@ from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
+from analogrig.judging.courses import first_at_level
 from analogrig.judging.exposure import Exposure, exposure
-from analogrig.plant import PARAMETERS, Segment, physical_parameters
+from analogrig.plant import Segment, estimated_parameters
+from analogrig.program import Program
 from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
@@ -46,8 +48,11 @@ Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not ju
 """Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
 instant, which is known only as an interval. ``not judged``: the change was not found in the samples."""
 
-ESTIMATES, STATISTIC, DIAGNOSES = "estimates of M, B, K", "the trigger's statistic", "diagnoses"
+ESTIMATES, STATISTIC, DIAGNOSES = "estimates of parameters", "the trigger's statistic", "diagnoses"
 """Quantities in ``Verdict.not_judged`` that reports show elsewhere."""
+
+BOUNDS = "delays"
+"""Quantity in ``Verdict.not_judged`` where no bound is known: every change then counts as detectable."""
 
 CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERAL)
 """Changes that are faults of a channel. Diagnosed where a parameter has changed, they are wrong."""
@@ -55,10 +60,8 @@ CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERA
 GAINS = frozenset({Change.FORCE_GAIN, Change.DISPLACEMENT_GAIN})
 """Faults of a channel that have an extent."""
 
-DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"} | {
-    fault: fault.name.lower().replace("_", " ") for fault in CHANNEL_FAULTS
-}
-"""Changes that a device can diagnose, with their names in verdicts, such as ``force offset``."""
+DIAGNOSABLE = {change: change.name.lower().replace("_", " ") for change in Change if change}
+"""Changes that a device can diagnose, with their names: ``mass``, ``several``, ``force offset``."""
 
 CURES: Mapping[str, str] = {
     "drift": "remove the mean of the displacement by a high-pass filter, or make the run shorter",
@@ -131,7 +134,7 @@ class DiagnosisVerdict:
     """Verdict on the first diagnosis after the detection of a change."""
 
     named: str
-    """Name in ``DIAGNOSABLE``: ``M``, ``B``, ``K``, ``several`` or a fault of a channel, such as ``force offset``."""
+    """Parameter of the program, or a name in ``DIAGNOSABLE``: ``several``, ``force offset``."""
     right: bool
     delay_n: int
     """Samples from the change to the diagnosis."""
@@ -160,6 +163,8 @@ class ChangeVerdict:
     """Information bound of this change; None: not detectable before the next change or the end."""
     deadline_n: int | None
     """Latest alarm that is not late; None: no alarm is late."""
+    is_bounded: bool = True
+    """False: the bound is unknown, and the change counts as detectable."""
     diagnosis: DiagnosisVerdict | None = None
     """None: the device reported no diagnosis."""
     alternatives: tuple[ChangeVerdict, ...] = ()
@@ -203,7 +208,7 @@ class ChangeVerdict:
     @property
     def missed(self) -> bool:
         """True if the change was detectable and raised no alarm."""
-        return self.latency_n is None and self.bound_n is not None
+        return self.latency_n is None and (self.bound_n is not None or not self.is_bounded)
 
     @property
     def late(self) -> bool:
@@ -222,17 +227,17 @@ def _result_at_instant(tweak: ChangeVerdict) -> Result:
 
 @dataclass(frozen=True)
 class SegmentEstimate:
-    """Last estimate of M, B, K in a segment of constant plant, samples ``start`` <= k < ``end``."""
+    """Last estimates of parameters in a segment of constant plant, samples ``start`` <= k < ``end``."""
 
     start: int
     end: int
     truth: Mapping[str, float]
     estimate: Mapping[str, float] | None
-    """None: the estimate describes no mass, damper and spring."""
+    """None: the estimate describes no plant of the program."""
 
     @property
     def error(self) -> Mapping[str, float]:
-        """Relative errors of M, B, K by name; empty without an estimate."""
+        """Relative errors by name; empty without an estimate."""
         if self.estimate is None:
             return {}
         return {name: self.estimate[name] / truth - 1.0 for name, truth in self.truth.items()}
@@ -323,7 +328,7 @@ def judge(run: Run) -> Verdict:
         missing_n=int(np.count_nonzero(run.missing)),
         theta_hash=run.theta_hash(),
         alarm_hash=run.alarm_hash(),
-        not_judged=unreported(sheet),
+        not_judged=not_judged(run),
         cannot_tell=sheet.cannot_tell,
         overloads=dict(run.conditions.overloads),
         fit=misfit_periods(run) if sheet.misfits else None,
@@ -369,6 +374,14 @@ def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
     return tuple(out)
 
 
+def not_judged(run: Run) -> tuple[str, ...]:
+    """Quantities that the device does not report, or that the program does not relate to its parameters."""
+    program = run.conditions.program
+    stated = {ESTIMATES: program.estimates, DIAGNOSES: _diagnosed(program), BOUNDS: information.is_bounded(run)}
+    unstated = (name for name, is_stated in stated.items() if not is_stated)
+    return tuple(dict.fromkeys((*unreported(run.datasheet), *unstated)))
+
+
 def unreported(sheet: Datasheet) -> tuple[str, ...]:
     """Quantities that the device does not report."""
     reported = {
@@ -380,18 +393,27 @@ def unreported(sheet: Datasheet) -> tuple[str, ...]:
     return tuple(name for name, is_reported in reported.items() if not is_reported)
 
 
+def _diagnosed(program: Program) -> dict[str, str]:
+    """Parameters by the name that diagnoses give them."""
+    return {row.diagnosis: name for name, row in program.parameters.items() if row.diagnosis}
+
+
 def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
-    """Estimated M, B, K after each of ``samples``, (n, 3) float64; NaN if theta does not describe them."""
-    channels, model = run.conditions.channels, run.datasheet.model
+    """Estimated parameters after each of ``samples``, (n, m) float64; NaN if theta does not describe them.
+
+    The columns are those of ``Program.estimates``.
+    """
+    conditions, model = run.conditions, run.datasheet.model
     theta = run.theta[samples]
     if model is None or not theta.shape[1]:
-        return np.full((len(theta), len(PARAMETERS)), np.nan)
-    return physical_parameters(
+        return np.full((len(theta), len(conditions.program.estimates)), np.nan)
+    return estimated_parameters(
+        conditions.program,
         theta,
         model,
-        n_per_code=channels["force"].lsb,
-        m_per_code=channels["displacement"].lsb,
-        period_s=run.conditions.sample_period_problem_s,
+        input_per_code=conditions.input.lsb,
+        output_per_code=conditions.output.lsb,
+        period_s=conditions.sample_period_problem_s,
     )
 
 
@@ -520,7 +542,9 @@ def _attribute_alarms(
     by_start = {segment.start: segment for segment in run.conditions.segments}
     detected: set[int] = set()
     tweaks = []
-    isolation_bounds = information.isolation_bounds(run) if len(run.diagnosis_index) else [None] * len(run.segments)
+    diagnosed, is_bounded = _diagnosed(run.conditions.program), information.is_bounded(run)
+    isolates = len(run.diagnosis_index) and diagnosed
+    isolation_bounds = information.isolation_bounds(run) if isolates else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
         run.segments, run.segments[1:], information.change_information(run), isolation_bounds, strict=False
     ):
@@ -531,7 +555,7 @@ def _attribute_alarms(
         detection = in_segment[0] if in_segment else None
         detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
-        late = information.first_at_level(gathered, expect.late_information_ratio * level)
+        late = first_at_level(gathered, expect.late_information_ratio * level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -540,10 +564,11 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=information.first_at_level(gathered, level),
+                bound_n=first_at_level(gathered, level),
+                is_bounded=is_bounded,
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
-                if detection is None
+                if detection is None or not diagnosed
                 else _judge_diagnosis(run, start, (detection, end), changed, isolation_bound_n),
             )
         )
@@ -558,9 +583,10 @@ def _judge_diagnosis(
     if not len(reported):
         return None
     first = reported[0]
-    named = DIAGNOSABLE[Change(run.diagnosis_change[first])]
+    diagnosis, parameters = DIAGNOSABLE[Change(run.diagnosis_change[first])], _diagnosed(run.conditions.program)
+    named = parameters.get(diagnosis, diagnosis)
     ratio = float(run.diagnosis_extent[first])
-    extent = ratio if named in PARAMETERS and math.isfinite(ratio) else None
+    extent = ratio if diagnosis in parameters and math.isfinite(ratio) else None
     right = (named,) == tuple(changed) or (named == "several" and len(changed) > 1)
     error = extent * changed[named][0] / changed[named][1] - 1.0 if right and extent is not None else None
     return DiagnosisVerdict(
@@ -643,9 +669,10 @@ def _segment_estimates(run: Run) -> tuple[SegmentEstimate, ...]:
     """Last estimate of each segment whose plant is known."""
     unseen = {segment.start for segment in run.conditions.segments if segment.unseen}
     segments = [segment for segment in run.segments if segment[0] not in unseen]
-    lasts = trajectory(run, [end - 1 for _, end, _ in segments])
+    lasts, names = trajectory(run, [end - 1 for _, end, _ in segments]), run.conditions.program.estimates
     out = []
     for (start, end, plant), last in zip(segments, lasts, strict=True):
-        estimate = None if np.isnan(last).any() else dict(zip(PARAMETERS, last.tolist(), strict=True))
-        out.append(SegmentEstimate(start, end, plant.parameters(), estimate))
+        estimate = None if np.isnan(last).any() or not names else dict(zip(names, last.tolist(), strict=True))
+        truth = plant.parameters()
+        out.append(SegmentEstimate(start, end, {name: truth[name] for name in names}, estimate))
     return tuple(out)

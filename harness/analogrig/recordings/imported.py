@@ -15,10 +15,10 @@ from analogrig import config
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import MAX_SAMPLES, Segment
 from analogrig.recordings.columns import ColumnFile, read_columns
-from analogrig.run import CHANNELS, MEASURED, Channel, Conditions, Run
+from analogrig.run import Channel, Conditions, Run
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
-from analogrig_emulator import Excitation
+from analogrig_emulator import CHANNELS, Excitation
 
 if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
@@ -128,7 +128,7 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
     codes, clipped = np.zeros((samples, len(CHANNELS)), np.uint16), np.ones((samples, len(CHANNELS)), np.bool_)
     channels = {}
-    for name, each in zip(MEASURED, (described.input, described.output), strict=True):
+    for name, each in zip(CHANNELS, (described.input, described.output), strict=False):
         at = CHANNELS.index(name)
         values = columns[each.column] * each.scale + each.offset
         channels[name] = _channel(path, each, described.bits, values)

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from analogrig.datasheet import ModelOrders
 from analogrig.reporting.markup import heading, number, row, table, text
-from analogrig.run import CHANNELS, MEASURED, Run
+from analogrig.run import INPUT, OUTPUT, Run
 from analogrig.wording import number_of
-
-_INPUT, _OUTPUT = (CHANNELS.index(name) for name in MEASURED)
 
 _MOST_ROWS = 20
 _SETTLING_N = 50
@@ -78,7 +76,7 @@ def mode_of(run: Run, theta: NDArray[np.float32]) -> Oscillation | None:
     if not (np.isfinite(slow).all() and (slow.real < 0).all() and squared > 0):
         return None
     rate = math.sqrt(squared)
-    scales = [run.conditions.channels[name].lsb for name in MEASURED]
+    scales = [run.conditions.channels[name].lsb for name in run.conditions.program.measured]
     gain = numerator.sum() / denominator.sum() * scales[1] / scales[0]
     return Oscillation(rate / (2.0 * math.pi), float(-(slow[0] + slow[1]).real / (2.0 * rate)), float(gain))
 
@@ -101,7 +99,7 @@ def fits(run: Run) -> tuple[StretchFit, ...]:
 def _fit(run: Run, start: int, end: int) -> StretchFit:
     first = start + (end - start) // 2  # the estimate converges in the first half
     theta = run.theta[end - 1]
-    y = run.codes[first:end, _OUTPUT].astype(np.float64)
+    y = run.codes[first:end, OUTPUT].astype(np.float64)
     errors = run.innovation[first:end].astype(np.float64)
     spread = float(y.std()) or 1.0
     simulated = _simulate(run, theta, first, end)
@@ -129,7 +127,7 @@ def _simulate(run: Run, theta: NDArray[np.float32], first: int, end: int) -> NDA
     denominator, numerator = _polynomials(theta, model)
     if (np.abs(np.roots(denominator)) >= 1.0).any():
         return None
-    u, y = (run.codes[first:end, at].astype(np.float64) for at in (_INPUT, _OUTPUT))
+    u, y = (run.codes[first:end, at].astype(np.float64) for at in (INPUT, OUTPUT))
     offset = float(theta[-1]) if model.offset else 0.0
     level = (offset + numerator.sum() * u[0]) / denominator.sum()
     state = lfiltic(numerator, denominator, np.full(model.na, y[0] - level), np.zeros(len(numerator)))
@@ -199,7 +197,7 @@ def _fit_row(fit: StretchFit) -> str:
 
 
 def _gain_unit(run: Run) -> str:
-    units = [run.conditions.channels[name].unit for name in MEASURED]
+    units = [run.conditions.channels[name].unit for name in run.conditions.program.measured]
     return f"{units[1]}/{units[0]}"
 
 
@@ -223,7 +221,7 @@ def spectrum(run: Run) -> Spectrum | None:
     """Spectra of input and output by Welch's method; None if the run is too short."""
     from scipy import signal
 
-    values = [run.channel(name) for name in MEASURED]
+    values = [run.channel(name) for name in run.conditions.program.measured]
     length = min(_SEGMENT_N, 1 << (run.samples // 2).bit_length() - 1) if run.samples >= 4 else 0
     if length < 32:
         return None
@@ -242,7 +240,7 @@ def _model_response(run: Run, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
         return None
     denominator, numerator = _polynomials(run.theta[-1], model)
     delay = np.exp(-2j * np.pi * frequency_hz * run.conditions.sample_period_s)
-    scales = [run.conditions.channels[name].lsb for name in MEASURED]
+    scales = [run.conditions.channels[name].lsb for name in run.conditions.program.measured]
     value = np.polynomial.polynomial.polyval(delay, numerator) / np.polynomial.polynomial.polyval(delay, denominator)
     return np.asarray(np.abs(value) * scales[1] / scales[0])
 
@@ -251,7 +249,7 @@ def _spectrum(run: Run) -> str:
     found = spectrum(run)
     if found is None:
         return "<p>The run is too short for a spectrum.</p>"
-    units = [run.conditions.channels[name].unit for name in MEASURED]
+    units = [run.conditions.channels[name].unit for name in run.conditions.program.measured]
     densities = {
         f"input [dB of {units[0]}²/Hz]": (_decibels(found.input_density, 10.0), "line"),
         f"output [dB of {units[1]}²/Hz]": (_decibels(found.output_density, 10.0), "dashed"),

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.verdict import ChangeVerdict, Verdict, trajectory
-from analogrig.plant import PARAMETERS, Plant
-from analogrig.run import CHANNELS, CHUNK_SAMPLES, Run, missing_samples
+from analogrig.plant import Plant
+from analogrig.run import CHUNK_SAMPLES, Run, missing_samples
 
 MOST_POINTS = 100_000
 """Longest run that is shown sample by sample."""
@@ -133,8 +133,11 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
     shown = _pieces(run, verdict)
     values = _signals(run, shown)
     detections, false = _alarms(run, verdict)
+    program = run.conditions.program
     return {
         "samples": run.samples,
+        "channels": [name for name in program.channels if name in run.conditions.channels],
+        "estimates": [{"name": name, "unit": program.unit(name)} for name in program.estimates if name in values],
         "points": sum(piece.points for piece in shown),
         "pieces": shown,
         "columns": [{"name": name, "type": each.dtype.name, **_units(run, name)} for name, each in values.items()],
@@ -217,7 +220,7 @@ def _direction(tweak: ChangeVerdict) -> str:
 
 def _signals(run: Run, shown: Sequence[Piece]) -> dict[str, NDArray[Any]]:
     """Signals by name: (p,) uint8, uint16 or float32, of the points of the plot."""
-    measured = [i for i, name in enumerate(CHANNELS) if name in run.conditions.channels]
+    measured = [i for i, name in enumerate(run.conditions.program.channels) if name in run.conditions.channels]
     none = _points(run, slice(0), 1, measured)
     parts = [none, *(_points(run, part, piece.size, measured) for piece in shown for part in piece.parts())]
     return {name: np.concatenate([part[name] for part in parts]) for name in none}
@@ -239,7 +242,7 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
     if run.datasheet.statistic:
         reported["statistic"] = condense(run.statistic[part], size)
     return {
-        **{CHANNELS[channel]: shown[:, i] for i, channel in enumerate(measured)},
+        **{run.conditions.program.channels[channel]: shown[:, i] for i, channel in enumerate(measured)},
         "clipped": bits,
         "missing": np.repeat(condense(missing, size)[1::2], 2) if size > 1 else missing,
         **reported,
@@ -247,10 +250,10 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
 
 
 def _estimates(run: Run, part: slice) -> tuple[Sequence[str], NDArray[np.float64]]:
-    """Names and values (n, 3) of the estimates: M, B, K; of an unknown plant its resonance, damping and gain."""
+    """Names and values (n, m) of the estimates; of an unknown plant its resonance, damping and gain."""
     found = trajectory(run, part)
     if run.conditions.segments:
-        return PARAMETERS, found
+        return run.conditions.program.estimates, found
     with np.errstate(all="ignore"):
         mass, damping, stiffness = found.T
         resonance_hz = np.sqrt(stiffness / mass) / (2.0 * np.pi) * run.conditions.time_scale

@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.emulator import ComputerDescription
-from analogrig.run import CHANNELS, MEASURED, Run
-from analogrig_emulator import MULTIPLIER_GRADES, EngineError, PatchedProgram, RecordedExcitation, SuspensionComputer
+from analogrig.run import Run
+from analogrig_emulator import (
+    CHANNELS,
+    MULTIPLIER_GRADES,
+    EngineError,
+    PatchedProgram,
+    RecordedExcitation,
+    SuspensionComputer,
+)
 
 SETTLING_N = 200
 """Samples at the beginning of a span that are played and not compared, by default: the machine starts from rest."""
@@ -94,7 +101,7 @@ class RecordedPlant:
             raise ConfigurationError(f"program {program.name}: a twin needs one input, and an output on a channel")
         self.program, self.run = program, run
         self.input, self.output = next(iter(equations.inputs)), outputs[0]
-        for name, quantity in zip(MEASURED, (self.input, self.output), strict=True):
+        for name, quantity in zip(CHANNELS, (self.input, self.output), strict=False):
             unit, measured = equations.quantities[quantity].unit, run.conditions.channels[name].unit
             if unit is not None and unit.text != measured:
                 raise ConfigurationError(
@@ -127,7 +134,7 @@ class RecordedPlant:
             )
         rows = slice(first, end)
         (u, u_clipped), (y, y_clipped) = (
-            (self.run.channel(name)[rows], self.run.clipped[rows, CHANNELS.index(name)]) for name in MEASURED
+            (self.run.channel(name)[rows], self.run.clipped[rows, CHANNELS.index(name)]) for name in CHANNELS[:2]
         )
         if u_clipped.any():
             lacking = first + int(u_clipped.argmax())
