@@ -52,7 +52,7 @@ from analogrig_emulator.errors import (
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
 from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
-from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
+from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension, Supply
 from analogrig_emulator.machine.program import (
     CHANNELS,
     SOURCE,
@@ -143,6 +143,7 @@ __all__ = [
     "SamplerError",
     "Scale",
     "Scales",
+    "Supply",
     "SuspensionComputer",
     "SuspensionParts",
     "SuspensionProgram",

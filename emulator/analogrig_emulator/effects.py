@@ -8,19 +8,21 @@ changes of the thesis. The shock absorber plays the same in proportion, without 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.card.acquisition import acquired, probes_per_sample
+from analogrig_emulator.card.acquisition import Playable, acquired, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.components import (
     DIELECTRICS,
     NOMINAL,
     OP_AMP_GRADES,
+    REFERENCE_C,
     Components,
     Dielectric,
     Grade,
@@ -29,7 +31,7 @@ from analogrig_emulator.circuit.components import (
 )
 from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
 from analogrig_emulator.circuit.pot import PotTurn
-from analogrig_emulator.machine.noise import NoisySuspension
+from analogrig_emulator.machine.noise import QUIET, NoisySuspension, Supply
 from analogrig_emulator.machine.program import CHANNELS, ProgramCircuit
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
@@ -103,7 +105,8 @@ def _set_to_a_thousandth(
 class _Setup:
     """Machine and card, ideal by default.
 
-    quantised: compare codes instead of converter inputs. turning: play one ramp instead of the usual changes.
+    quantised: compare codes instead of converter inputs. turning: play one ramp instead of the usual changes. added:
+    compare with the same op-amps without the components.
     """
 
     op_amp: OpAmpModel = IDEAL
@@ -113,11 +116,14 @@ class _Setup:
     operator: _Operator = _set_exactly
     quantised: bool = False
     turning: bool = False
+    added: bool = False
+    temperature_c: float = REFERENCE_C
+    supply: Supply = QUIET
 
     def figure_lsb(self, program: ProgramCircuit, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
         """Largest difference of the displacement from the ideal machine's, or from that without the effect."""
         reference_lsb = ideal_lsb
-        if self.turning:
+        if self.turning or self.added:
             reference_lsb = dataclasses.replace(self, components=NOMINAL).displacement_lsb(program, seed)
         elif self.noise is not None:
             reference_lsb = dataclasses.replace(self, noise=None).displacement_lsb(program, seed)
@@ -131,11 +137,17 @@ class _Setup:
         rng = np.random.default_rng(seed)
         machine.set(**self.operator(machine, program.values, rng))
         changes = [PotTurn(k, self.operator(machine, values, rng), n) for k, values, n in self._changes(program)]
-        played = machine if self.noise is None else NoisySuspension(machine, rng, op_amps=self.noise)
-        volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, changes, rng=rng)))
+        volts = np.concatenate(
+            list(acquired(self._noisy(machine, rng), self.card, Excitation(), SAMPLES, changes, rng=rng))
+        )
         sampler = Sampler(self.card, rng)
         seen_lsb = sampler.seen_lsb(volts)
         return (sampler.convert(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
+
+    def _noisy(self, machine: SuspensionComputer, rng: np.random.Generator) -> Playable:
+        if self.noise is None:
+            return machine
+        return NoisySuspension(machine, rng, op_amps=self.noise, temperature_c=self.temperature_c, supply=self.supply)
 
     def _changes(self, program: ProgramCircuit) -> Sequence[PotTurn]:
         if self.turning:
@@ -209,17 +221,38 @@ def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
     yield (
         "noise of TL07x and resistors",
         DRAWS,
-        _constant(_Setup(op_amp=tl07x, noise=OP_AMP_GRADES["tl07x"])),
+        _constant(_Setup(op_amp=tl07x, noise=dataclasses.replace(OP_AMP_GRADES["tl07x"], flicker_hz=0.0))),
     )
+    yield from _supply_rows()
     for name in ("tl07x", "741"):
         grade = OP_AMP_GRADES[name]
         bias = OpAmpGrade(bias_a=grade.bias_a, input_ohm=grade.input_ohm)
         yield f"bias current, {name} ({1e9 * grade.bias_a:g} nA)", 1, _with_components(Components(op_amps=bias))
+    grade = OP_AMP_GRADES["tl07x"]
+    parts = {
+        f"input capacitance {1e12 * grade.input_farad:g} pF": OpAmpGrade(input_farad=grade.input_farad),
+        "common-mode rejection 100 dB": OpAmpGrade(cmrr=grade.cmrr),
+        "output current to 40 mA": OpAmpGrade(current_limit_a=grade.current_limit_a),
+        "output current to 1 mA": OpAmpGrade(current_limit_a=1e-3),
+        "recovery from overload 5 us": OpAmpGrade(recovery_s=5e-6),
+    }
+    for name, part in parts.items():
+        yield name, 1, _constant(_Setup(op_amp=tl07x, components=Components(op_amps=part), added=True))
+
+
+def _supply_rows() -> Iterator[tuple[str, int, _Make]]:
+    # The same 1/f density beside a white one of no account; resistors without noise.
+    cold = _Setup(op_amp=PRESETS["tl07x"], temperature_c=-273.15)
+    grade = OP_AMP_GRADES["tl07x"]
+    pink = OpAmpGrade(noise_v_per_rthz=1e-6 * grade.noise_v_per_rthz, flicker_hz=1e12 * grade.flicker_hz)
+    yield "1/f noise of TL07x", DRAWS, _constant(dataclasses.replace(cold, noise=pink))
+    humming = dataclasses.replace(cold, noise=OpAmpGrade(psrr=grade.psrr), supply=Supply(hum_v=0.1))
+    yield "supply with 0.1 V at 100 Hz, rejected by 100 dB", 1, _constant(humming)
 
 
 def _dielectric_rows() -> Iterator[tuple[str, int, _Make]]:
     for name in ("polyester", "polypropylene"):
-        absorption = Dielectric(absorption=DIELECTRICS[name].absorption)
+        absorption = dataclasses.replace(DIELECTRICS[name], leakage_s=math.inf)
         yield f"dielectric absorption, {name}", 1, _with_components(Components(dielectric=absorption))
     leakage = Dielectric(leakage_s=DIELECTRICS["polyester"].leakage_s)
     yield "capacitor leakage, polyester", 1, _with_components(Components(dielectric=leakage))

@@ -5,7 +5,8 @@
     R, C, track     value (1 + tolerance) (1 + temperature coefficient (T - 25 C)) (1 + ageing sqrt(age / 1000 h))
     C               leakage resistance across it; dielectric absorption as series R-C branches across it
     op-amp          offset voltage and its drift, bandwidth and slew of the specimen; bias current through its input
-                    resistance (as a voltage source behind it), input capacitance
+                    resistance (as a voltage source behind it), input capacitance; common-mode rejection, limit of the
+                    output current, recovery from overload
     multiplier      scale error, offsets and non-linearity of the specimen
     pot             wiper resistance, and resistance beyond the end stops
 
@@ -96,17 +97,26 @@ class Dielectric:
     """Leakage and dielectric absorption of a capacitor.
 
     leakage_s: its insulation resistance times its capacitance. absorption: branches in parallel, each as (fraction of
-    the capacitance, time constant in s of its series R-C).
+    the capacitance, time constant in s of its series R-C). marked_hz: frequency at which the capacitance is the marked
+    one; branches that follow it are part of that.
     Raises CircuitError naming the field.
     """
 
     leakage_s: float = math.inf
     absorption: tuple[tuple[float, float], ...] = ()
+    marked_hz: float = math.inf
 
     def __post_init__(self) -> None:
         _require(self, "leakage_s", self.leakage_s > 0, "must be positive")
+        _require(self, "marked_hz", self.marked_hz > 0, "must be positive")
         for fraction, tau_s in self.absorption:
             _require(self, "absorption", 0 < fraction < 1 and 0 < tau_s < math.inf, "needs 0 < fraction < 1, tau_s > 0")
+
+    @property
+    def instantaneous(self) -> float:
+        """Part of the marked capacitance that is free of absorption."""
+        turns = [2.0 * math.pi * self.marked_hz * tau_s for _, tau_s in self.absorption]
+        return 1.0 / (1.0 + sum(part / (1.0 + turn**2) for (part, _), turn in zip(self.absorption, turns, strict=True)))
 
 
 def _constant_loss(tan_delta: float, taus_s: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
@@ -117,18 +127,19 @@ def _constant_loss(tan_delta: float, taus_s: tuple[float, ...]) -> tuple[tuple[f
     return tuple((2.0 / math.pi * math.log(10.0) * tan_delta, tau_s) for tau_s in taus_s)
 
 
-_TAUS_S = (1e-3, 1e-2, 1e-1)
+_TAUS_S = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+_MARKED_HZ = 1e3
 
 DIELECTRICS: Mapping[str, Dielectric] = MappingProxyType(
     {
         "perfect": Dielectric(),
-        "polyester": Dielectric(leakage_s=1e4, absorption=_constant_loss(2e-3, _TAUS_S)),
-        "polypropylene": Dielectric(leakage_s=1e5, absorption=_constant_loss(1e-4, _TAUS_S)),
+        "polyester": Dielectric(1e4, _constant_loss(2e-3, _TAUS_S), _MARKED_HZ),
+        "polypropylene": Dielectric(1e5, _constant_loss(1e-4, _TAUS_S), _MARKED_HZ),
     }
 )
 """Film capacitors with the typical insulation resistance and the loss at 100 Hz of their datasheets.
 
-Relaxation faster than a millisecond is part of the capacitance, which is measured at 1 kHz.
+Relaxation faster than 10 us is part of the capacitance.
 """
 
 
@@ -138,8 +149,10 @@ class OpAmpGrade:
 
     offset_v, offset_v_per_k: uniform within +-, added to the model's. bandwidth, slew: fractions, uniform within +-.
     bias_a: current into each input at 25 C, of which bias_spread, a fraction, is uniform within +-; it doubles every
-    bias_doubles_k (junction FETs: 10 K). input_ohm, input_farad: from each input to ground. noise_v_per_rthz,
-    noise_a_per_rthz: white input noise.
+    bias_doubles_k (junction FETs: 10 K). input_ohm, input_farad: from each input to ground; an op-amp without a pole or
+    an output resistance has no input_farad. noise_v_per_rthz, noise_a_per_rthz: white input noise. flicker_hz:
+    frequency at which the 1/f noise is as dense as the white one. cmrr, current_limit_a, recovery_s: as in OpAmpModel,
+    of which the worse holds. psrr: rejection of the supply, V/V.
     Raises CircuitError naming the field.
     """
 
@@ -154,14 +167,19 @@ class OpAmpGrade:
     input_farad: float = 0.0
     noise_v_per_rthz: float = 0.0
     noise_a_per_rthz: float = 0.0
+    flicker_hz: float = 0.0
+    cmrr: float = math.inf
+    psrr: float = math.inf
+    current_limit_a: float = math.inf
+    recovery_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("offset_v", "offset_v_per_k", "bias_spread", "input_farad", "noise_v_per_rthz"):
+        finite = ("offset_v", "offset_v_per_k", "bias_spread", "input_farad", "noise_v_per_rthz", "noise_a_per_rthz")
+        for name in (*finite, "flicker_hz", "recovery_s"):
             _require(self, name, 0 <= getattr(self, name) < math.inf, "must be finite and not negative")
-        _require(self, "noise_a_per_rthz", 0 <= self.noise_a_per_rthz < math.inf, "must be finite and not negative")
         for name in ("bandwidth", "slew"):
             _require(self, name, 0 <= getattr(self, name) < 1, "must be at least 0 and less than 1")
-        for name in ("bias_doubles_k", "input_ohm"):
+        for name in ("bias_doubles_k", "input_ohm", "cmrr", "psrr", "current_limit_a"):
             _require(self, name, getattr(self, name) > 0, "must be positive")
         _require(self, "bias_a", math.isfinite(self.bias_a), "must be finite")
         _require(self, "input_ohm", math.isfinite(self.input_ohm) or self.bias_a == 0, "must be finite to carry bias_a")
@@ -178,8 +196,13 @@ OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
             bias_a=65e-12,
             bias_spread=0.5,
             bias_doubles_k=10.0,
+            input_farad=3e-12,
             noise_v_per_rthz=18e-9,
             noise_a_per_rthz=0.01e-12,
+            flicker_hz=100.0,
+            cmrr=1e5,
+            psrr=1e5,
+            current_limit_a=40e-3,
         ),
         "741": OpAmpGrade(
             offset_v=2e-3,
@@ -189,8 +212,13 @@ OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
             bias_a=80e-9,
             bias_spread=0.25,
             input_ohm=2e8,
+            input_farad=1.4e-12,
             noise_v_per_rthz=20e-9,
             noise_a_per_rthz=0.5e-12,
+            flicker_hz=200.0,
+            cmrr=3.2e4,
+            psrr=3.2e4,
+            current_limit_a=25e-3,
         ),
         "opa627": OpAmpGrade(
             offset_v=0.1e-3,
@@ -201,8 +229,13 @@ OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
             bias_spread=0.5,
             bias_doubles_k=10.0,
             input_ohm=1e13,
+            input_farad=15e-12,
             noise_v_per_rthz=5e-9,
             noise_a_per_rthz=1.6e-15,
+            flicker_hz=100.0,
+            cmrr=6.3e5,
+            psrr=1e6,
+            current_limit_a=55e-3,
         ),
     }
 )
@@ -368,7 +401,8 @@ class Components:
             case Resistor():
                 yield replace(element, ohm=element.ohm * self._factor(element.name, self.resistors, draws))
             case Capacitor():
-                real = replace(element, farad=element.farad * self._factor(element.name, self.capacitors, draws))
+                factor = self._factor(element.name, self.capacitors, draws) * self.dielectric.instantaneous
+                real = replace(element, farad=element.farad * factor)
                 yield real
                 yield from _loss_parts(real, self.dielectric)
             case Pot():
@@ -412,6 +446,9 @@ class Components:
             vos_v=model.vos_v + offset_v + drift_v,
             gbw_hz=model.gbw_hz * (1.0 + bandwidth),
             slew_v_per_s=model.slew_v_per_s * (1.0 + slew),
+            cmrr=min(model.cmrr, grade.cmrr),
+            current_limit_a=min(model.current_limit_a, grade.current_limit_a) if model.has_current else math.inf,
+            recovery_s=max(model.recovery_s, grade.recovery_s) if model.saturates else 0.0,
         )
 
     def _inputs(self, amp: OpAmp, draws: NDArray[np.float64]) -> Iterator[Element]:
@@ -425,7 +462,7 @@ class Components:
                 behind = f"{amp.name}_{side}_bias"
                 yield VoltageSource(behind, behind, dc_v=-bias_a * grade.input_ohm)
                 yield Resistor(f"{amp.name}_{side}_ohm", node, behind, grade.input_ohm)
-            if grade.input_farad > 0:
+            if grade.input_farad > 0 and amp.model.has_current:
                 yield Capacitor(f"{amp.name}_{side}_farad", node, GROUND, grade.input_farad)
 
 

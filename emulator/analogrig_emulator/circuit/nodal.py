@@ -3,8 +3,9 @@
 x: the voltage of every capacitor, then the voltage behind the output resistance of every op-amp that has a pole, then
 that of every multiplier with a bandwidth (netlist order each).
 u: the voltage sources that are inputs, then the product of every multiplier. v: every node voltage. phi: one Kink per
-element of w: for each op-amp and multiplier its slew limit, then its clamp; for each diode limiter the voltage beyond
-its threshold; for each function generator the bends of its input; last the two arguments of every product.
+element of w: for each op-amp and multiplier its slew limit, then its clamp, then the limit of its current; for each
+diode limiter the voltage beyond its threshold; for each function generator the bends of its input; for each op-amp that
+recovers from overloads the voltage beyond its swing; last the two arguments of every product.
 
 With x and u held, the circuit is resistive. Capacitors become voltage sources x, op-amp poles voltage sources x
 behind their output resistance. Kirchhoff's current law at every node, and one equation per branch whose current is
@@ -16,6 +17,7 @@ so a circuit has the same bits on every machine.
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -134,12 +136,14 @@ class Nodal:
         self._state = {element.name: i for i, element in enumerate(holders)}
         self._columns = len(self._state) + len(self._inputs) + len(self._multipliers) + 1
         limited: tuple[OpAmp | Multiplier, ...] = (*self._poles, *followers)
-        self._kinks = tuple(replace(kink, element=part.name) for part in limited for kink in _kinks(part))
+        self._kinks = tuple(replace(kink, element=part.name) for part in limited for kink in _limits(part).values())
         first_source = len(self._kinks)
         self._kinks += tuple(
             replace(Kink.deadzone(-math.inf, limiter.threshold_v), element=limiter.name) for limiter in self._limiters
         )
         self._kinks += tuple(kink for function in self._functions for kink in function.kinks)
+        self._recovering = tuple(amp for amp in self._poles if amp.model.recovers)
+        self._kinks += tuple(replace(Kink.deadzone(*amp.model.swing_v), element=amp.name) for amp in self._recovering)
         self._sources = slice(first_source, len(self._kinks))
         self._kinks += tuple(Kink.none(part.name) for part in self._multipliers for _ in "xy")
         self._check_size()
@@ -215,7 +219,7 @@ class Nodal:
 
     def _trim(self, solution: Matrix) -> Trim:
         laws = self._laws
-        apart_v = (solution[laws.plus] - solution[laws.minus])[laws.poles, self._columns - 1]
+        apart_v = laws.apart(solution)[laws.poles, self._columns - 1]
         slew_kinks = dict(zip(laws.drive_of_kink[laws.slews].tolist(), laws.slews.tolist(), strict=True))
         return Trim(
             amps=tuple(amp.name for amp in self._poles),
@@ -282,6 +286,9 @@ class Nodal:
             self._right[row, self._columns - 1] = volts
             self._right[row, bend : bend + len(function.kinks)] = 1.0
             bend += len(function.kinks)
+        for amp in self._recovering:
+            self._right[:, bend] = -self._right[:, self._state[amp.name]]
+            bend += 1
 
     def _drive(self, source: VoltageSource | CurrentSource) -> tuple[int, float]:
         """Column of the right-hand side that drives a source, and its factor."""
@@ -340,6 +347,8 @@ class Nodal:
             self._left[row, self._row[amp.plus]] -= 1.0
             self._left[row, self._row[amp.minus]] += 1.0
             self._right[row, self._columns - 1] = model.vos_v
+            for node in (amp.plus, amp.minus):
+                self._left[row, self._row[node]] -= 0.5 / model.cmrr
         else:
             self._enter_output(amp)
 
@@ -390,8 +399,11 @@ class Nodal:
         laws, states = self._laws, len(self._state)
         drives = laws.drives(solution, self._columns - 1)
         w = drives[laws.drive_of_kink]
-        w[laws.clamps] = 0.0
-        w[laws.clamps, laws.drive_of_kink[laws.clamps]] = 1.0
+        w[laws.of_state] = 0.0
+        w[laws.of_state, laws.state] = 1.0
+        w[laws.currents] -= solution[laws.loaded]
+        for kink, column in laws.saturations:
+            w[kink, column] -= 1.0
         slopes = drives[:states]
         slopes[laws.drive_of_kink[laws.slews]] = 0.0
         g = laws.g.copy()
@@ -449,8 +461,10 @@ class _Laws:
 
     A drive is (solution[plus] - solution[minus] + offset) gain / capacity, less the leak. The drives of multipliers
     hold their products besides: fed gives their rows, products the columns. drive_of_kink: drive of each kink, in the
-    order of _kinks(); slews, clamps: indices of the kinks of each kind. g: G without limiters and bends. holders: rows
-    with a leak; poles: those of the op-amps.
+    order of the kinks; slews: indices of the kinks of that kind. of_state: kinks whose argument is a state, and state:
+    it. currents: those from which the voltage of the node in loaded is taken. saturations: (kink, column of the
+    solution) at which the output of a recovering op-amp lacks its excess. common: for each op-amp, 1 / (2 CMRR). g: G
+    without limiters and bends. holders: rows with a leak; poles: those of the op-amps.
     """
 
     plus: NDArray[np.intp]
@@ -465,7 +479,12 @@ class _Laws:
     leak: Matrix
     drive_of_kink: NDArray[np.intp]
     slews: NDArray[np.intp]
-    clamps: NDArray[np.intp]
+    of_state: NDArray[np.intp]
+    state: NDArray[np.intp]
+    currents: NDArray[np.intp]
+    loaded: NDArray[np.intp]
+    saturations: tuple[tuple[int, int], ...]
+    common: Matrix
     g: Matrix
 
     @classmethod
@@ -479,13 +498,22 @@ class _Laws:
         ends += [(row[GROUND], row[GROUND])] * len(followers)
         ends += [(row[limiter.a], row[limiter.b]) for limiter in limiters]
         ends += [(row[function.x], row[GROUND]) for function in bent]
+        recovering = [(i, amp) for i, amp in enumerate(poles, len(capacitors)) if amp.model.recovers]
+        ends += [(row[GROUND], row[GROUND])] * len(recovering)
         ends += [(row[node], row[GROUND]) for part in multipliers for node in (part.x, part.y)]
         plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
         limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
         first, states = len(capacitors), len(capacitors) + len(limited)
-        kinds = [
-            (i, slews) for i, part in enumerate(limited, first) for slews in (True, False) if _limits(part, slews=slews)
-        ]
+        kinds = [(i, part, limit) for i, part in enumerate(limited, first) for limit in _limits(part)]
+        held = [(kink, i) for kink, (i, _, limit) in enumerate(kinds) if limit is not _Limit.SLEW]
+        fed_back = [(kink, part) for kink, (_, part, limit) in enumerate(kinds) if limit is _Limit.CURRENT]
+        last_source = len(kinds) + len(limiters) + len(bent) + len(recovering)
+        held += [(last_source - len(recovering) + k, i) for k, (i, _) in enumerate(recovering)]
+        # The columns of sources follow those of the last product and the constant.
+        excess = {
+            amp.name: first_product + len(multipliers) + 1 + len(limiters) + len(bent) + k
+            for k, (_, amp) in enumerate(recovering)
+        }
         ones, zeros = np.ones(len(capacitors)), np.zeros(len(capacitors))
         tail = np.ones(len(ends) - states)
         offsets_v = np.zeros(tail.size)
@@ -505,18 +533,31 @@ class _Laws:
             fed=np.arange(first + len(poles), states),
             products=first_product + np.array([i for i, p in enumerate(multipliers) if p.model.has_state], np.intp),
             leak=np.array([part.model.leak_rate for part in limited]),
-            drive_of_kink=np.array([*(i for i, _ in kinds), *range(states, len(ends))], np.intp),
-            slews=np.array([kink for kink, (_, slews) in enumerate(kinds) if slews], np.intp),
-            clamps=np.array([kink for kink, (_, slews) in enumerate(kinds) if not slews], np.intp),
+            drive_of_kink=np.array([*(i for i, _, _ in kinds), *range(states, len(ends))], np.intp),
+            slews=np.array([kink for kink, (_, _, limit) in enumerate(kinds) if limit is _Limit.SLEW], np.intp),
+            of_state=np.array([kink for kink, _ in held], np.intp),
+            state=np.array([i for _, i in held], np.intp),
+            currents=np.array([kink for kink, _ in fed_back], np.intp),
+            loaded=np.array([row[part.out] for _, part in fed_back], np.intp),
+            saturations=tuple((kink, excess[part.name]) for kink, part in fed_back if part.name in excess),
+            common=np.array([0.5 / amp.model.cmrr for amp in poles]).reshape(-1, 1),
             g=np.zeros((states, len(kinds) + tail.size)),
         )
         laws.g[laws.drive_of_kink[laws.slews], laws.slews] = 1.0
-        laws.g[laws.drive_of_kink[laws.clamps], laws.clamps] = -CLAMP_RATE
+        for kink, i in held[: len(held) - len(recovering)]:
+            laws.g[i, kink] = -CLAMP_RATE
         return laws
+
+    def apart(self, solution: Matrix) -> Matrix:
+        """Voltage between the ends of each law, with what an op-amp passes of its common mode."""
+        apart: Matrix = solution[self.plus] - solution[self.minus]
+        if self.common.any():
+            apart[self.poles] += (solution[self.plus[self.poles]] + solution[self.minus[self.poles]]) * self.common
+        return apart
 
     def drives(self, solution: Matrix, constant: int) -> Matrix:
         """A row for each capacitor (V/s), op-amp and multiplier with a pole (V/s, before any limit), and w (V)."""
-        drives: Matrix = solution[self.plus] - solution[self.minus]
+        drives = self.apart(solution)
         drives[:, constant] += self.offset
         drives[self.fed, self.products] += 1.0
         drives *= self.gain
@@ -526,18 +567,25 @@ class _Laws:
 
     def slopes(self, solution: Matrix) -> Matrix:
         """Rows of drives() without offsets and leaks."""
-        return np.asarray((solution[self.plus] - solution[self.minus]) * self.gain / self.capacity)
+        return np.asarray(self.apart(solution) * self.gain / self.capacity)
 
 
-def _limits(part: OpAmp | Multiplier, *, slews: bool) -> bool:
-    return part.model.slews if slews else part.model.clamps
+class _Limit(enum.Enum):
+    """Limits of an output."""
+
+    SLEW = enum.auto()
+    SWING = enum.auto()
+    CURRENT = enum.auto()
 
 
-def _kinks(part: OpAmp | Multiplier) -> list[Kink]:
-    """The slew limit, then the clamp."""
-    kinks = []
-    if part.model.slews:
-        kinks.append(Kink.clip(part.model.slew_v_per_s))
-    if part.model.clamps:
-        kinks.append(Kink.deadzone(*part.model.swing_v))
-    return kinks
+def _limits(part: OpAmp | Multiplier) -> dict[_Limit, Kink]:
+    """Limits of an output with a pole, in the order of their kinks."""
+    model, limits = part.model, {}
+    if model.slews:
+        limits[_Limit.SLEW] = Kink.clip(model.slew_v_per_s)
+    if model.clamps:
+        limits[_Limit.SWING] = Kink.deadzone(*model.bounds_v)
+    if model.limits_current:
+        drop_v = model.rout_ohm * model.current_limit_a
+        limits[_Limit.CURRENT] = Kink.deadzone(-drop_v, drop_v)
+    return limits

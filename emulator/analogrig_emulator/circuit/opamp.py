@@ -2,12 +2,14 @@
 
 The law of every op-amp here, with v the voltage behind the output resistance (SI units throughout):
 
-    dv/dt = clip(2 pi GBW (v+ - v- + Vos) - v / tau, -SR, +SR) - CLAMP_RATE deadzone(v; swing)
-    tau = Avol / (2 pi GBW)
+    dv/dt = clip(2 pi GBW (d + Vos) - v / tau, -SR, +SR) - CLAMP_RATE (deadzone(v; swing) + deadzone(Rout i; Rout Imax))
+    d = v+ - v- + (v+ + v-) / (2 CMRR),   tau = Avol / (2 pi GBW)
 
 The clamp is a spring and not a wall: overdriven at full slew rate, v settles SR / CLAMP_RATE beyond the swing (13 mV
 for a TL07x). The field is therefore continuous, and the mode of an amplifier follows from the state alone.
-Inputs draw no current; the supply is not modelled beyond the swing.
+The current i from v through Rout is limited likewise. With a recovery time, v is let SR times it further beyond
+the swing, and what is behind Rout is v within the swing: after an overload v has to slew back first.
+Inputs draw no current; the supply is not modelled beyond the swing and its hum (machine/noise.py).
 """
 
 from __future__ import annotations
@@ -48,6 +50,16 @@ class OutputStage:
         return math.isfinite(self.gain_rate)
 
     @property
+    def limits_current(self) -> bool:
+        """True if the output current is limited."""
+        return False
+
+    @property
+    def bounds_v(self) -> tuple[float, float]:
+        """Voltages to which the state is clamped."""
+        return self.swing_v
+
+    @property
     def slews(self) -> bool:
         """True if the slew rate is finite."""
         return math.isfinite(self.slew_v_per_s)
@@ -73,9 +85,12 @@ class OpAmpModel(OutputStage):
     """One type of op-amp. The defaults are ideal: v+ = v-, no state. Each field switches one non-ideality on.
 
     avol: open-loop gain at DC (V/V); gbw_hz: gain-bandwidth product; slew_v_per_s: slew rate; swing_v: (lowest,
-    highest) output in V; rout_ohm: open-loop output resistance; vos_v: input offset voltage, added to v+ - v-.
+    highest) output in V; rout_ohm: open-loop output resistance; vos_v: input offset voltage, added to v+ - v-; cmrr:
+    common-mode rejection (V/V); current_limit_a: largest output current; recovery_s: time for which the output stays
+    at its swing after an overload.
 
-    Raises CircuitError naming the field. Slew and swing need a finite gbw_hz: they act on its state.
+    Raises CircuitError naming the field. Slew and swing need a finite gbw_hz: they act on its state. So does
+    current_limit_a, with a rout_ohm through which the current flows; recovery_s needs slew and swing.
     """
 
     avol: float = math.inf
@@ -84,9 +99,12 @@ class OpAmpModel(OutputStage):
     swing_v: tuple[float, float] = (-math.inf, math.inf)
     rout_ohm: float = 0.0
     vos_v: float = 0.0
+    cmrr: float = math.inf
+    current_limit_a: float = math.inf
+    recovery_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in ("avol", "gbw_hz", "slew_v_per_s"):
+        for field in ("avol", "gbw_hz", "slew_v_per_s", "cmrr", "current_limit_a"):
             value = getattr(self, field)
             if not value > 0:
                 raise CircuitError(f"op-amp: {field} must be positive, got {value!r}")
@@ -95,6 +113,12 @@ class OpAmpModel(OutputStage):
         self.require_limits("op-amp", "gbw_hz")
         if self.gbw_hz < LEAST_GBW_HZ:
             raise CircuitError(f"op-amp: gbw_hz {self.gbw_hz!r} is below {LEAST_GBW_HZ:g} Hz")
+        if not 0 <= self.recovery_s < math.inf:
+            raise CircuitError(f"op-amp: recovery_s must be finite and not negative, got {self.recovery_s!r}")
+        if self.limits_current and not self.has_current:
+            raise CircuitError("op-amp: current_limit_a needs a finite gbw_hz and a rout_ohm")
+        if self.recovery_s and not self.saturates:
+            raise CircuitError("op-amp: recovery_s needs a finite slew_v_per_s and a swing_v")
 
     @property
     def gain_rate(self) -> float:
@@ -105,6 +129,34 @@ class OpAmpModel(OutputStage):
     def leak_rate(self) -> float:
         """1 / tau = 2 pi GBW / Avol, in 1/s; 0 for an infinite gain."""
         return self.gain_rate / self.avol
+
+    @property
+    def has_current(self) -> bool:
+        """True if the output current can be limited."""
+        return self.has_state and self.rout_ohm > 0
+
+    @property
+    def limits_current(self) -> bool:
+        """True if the output current is limited."""
+        return math.isfinite(self.current_limit_a)
+
+    @property
+    def saturates(self) -> bool:
+        """True if an overload ends after a time to be recovered from."""
+        return self.slews and self.clamps
+
+    @property
+    def recovers(self) -> bool:
+        """True if recovery from an overload takes time."""
+        return self.recovery_s > 0
+
+    @property
+    def bounds_v(self) -> tuple[float, float]:
+        """Voltages to which the state is clamped: the swing, and beyond it a slew for the time of recovery."""
+        if not self.recovers:
+            return self.swing_v
+        (low, high), beyond_v = self.swing_v, self.slew_v_per_s * self.recovery_s
+        return low - beyond_v, high + beyond_v
 
 
 IDEAL = OpAmpModel()

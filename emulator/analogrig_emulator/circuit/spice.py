@@ -33,7 +33,7 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
-from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
 from analogrig_emulator.circuit.pot import END_FRACTION, PotTurn
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
@@ -61,9 +61,21 @@ Bstate 0 state I = 1e-10 * (max(-{{slew}}, min({{slew}},
 Einner inner 0 state 0 1
 Rout inner out {{max(rout, 1e-4)}}
 .ends""",
+        # Node inner is what is behind Rout: the state within out_low and out_high.
+        "limited_opamp": f"""\
+.subckt limited_opamp plus minus out avol=1e99 gbw=1e6 slew=1e99 swing_low=-1e99 swing_high=1e99 rout=0 vos=0
++ common=0 drop=1e99 out_low=-1e99 out_high=1e99
+Cstate state 0 1e-10
+Bstate 0 state I = 1e-10 * (max(-{{slew}}, min({{slew}},
++ {2 * math.pi!r} * {{gbw}} * (v(plus, minus) + {{common}} * (v(plus) + v(minus)) + {{vos}} - v(state) / {{avol}})))
++ - {CLAMP_RATE!r} * (max(0, v(state) - {{swing_high}}) + min(0, v(state) - {{swing_low}}))
++ - {CLAMP_RATE!r} * (max(0, v(inner, out) - {{drop}}) + min(0, v(inner, out) + {{drop}})))
+Binner inner 0 V = max({{out_low}}, min({{out_high}}, v(state)))
+Rout inner out {{max(rout, 1e-4)}}
+.ends""",
         "opamp_without_pole": """\
-.subckt opamp_without_pole plus minus out avol=1e99 rout=0 vos=0
-Binner inner 0 V = {min(avol, 1e9)} * (v(plus, minus) + {vos})
+.subckt opamp_without_pole plus minus out avol=1e99 rout=0 vos=0 common=0
+Binner inner 0 V = {min(avol, 1e9)} * (v(plus, minus) + {common} * (v(plus) + v(minus)) + {vos})
 Rout inner out {max(rout, 1e-4)}
 .ends""",
         "pot": f"""\
@@ -341,19 +353,8 @@ def _straight_pieces(card: str, function: Function) -> Iterator[str]:
 def _instance_of(element: OpAmp | Pot | DiodeLimiter | Switch | Multiplier) -> tuple[str, dict[str, float]]:
     """Return the subcircuit of an element and its parameters; its nodes are the element's, in their order."""
     match element:
-        case OpAmp(model=model) if not model.has_state:
-            return "opamp_without_pole", _finite(avol=model.avol, rout=model.rout_ohm, vos=model.vos_v)
-        case OpAmp(model=model):
-            low, high = model.swing_v
-            return "opamp", _finite(
-                avol=model.avol,
-                gbw=model.gbw_hz,
-                slew=model.slew_v_per_s,
-                swing_low=low,
-                swing_high=high,
-                rout=model.rout_ohm,
-                vos=model.vos_v,
-            )
+        case OpAmp():
+            return _opamp_instance(element.model)
         case Pot():
             return "pot", {"track": element.track_ohm, "dial": element.dial}
         case DiodeLimiter():
@@ -366,6 +367,28 @@ def _instance_of(element: OpAmp | Pot | DiodeLimiter | Switch | Multiplier) -> t
             return _multiplier_instance(element)
         case Switch():
             return "switch", {"on": element.on_ohm, "off": element.off_ohm, "closed": float(element.closed)}
+
+
+def _opamp_instance(model: OpAmpModel) -> tuple[str, dict[str, float]]:
+    rejection = {"common": 0.5 / model.cmrr} if math.isfinite(model.cmrr) else {}
+    if not model.has_state:
+        return "opamp_without_pole", _finite(avol=model.avol, rout=model.rout_ohm, vos=model.vos_v) | rejection
+    low, high = model.bounds_v
+    law = _finite(
+        avol=model.avol,
+        gbw=model.gbw_hz,
+        slew=model.slew_v_per_s,
+        swing_low=low,
+        swing_high=high,
+        rout=model.rout_ohm,
+        vos=model.vos_v,
+    )
+    limits = {"drop": model.rout_ohm * model.current_limit_a} if model.limits_current else {}
+    if model.recovers:
+        limits |= dict(zip(("out_low", "out_high"), model.swing_v, strict=True))
+    if not (rejection or limits):
+        return "opamp", law
+    return "limited_opamp", law | rejection | _finite(**limits)
 
 
 def _multiplier_instance(element: Multiplier) -> tuple[str, dict[str, float]]:

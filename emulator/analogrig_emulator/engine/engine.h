@@ -33,7 +33,8 @@
 
 #include <stdint.h>
 
-#define ENGINE_MAX_STATES 32
+#define ENGINE_MAX_STATES 64
+#define ENGINE_MAX_NOISE_STATES 128
 #define ENGINE_MAX_INPUTS 24
 #define ENGINE_MAX_PRODUCTS 16
 #define ENGINE_MAX_KINKS 128

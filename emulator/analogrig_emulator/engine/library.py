@@ -10,7 +10,8 @@ from pathlib import Path
 from analogrig_emulator.errors import EngineError
 
 # The limits of engine/engine.h.
-MAX_STATES = 32
+MAX_STATES = 64
+MAX_NOISE_STATES = 128
 MAX_INPUTS = 24
 MAX_PRODUCTS = 16
 MAX_KINKS = 128

@@ -7,12 +7,14 @@
 #define NOISE_TERMS 8
 #define MAX_DOUBLINGS 80
 
+#define MAX_NOISE_SQUARE (ENGINE_MAX_NOISE_STATES * ENGINE_MAX_NOISE_STATES)
+
 /// Part of a variance below which the remainder of the Cholesky factorisation counts as zero.
 #define NO_VARIANCE 1e-12
 
 /// change = exp(a h) - I over the short step, and cov by the Taylor series of dP/dt = a P + P a' + q.
 static void gather_one_step(int n, double step_s, const double* a, const double* q, double* change, double* cov) {
-    double power[MAX_SQUARE] = { 0.0 }, term[MAX_SQUARE] = { 0.0 }, grown[MAX_SQUARE];
+    double power[MAX_NOISE_SQUARE] = { 0.0 }, term[MAX_NOISE_SQUARE] = { 0.0 }, grown[MAX_NOISE_SQUARE];
     for (int i = 0; i < n * n; i++) {
         change[i] = power[i] = a[i] * step_s;
         cov[i] = term[i] = q[i] * step_s;
@@ -34,7 +36,7 @@ static void gather_one_step(int n, double step_s, const double* a, const double*
 
 /// Double the step: P + Phi P Phi' and Phi Phi - I with Phi = I + change. Slow states lose no digits.
 static void double_step(int n, double* change, double* cov) {
-    double grown[MAX_SQUARE] = { 0.0 }, transposed[MAX_SQUARE] = { 0.0 }, both[MAX_SQUARE];
+    double grown[MAX_NOISE_SQUARE] = { 0.0 }, transposed[MAX_NOISE_SQUARE] = { 0.0 }, both[MAX_NOISE_SQUARE];
     matrix_multiply(n, change, cov, false, grown);
     for (int i = 0; i < n * n; i++) {
         transposed[i] = grown[(i % n) * n + i / n];
@@ -93,7 +95,8 @@ int engine_noise_gather(
 
 /// Panels of [phi factor] over those of [reading 0]: the next x, padded to whole panels, and y over [x v].
 static void pack(int n, int outputs, const engine_noise_t* noise, double* panels) {
-    double both[ENGINE_MAX_OUTPUTS * 2 * ENGINE_MAX_STATES] = { 0.0 };
+    double both[ENGINE_MAX_OUTPUTS * 2 * ENGINE_MAX_NOISE_STATES];
+    memset(both, 0, (size_t)outputs * 2 * (size_t)n * sizeof both[0]);
     for (int i = 0; i < outputs; i++) {
         memcpy(&both[i * 2 * n], &noise->reading[i * n], (size_t)n * sizeof both[0]);
     }
@@ -115,8 +118,8 @@ void engine_noise_add(int                   n,
                       double*               volts) {
     const kernels_t* const kernels = kernels_find();
     const int              rows    = PADDED(n) + outputs;
-    double                 panels[PANEL_ELEMENTS(ENGINE_MAX_STATES + ENGINE_MAX_OUTPUTS, 2 * ENGINE_MAX_STATES)];
-    double                 z[2 * ENGINE_MAX_STATES], next[PADDED(ENGINE_MAX_STATES) + PADDED(ENGINE_MAX_OUTPUTS)];
+    double panels[PANEL_ELEMENTS(ENGINE_MAX_NOISE_STATES + ENGINE_MAX_OUTPUTS, 2 * ENGINE_MAX_NOISE_STATES)];
+    double z[2 * ENGINE_MAX_NOISE_STATES], next[PADDED(ENGINE_MAX_NOISE_STATES) + PADDED(ENGINE_MAX_OUTPUTS)];
     memcpy(z, x, (size_t)n * sizeof z[0]);
     for (int64_t stretch = 0; stretch < stretches; stretch++, noise++) {
         pack(n, outputs, noise, panels);

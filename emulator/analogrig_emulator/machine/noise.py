@@ -1,4 +1,4 @@
-"""Thermal noise of the resistors and input noise of the op-amps, exact at the samples.
+"""Thermal noise of the resistors, input noise of the op-amps and hum of their supply, exact at the samples.
 
 The noise is small: it is the solution of the linear circuit with white sources, and adds to the engine's voltages.
 No amplifier limits and no diode limiter conducts in that circuit, so a bump stop does not change the noise.
@@ -9,6 +9,11 @@ With dx = A x dt + B dw, one sample period T takes the noise x to
 both by doubling a short step (engine/noise.c). Sources (two-sided densities): 2 k T / R across each resistor and each
 leg of a pot, en^2 / 2 in series with the + input of an op-amp, in^2 / 2 into each of its inputs. Noise that reaches an
 output without passing a state is omitted: white without bound in this model, some nV per root Hz in reality.
+
+1/f noise of an op-amp is the sum of one first-order process a decade, from 1 Hz to 1 kHz, each with the variance
+K ln 10 that the density K / f has in a decade; K = en^2 times the frequency where both are equal. Its level at the
+first sample is drawn too. Hum of the supply, over the rejection, is in series with the + input of every op-amp. Both
+are states that drive the circuit.
 Elementwise arithmetic only, so a seed has the same bits on every machine.
 """
 
@@ -38,6 +43,10 @@ BOLTZMANN_J_PER_K = 1.380649e-23
 _ZERO_C_K = 273.15
 
 _ROOT_TWO = math.sqrt(2.0)
+_TURN = 2.0 * math.pi
+
+_FLICKER_HZ = (1.0, 10.0, 100.0, 1000.0)
+"""Corners of the processes that make up 1/f noise."""
 
 _KEPT_PROPAGATIONS = 16
 
@@ -64,6 +73,24 @@ class Propagation(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Supply:
+    """Supply of the op-amps: a sine of amplitude hum_v at hum_hz, 0 V and rising at sample 0. Raises CircuitError."""
+
+    hum_v: float = 0.0
+    hum_hz: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.hum_v < math.inf:
+            raise CircuitError(f"supply: hum_v must be finite and not negative, got {self.hum_v!r}")
+        if not 0 < self.hum_hz < math.inf:
+            raise CircuitError(f"supply: hum_hz must be positive and finite, got {self.hum_hz!r}")
+
+
+QUIET = Supply()
+"""Supply without hum."""
+
+
+@dataclass(frozen=True)
 class _Conditions:
     """Conditions of a noise, apart from circuit and dials."""
 
@@ -71,6 +98,17 @@ class _Conditions:
     op_amps: OpAmpGrade
     temperature_k: float
     period_s: float
+    supply: Supply
+
+    @property
+    def flicker_v(self) -> float:
+        """Rms of each process of an op-amp's 1/f noise."""
+        return self.op_amps.noise_v_per_rthz * math.sqrt(self.op_amps.flicker_hz * math.log(10.0))
+
+    @property
+    def hum_v(self) -> float:
+        """Amplitude of the hum at an op-amp's input."""
+        return self.supply.hum_v / self.op_amps.psrr
 
 
 class _Sources:
@@ -99,10 +137,47 @@ class _Sources:
 
     def _propagate(self, conditions: _Conditions, dials: Mapping[str, float]) -> Propagation:
         system = self._nodal.at(dials)
-        a = _linear_matrix(system)
-        drives = self._drives(conditions, dials, self._nodal.disturbances(dials))
-        gathered = _propagate(a, _product(drives.T, drives), conditions.period_s)
-        return Propagation.of(*gathered, np.ascontiguousarray(system.readings(conditions.outputs)[:, : len(a)]))
+        circuit = _linear_matrix(system)
+        response = self._nodal.disturbances(dials)
+        drives = self._drives(conditions, dials, response)
+        a, inputs = self._with_shapers(conditions, circuit, response)
+        intensity = np.diag(inputs**2)
+        n = len(circuit)
+        intensity[:n, :n] = _product(drives.T, drives)
+        reading = np.zeros((len(conditions.outputs), len(a)))
+        reading[:, :n] = system.readings(conditions.outputs)[:, :n]
+        return Propagation.of(*_propagate(a, intensity, conditions.period_s), reading)
+
+    def initial(self, conditions: _Conditions, states: int, rng: np.random.Generator) -> Matrix:
+        """First state of a noise: circuit at rest, 1/f noise of any level, hum at 0 V and rising."""
+        x = np.zeros(states)
+        if conditions.hum_v > 0:
+            x[-1] = conditions.hum_v
+        if conditions.flicker_v > 0:
+            count = len(self._amps) * len(_FLICKER_HZ)
+            first = states - count - (2 if conditions.hum_v > 0 else 0)
+            x[first : first + count] = conditions.flicker_v * rng.standard_normal(count)
+        return x
+
+    def _with_shapers(
+        self, conditions: _Conditions, circuit: Matrix, response: Mapping[str, Matrix]
+    ) -> tuple[Matrix, Matrix]:
+        """Matrix A with the processes of 1/f noise, then the hum and its quadrature; white drive of each state."""
+        corners_hz = [(amp.name, hz) for amp in self._amps for hz in _FLICKER_HZ if conditions.flicker_v > 0]
+        n, hums = len(circuit), 2 if conditions.hum_v > 0 else 0
+        size = n + len(corners_hz) + hums
+        if size > library.MAX_NOISE_STATES:
+            raise CircuitError(f"the noise has {size} states; the engine takes at most {library.MAX_NOISE_STATES}")
+        a, inputs = np.zeros((size, size)), np.zeros(size)
+        a[:n, :n] = circuit
+        for i, (name, hz) in enumerate(corners_hz, n):
+            a[:n, i] = response[name]
+            a[i, i] = -_TURN * hz
+            inputs[i] = conditions.flicker_v * math.sqrt(2.0 * _TURN * hz)
+        if hums:
+            a[:n, -2] = _rows_of(response, [amp.name for amp in self._amps]).sum(axis=0)
+            a[-2, -1], a[-1, -2] = _TURN * conditions.supply.hum_hz, -_TURN * conditions.supply.hum_hz
+        return a, inputs
 
     def _drives(self, conditions: _Conditions, dials: Mapping[str, float], response: Mapping[str, Matrix]) -> Matrix:
         """Contribution of each source to dx/dt, in V/s per root of its two-sided density: (sources, n)."""
@@ -120,8 +195,8 @@ class _Sources:
 class CircuitNoise:
     """Noise of a circuit's nodes at the samples, from zero.
 
-    outputs: nodes; op_amps: grade with noise_v_per_rthz and noise_a_per_rthz of every op-amp; temperature_c:
-    temperature of the resistors. Raises CircuitError for an unknown node or a singular circuit.
+    outputs: nodes; op_amps: grade with the noise and the supply rejection of every op-amp; temperature_c: temperature
+    of the resistors. Raises CircuitError for an unknown node, a singular circuit or too many states.
     """
 
     def __init__(
@@ -132,12 +207,14 @@ class CircuitNoise:
         op_amps: OpAmpGrade,
         temperature_c: float = REFERENCE_C,
         sample_rate_hz: float = 20e3,
+        supply: Supply = QUIET,
     ) -> None:
-        self._conditions = _Conditions(tuple(outputs), op_amps, temperature_c + _ZERO_C_K, 1.0 / sample_rate_hz)
+        temperature_k = temperature_c + _ZERO_C_K
+        self._conditions = _Conditions(tuple(outputs), op_amps, temperature_k, 1.0 / sample_rate_hz, supply)
         self._sources = circuit.untrimmed.derive(_Sources)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
         self.turn({})
-        self._x = np.zeros(len(self.transition))
+        self._x: Matrix | None = None
 
     @property
     def transition(self) -> Matrix:
@@ -171,6 +248,8 @@ class CircuitNoise:
 
         turns: dials set before a row of volts, in order of rows.
         """
+        if self._x is None:
+            self._x = self._sources.initial(self._conditions, len(self.transition), rng)
         stretches, begun = [], 0
         for row, dials in turns:
             stretches.append(library.Noise(row - begun, *self._propagation.addresses))
@@ -184,7 +263,7 @@ class CircuitNoise:
 
 
 class NoisySuspension:
-    """SuspensionComputer whose voltages include the noise of its resistors and op-amps."""
+    """SuspensionComputer whose voltages include the noise of its resistors and op-amps, and hum of their supply."""
 
     def __init__(
         self,
@@ -193,7 +272,9 @@ class NoisySuspension:
         *,
         op_amps: OpAmpGrade,
         temperature_c: float = REFERENCE_C,
+        supply: Supply = QUIET,
     ) -> None:
+        self._supply = supply
         self._computer = computer
         self._rng = rng
         self._op_amps = op_amps
@@ -225,6 +306,7 @@ class NoisySuspension:
             op_amps=self._op_amps,
             temperature_c=self._temperature_c,
             sample_rate_hz=computer.sample_rate_hz,
+            supply=self._supply,
         )
         quiet = computer.play_planned(excitation, samples, planned, block_samples, ahead_ticks)
         return self._blocks(quiet, noise, turns)
