@@ -14,8 +14,17 @@ from analogrig_emulator.errors import ExcitationError
 MOST_V = 1e3
 
 
+class DrivenExcitation:
+    """Generator whose level moves all the time."""
+
+    @property
+    def drive(self) -> Drive:
+        """Signal as the engine takes it."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False)
-class RecordedExcitation:
+class RecordedExcitation(DrivenExcitation):
     """Generator that plays samples_v, (n,) in V, one at each sample instant; the last one holds.
 
     Between samples the signal is band-limited to half the sample rate, as that before the recorder's filter was.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
 from typing import Any, NamedTuple
@@ -97,8 +97,18 @@ class Drive:
             for node in _NODES[1:-1]
         ]
         after = np.append(samples_v[1:], samples_v[-1])
-        values = np.stack([samples_v, *inner, after], axis=1)
-        values[-1] = samples_v[-1]
+        return cls._through(np.stack([samples_v, *inner, after], axis=1))
+
+    @classmethod
+    def through(cls, volts: Callable[[Matrix], Matrix], samples: int) -> Drive:
+        """Signal given by a function of the time in sample periods, at the nodes of the engine's longest step."""
+        at = np.arange(float(samples))
+        return cls._through(np.stack([volts(at + node) for node in _NODES], axis=1))
+
+    @classmethod
+    def _through(cls, values: Matrix) -> Drive:
+        """Polynomials through the values at the nodes of each sample, (n, nodes); the last sample holds."""
+        values[-1] = values[-1, 0]
         terms = np.ascontiguousarray(values.T)
         solve_in_place(np.vander(_NODES, increasing=True), terms)
         return cls(np.ascontiguousarray(terms.T))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.card.recorded import RecordedExcitation
+from analogrig_emulator.card.recorded import DrivenExcitation
 from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
@@ -134,7 +134,7 @@ class SuspensionComputer:
 
     def play(
         self,
-        excitation: Excitation | RecordedExcitation,
+        excitation: Excitation | DrivenExcitation,
         samples: int,
         changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
@@ -152,7 +152,7 @@ class SuspensionComputer:
 
     def play_planned(
         self,
-        excitation: Excitation | RecordedExcitation,
+        excitation: Excitation | DrivenExcitation,
         samples: int,
         turns: Sequence[PotTurn],
         block_samples: int = BLOCK_SAMPLES,
@@ -178,15 +178,15 @@ class SuspensionComputer:
 
     def _begin(
         self,
-        excitation: Excitation | RecordedExcitation,
+        excitation: Excitation | DrivenExcitation,
         lengths: Iterable[int],
         turns: list[PotTurn],
         ahead_ticks: int,
         probes: Sequence[str] = (),
     ) -> Iterator[NDArray[np.float64]]:
         drives: dict[str, Drive] = {}
-        generator = None if isinstance(excitation, RecordedExcitation) else excitation
-        if isinstance(excitation, RecordedExcitation):
+        generator = None if isinstance(excitation, DrivenExcitation) else excitation
+        if isinstance(excitation, DrivenExcitation):
             drives[SOURCE] = excitation.drive
         else:
             excitation.period_ticks(self.sample_rate_hz)
