@@ -53,7 +53,7 @@ from analogrig_emulator.errors import (
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
 from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
-from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension, Supply
+from analogrig_emulator.machine.noise import ABSOLUTE_ZERO_C, CircuitNoise, NoisySuspension, Supply
 from analogrig_emulator.machine.program import (
     CHANNELS,
     SOURCE,
@@ -71,6 +71,7 @@ from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, 
 from analogrig_emulator.machine.two_mass import TWO_MASS, TwoMassParts, TwoMassPlant, TwoMassProgram
 
 __all__ = [
+    "ABSOLUTE_ZERO_C",
     "BUMP_STOP",
     "CARDS",
     "CHANNELS",

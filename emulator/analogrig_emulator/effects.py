@@ -31,7 +31,7 @@ from analogrig_emulator.circuit.components import (
 )
 from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
 from analogrig_emulator.circuit.pot import PotTurn
-from analogrig_emulator.machine.noise import QUIET, NoisySuspension, Supply
+from analogrig_emulator.machine.noise import ABSOLUTE_ZERO_C, QUIET, NoisySuspension, Supply
 from analogrig_emulator.machine.program import CHANNELS, ProgramCircuit
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
@@ -242,7 +242,7 @@ def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
 
 def _supply_rows() -> Iterator[tuple[str, int, _Make]]:
     # The same 1/f density beside a white one of no account; resistors without noise.
-    cold = _Setup(op_amp=PRESETS["tl07x"], temperature_c=-273.15)
+    cold = _Setup(op_amp=PRESETS["tl07x"], temperature_c=ABSOLUTE_ZERO_C)
     grade = OP_AMP_GRADES["tl07x"]
     pink = OpAmpGrade(noise_v_per_rthz=1e-6 * grade.noise_v_per_rthz, flicker_hz=1e12 * grade.flicker_hz)
     yield "1/f noise of TL07x", DRAWS, _constant(dataclasses.replace(cold, noise=pink))

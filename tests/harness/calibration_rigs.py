@@ -23,7 +23,7 @@ from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibra
 from analogrig.program import Program
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.scenario import PotChange, Scenario
-from analogrig_emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
+from analogrig_emulator import COMPONENTS, PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
 
 _LOADS = {"M": "R1", "B": "RB", "K": "RK"}
 
@@ -142,14 +142,15 @@ def thesis_profile(program: ProgramName) -> Scenario:
 def _values(description: EmulatorDescription, program: ProgramName) -> dict[str, float]:
     """Values of the rig's machine by name, in ohm, F, V, Hz, V/s, and its dials."""
     scenario = Scenario(samples=1, excitation=Scenario.load("thesis").excitation, program=Program.load(program))
-    return _read(EmulatorRig(description).set_up(scenario, 0).computer)
+    return _read(EmulatorRig(description).set_up(scenario, 0).computer, description.computer.components)
 
 
 def _nominal(program: ProgramName) -> dict[str, float]:
-    return _read(SuspensionComputer(program, components=Components()))
+    return _read(SuspensionComputer(program, components=Components()), "nominal")
 
 
-def _read(computer: SuspensionComputer) -> dict[str, float]:
+def _read(computer: SuspensionComputer, stock: str) -> dict[str, float]:
+    instantaneous = COMPONENTS[stock].dielectric.instantaneous
     out = {f"dial {pot}": dial for pot, dial in computer.dials.items()}
     for element in computer.circuit.elements:
         if isinstance(element, Resistor):
@@ -157,7 +158,7 @@ def _read(computer: SuspensionComputer) -> dict[str, float]:
         elif isinstance(element, Pot):
             out[element.name] = element.track_ohm
         elif isinstance(element, Capacitor):
-            out[element.name] = element.farad
+            out[element.name] = element.farad / instantaneous
         elif isinstance(element, OpAmp):
             number = element.name.removeprefix("U")
             out[f"V{number}"], out[f"GBW{number}"] = element.model.vos_v, element.model.gbw_hz

@@ -40,7 +40,7 @@ from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.machine.suspension import BLOCK_SAMPLES, SuspensionComputer
 
 BOLTZMANN_J_PER_K = 1.380649e-23
-_ZERO_C_K = 273.15
+ABSOLUTE_ZERO_C = -273.15
 
 _ROOT_TWO = math.sqrt(2.0)
 _TURN = 2.0 * math.pi
@@ -209,7 +209,7 @@ class CircuitNoise:
         sample_rate_hz: float = 20e3,
         supply: Supply = QUIET,
     ) -> None:
-        temperature_k = temperature_c + _ZERO_C_K
+        temperature_k = temperature_c - ABSOLUTE_ZERO_C
         self._conditions = _Conditions(tuple(outputs), op_amps, temperature_k, 1.0 / sample_rate_hz, supply)
         self._sources = circuit.untrimmed.derive(_Sources)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}

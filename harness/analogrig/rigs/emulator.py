@@ -22,6 +22,7 @@ from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
 from analogrig.run import OUTPUT, Channel
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
+    ABSOLUTE_ZERO_C,
     CARDS,
     COMPONENTS,
     OP_AMP_GRADES,
@@ -41,6 +42,7 @@ from analogrig_emulator import (
     RepeatedPlay,
     Resistor,
     Sampler,
+    Supply,
     SuspensionComputer,
     WideProgram,
     Wired,
@@ -52,7 +54,7 @@ from analogrig_emulator import (
     probes_per_sample,
 )
 
-MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
+MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V, MOST_HUM_V = 1000.0, 1e-3, 1.0, 10.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
 MOST_DEVIATION = 0.9
 
@@ -136,7 +138,9 @@ class ComputerDescription:
     wiper_noise_ohm: float = 0.0
     """Largest rise of a wiper's resistance while its pot is turned (``ramp_n``)."""
     noise: bool = False
-    """Thermal noise of resistors and noise of the amplifiers; costs about 0.2 us a sample."""
+    """Thermal noise of resistors and noise of the amplifiers; costs about 1 us a sample."""
+    supply_hum_v: float = 0.0
+    """Amplitude of a sine of 100 Hz on the amplifiers' supply, of which their rejection lets a part through."""
 
     def components_for(self, seed: int) -> Components:
         """Components of the machine: as measured, or drawn from the seed.
@@ -170,14 +174,18 @@ class ComputerDescription:
         )
 
     def add_noise(self, computer: SuspensionComputer, seed: int) -> SuspensionComputer | NoisySuspension:
-        """The machine, with the noise of its components if that is described."""
-        if not self.noise:
+        """The machine, with the noise of its components and the hum of its supply if they are described."""
+        if not (self.noise or self.supply_hum_v):
             return computer
-        grade = OP_AMP_GRADES.get(self.op_amp, OpAmpGrade())
-        return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=self.temperature_c)
+        grade, temperature_c = OP_AMP_GRADES.get(self.op_amp, OpAmpGrade()), self.temperature_c
+        if not self.noise:
+            grade, temperature_c = OpAmpGrade(psrr=grade.psrr), ABSOLUTE_ZERO_C
+        rng, supply = Stream.NOISE.generator(seed), Supply(self.supply_hum_v)
+        return NoisySuspension(computer, rng, op_amps=grade, temperature_c=temperature_c, supply=supply)
 
     def __post_init__(self) -> None:
         config.check_range(self, "offset_v", 0.0, MOST_OFFSET_V)
+        config.check_range(self, "supply_hum_v", 0.0, MOST_HUM_V)
         if self.specimen is not None and self.specimen < 0:
             raise ValueError(f"specimen must be 0 to 2^63 - 1, not {self.specimen}")
         if self.values is not None and (self.offset_v or self.specimen is not None):
@@ -437,7 +445,8 @@ class EmulatorRig(Rig):
 
     def _draws_offsets_alone(self, card: Card) -> bool:
         drawn = self._description.computer
-        is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm and not drawn.noise
+        is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm
+        is_nominal &= not drawn.noise and not drawn.supply_hum_v
         is_nominal &= drawn.specimen is None and drawn.values is None
         is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
         return is_nominal and is_on_time

@@ -393,7 +393,8 @@ class ServedDescription(EmulatorDescription):
         card = self.card.card(CHANNELS)
         others = [each for each in fields(Card) if each.name not in _ON_BOTH | _OF_THE_CARD]
         of_card = tuple(f"card.{each.name}" for each in others if getattr(card, each.name) != each.default)
-        return (*of_card, "computer.noise") if self.computer.noise else of_card
+        of_computer = [f"computer.{key}" for key in ("noise", "supply_hum_v") if getattr(self.computer, key)]
+        return (*of_card, *of_computer)
 
 
 def _pair(values: NDArray[np.float64]) -> tuple[float, float]:
