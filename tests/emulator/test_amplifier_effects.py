@@ -13,6 +13,8 @@ import scipy.linalg
 from analogrig_emulator import (
     COMPONENTS,
     DIELECTRICS,
+    MULTIPLIER_GRADES,
+    MULTIPLIERS,
     OP_AMP_GRADES,
     TICKS_PER_SAMPLE,
     Capacitor,
@@ -24,6 +26,7 @@ from analogrig_emulator import (
     Edges,
     Engine,
     Excitation,
+    Multiplier,
     NoisySuspension,
     OpAmp,
     OpAmpGrade,
@@ -243,3 +246,29 @@ def test_hum_is_switched_by_itself_and_does_not_depend_on_blocks() -> None:
 def test_a_supply_that_cannot_be_is_refused(fields: dict[str, float]) -> None:
     with pytest.raises(CircuitError, match=f"supply: {next(iter(fields))} must be"):
         Supply(**fields)
+
+
+def test_noise_of_a_multiplier_is_its_density_over_its_bandwidth() -> None:
+    """AD633: 0.8 uV per root Hz over pi/2 times 1 MHz is 1 mV rms, as its data sheet says of 10 Hz to 5 MHz."""
+    elements = [VoltageSource("F", "in"), Multiplier("M1", "in", "in", "out", model=MULTIPLIERS["ad633"])]
+    noise = CircuitNoise(Circuit(elements), ["out"], op_amps=OpAmpGrade())
+    assert math.sqrt(noise.covariance[0, 0]) == pytest.approx(0.8e-6 * math.sqrt(math.pi / 2 * 1e6), rel=1e-9)
+    silent = replace(MULTIPLIERS["ad633"], noise_v_per_rthz=0.0)
+    circuit = Circuit([elements[0], Multiplier("M1", "in", "in", "out", model=silent)])
+    assert not CircuitNoise(circuit, ["out"], op_amps=OpAmpGrade()).covariance.any()
+    with pytest.raises(CircuitError, match="noise_v_per_rthz must not be negative"):
+        replace(silent, noise_v_per_rthz=-1.0)
+
+
+def test_a_multiplier_of_the_grade_has_offsets_and_errors_within_its_data_sheet_and_its_swing() -> None:
+    """Drawn over 200 specimens. Squaring 12 V asks for 14.4 V and gets the swing of 11 V and SR / CLAMP_RATE more."""
+    part = Multiplier("M1", "in", "in", "out", model=MULTIPLIERS["ad633"])
+    models = [
+        next(each.model for each in fit if isinstance(each, Multiplier))
+        for fit in (Components(multipliers=MULTIPLIER_GRADES["ad633"], seed=s).fit([part]) for s in range(200))
+    ]
+    for field, most in (("x_offset_v", 5e-3), ("y_offset_v", 5e-3), ("z_offset_v", 5e-3), ("gain_error", 2.5e-3)):
+        drawn = np.array([getattr(model, field) for model in models])
+        assert 0.9 * most < np.abs(drawn).max() <= most and abs(drawn.mean()) < 0.2 * most
+    at_rest = piecewise_linear(Circuit([VoltageSource("F", "in"), part])).rest(np.array([12.0])).volts["out"]
+    assert at_rest == pytest.approx(11.0 + 20e6 / CLAMP_RATE, rel=1e-9)

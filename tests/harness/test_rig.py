@@ -146,7 +146,7 @@ def test_noise_of_the_machine_moves_a_code_now_and_then_by_one(tmp_path: Path) -
 
 
 def test_hum_of_the_supply_moves_codes_without_noise(tmp_path: Path) -> None:
-    """10 V over a rejection of 1e5: 0.1 mV at each amplifier, a fraction of an LSB at the displacement; nothing drawn."""
+    """10 V over a rejection of 1e5: 0.1 mV at each amplifier, a fraction of an LSB in the displacement; none drawn."""
     humming = tmp_path / "humming.toml"
     text = config.locate("rigs", "emulator").read_text()
     humming.write_text(text.replace("[computer]", "[computer]\nsupply_hum_v = 10.0"))

@@ -231,14 +231,17 @@ class Nodal:
     def disturbances(self, dials: Mapping[str, float]) -> dict[str, Matrix]:
         """Contribution of unit sources to dx/dt while no limit acts, each (n,), with pots at `dials`.
 
-        Key node: 1 A into it; key op-amp: 1 V in series with its + input; ground: zeros. Raises like at().
+        Key node: 1 A into it; key op-amp: 1 V in series with its + input; key multiplier with a bandwidth: 1 V added to
+        its product; ground: zeros. Raises like at().
         """
         size = len(self._unknowns)
         slopes = self._laws.slopes(self._solve(self._set(dials, {}), np.eye(size + 1)))[: len(self._state)]
         columns = {node: slopes[:, row] if node != GROUND else np.zeros(len(slopes)) for node, row in self._row.items()}
         amps = {amp.name: amp for amp in self._poles}
         own = np.eye(len(self._state))
-        poles = {name: own[self._state[name]] * amp.model.gain_rate for name, amp in amps.items()}
+        followers = {part.name: part for part in self._multipliers if part.model.has_state}
+        held = {**amps, **followers}
+        poles = {name: own[self._state[name]] * part.model.gain_rate for name, part in held.items()}
         return columns | {name: slopes[:, row] for name, row in self._branch.items() if name not in amps} | poles
 
     # ---- entering the elements

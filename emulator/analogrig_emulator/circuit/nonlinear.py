@@ -35,7 +35,7 @@ class MultiplierModel(OutputStage):
     gain_error: relative error of the scale; x_offset_v, y_offset_v: added to the inputs; z_offset_v: added to the
     product; x_nonlinearity, y_nonlinearity: largest deviation from a straight line, as a fraction of full_v with the
     other input at full_v; bandwidth_hz: of the output; slew_v_per_s, swing_v: limits of the output; rout_ohm: its
-    resistance.
+    resistance; noise_v_per_rthz: white noise of the product, within the bandwidth (machine/noise.py).
 
     Raises CircuitError naming the field. Slew and swing need a finite bandwidth_hz: they act on its state.
     """
@@ -51,6 +51,7 @@ class MultiplierModel(OutputStage):
     slew_v_per_s: float = math.inf
     swing_v: tuple[float, float] = (-math.inf, math.inf)
     rout_ohm: float = 0.0
+    noise_v_per_rthz: float = 0.0
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -59,6 +60,8 @@ class MultiplierModel(OutputStage):
                 raise CircuitError(f"multiplier: {each.name} must be positive, got {value!r}")
             if each.name in _FINITE and not math.isfinite(value):
                 raise CircuitError(f"multiplier: {each.name} must be finite, got {value!r}")
+        if not 0 <= self.noise_v_per_rthz < math.inf:
+            raise CircuitError(f"multiplier: noise_v_per_rthz must not be negative, got {self.noise_v_per_rthz!r}")
         if not self.full_v > 0:
             raise CircuitError(f"multiplier: full_v must be positive, got {self.full_v!r}")
         self.require_limits("multiplier", "bandwidth_hz")
@@ -93,10 +96,10 @@ _FINITE = frozenset(
 MULTIPLIERS: Mapping[str, MultiplierModel] = MappingProxyType(
     {
         "ideal": MultiplierModel(),
-        "ad633": MultiplierModel(bandwidth_hz=1e6, slew_v_per_s=20e6, swing_v=(-11.0, 11.0)),
+        "ad633": MultiplierModel(bandwidth_hz=1e6, slew_v_per_s=20e6, swing_v=(-11.0, 11.0), noise_v_per_rthz=0.8e-6),
     }
 )
-"""Multipliers by name, with the typical bandwidth and limits of the data sheet; errors belong to specimens."""
+"""Multipliers by name, with the typical bandwidth, limits and noise of the data sheet; errors belong to specimens."""
 
 
 @dataclass(frozen=True)

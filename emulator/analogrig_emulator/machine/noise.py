@@ -1,13 +1,15 @@
 """Thermal noise of the resistors, input noise of the op-amps and hum of their supply, exact at the samples.
 
 The noise is small: it is the solution of the linear circuit with white sources, and adds to the engine's voltages.
-No amplifier limits and no diode limiter conducts in that circuit, so a bump stop does not change the noise.
+No amplifier limits and no diode limiter conducts in that circuit, so a bump stop does not change the noise. Products
+are held in it: noise begins at a multiplier's output, and ends at its inputs.
 With dx = A x dt + B dw, one sample period T takes the noise x to
 
     Phi x + w,   Phi = exp(A T),   cov(w) = integral over 0..T of exp(A s) B B' exp(A' s) ds
 
 both by doubling a short step (engine/noise.c). Sources (two-sided densities): 2 k T / R across each resistor and each
-leg of a pot, en^2 / 2 in series with the + input of an op-amp, in^2 / 2 into each of its inputs. Noise that reaches an
+leg of a pot, en^2 / 2 in series with the + input of an op-amp and in a product, in^2 / 2 into each of an op-amp's
+inputs. Noise that reaches an
 output without passing a state is omitted: white without bound in this model, some nV per root Hz in reality.
 
 1/f noise of an op-amp is the sum of one first-order process a decade, from 1 Hz to 1 kHz, each with the variance
@@ -32,6 +34,7 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import Circuit, OpAmp, Pot, Resistor
 from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
 from analogrig_emulator.circuit.nodal import analyse
+from analogrig_emulator.circuit.nonlinear import Multiplier
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
 from analogrig_emulator.engine import library
@@ -118,6 +121,7 @@ class _Sources:
         self._nodal = analyse(circuit)
         self._tracks_ohm = [(pot.name, pot.track_ohm) for pot in circuit.of(Pot)]
         self._amps = circuit.of(OpAmp)
+        self._multipliers = [part for part in circuit.of(Multiplier) if part.model.has_state]
         self._fixed_ohm = [resistor.ohm for resistor in circuit.of(Resistor)]
         bonds = [(resistor.a, resistor.b) for resistor in circuit.of(Resistor)]
         bonds += [leg for pot in circuit.of(Pot) for leg in pot.bonds]
@@ -189,7 +193,9 @@ class _Sources:
         voltages = _rows_of(response, [amp.name for amp in self._amps]) * (grade.noise_v_per_rthz / _ROOT_TWO)
         inputs = [node for amp in self._amps for node in (amp.plus, amp.minus)]
         currents = _rows_of(response, inputs) * (grade.noise_a_per_rthz / _ROOT_TWO)
-        return np.concatenate((thermal, voltages, currents))
+        densities = np.array([part.model.noise_v_per_rthz / _ROOT_TWO for part in self._multipliers])
+        products = _rows_of(response, [part.name for part in self._multipliers]) * densities[:, None]
+        return np.concatenate((thermal, voltages, currents, products))
 
 
 class CircuitNoise:
