@@ -214,10 +214,13 @@ def test_noise_of_an_amplifier_is_white_plus_one_over_f(hz: float) -> None:
 
 def test_one_over_f_noise_begins_as_it_goes_on() -> None:
     """Over seeds, the first levels have the variance of the stationary state."""
-    noise_of = {"op_amps": OpAmpGrade(noise_v_per_rthz=18e-9, flicker_hz=1e4), "sample_rate_hz": 1e3}
-    circuit = follower(OpAmpModel(gbw_hz=1e5))
-    volts = [CircuitNoise(circuit, ["out"], **noise_of).volts(2, np.random.default_rng(s))[1, 0] for s in range(400)]
-    still = CircuitNoise(circuit, ["out"], **noise_of)
+    grade, circuit = OpAmpGrade(noise_v_per_rthz=18e-9, flicker_hz=1e4), follower(OpAmpModel(gbw_hz=1e5))
+
+    def noise() -> CircuitNoise:
+        return CircuitNoise(circuit, ["out"], op_amps=grade, sample_rate_hz=1e3)
+
+    volts = [noise().volts(2, np.random.default_rng(s))[1, 0] for s in range(400)]
+    still = noise()
     state = scipy.linalg.solve_discrete_lyapunov(still.transition, still.covariance)
     assert np.std(volts) == pytest.approx(math.sqrt(state[0, 0]), rel=0.15)
 
@@ -250,7 +253,10 @@ def test_a_supply_that_cannot_be_is_refused(fields: dict[str, float]) -> None:
 
 def test_noise_of_a_multiplier_is_its_density_over_its_bandwidth() -> None:
     """AD633: 0.8 uV per root Hz over pi/2 times 1 MHz is 1 mV rms, as its data sheet says of 10 Hz to 5 MHz."""
-    elements = [VoltageSource("F", "in"), Multiplier("M1", "in", "in", "out", model=MULTIPLIERS["ad633"])]
+    elements: list[Element] = [
+        VoltageSource("F", "in"),
+        Multiplier("M1", "in", "in", "out", model=MULTIPLIERS["ad633"]),
+    ]
     noise = CircuitNoise(Circuit(elements), ["out"], op_amps=OpAmpGrade())
     assert math.sqrt(noise.covariance[0, 0]) == pytest.approx(0.8e-6 * math.sqrt(math.pi / 2 * 1e6), rel=1e-9)
     silent = replace(MULTIPLIERS["ad633"], noise_v_per_rthz=0.0)
