@@ -98,7 +98,7 @@ def test_a_machine_plays_it_in_blocks() -> None:
         np.concatenate(list(SuspensionComputer("front").play(sweep, 120, (), block_samples)))
         for block_samples in (120, 7)
     ]
-    assert np.array_equal(*played)
+    assert np.array_equal(played[0], played[1])
     assert np.abs(played[0][:, 0] - sweep.volts(np.arange(120.0))).max() < 1e-9
 
 

@@ -39,7 +39,7 @@ from analogrig_emulator.circuit.circuit import (
     element_error,
 )
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
-from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
 from analogrig_emulator.engine import library
@@ -240,7 +240,7 @@ class Nodal:
         amps = {amp.name: amp for amp in self._poles}
         own = np.eye(len(self._state))
         followers = {part.name: part for part in self._multipliers if part.model.has_state}
-        held = {**amps, **followers}
+        held: dict[str, OpAmp | Multiplier] = {**amps, **followers}
         poles = {name: own[self._state[name]] * part.model.gain_rate for name, part in held.items()}
         return columns | {name: slopes[:, row] for name, row in self._branch.items() if name not in amps} | poles
 
@@ -588,7 +588,7 @@ def _limits(part: OpAmp | Multiplier) -> dict[_Limit, Kink]:
         limits[_Limit.SLEW] = Kink.clip(model.slew_v_per_s)
     if model.clamps:
         limits[_Limit.SWING] = Kink.deadzone(*model.bounds_v)
-    if model.limits_current:
+    if isinstance(model, OpAmpModel) and model.limits_current:
         drop_v = model.rout_ohm * model.current_limit_a
         limits[_Limit.CURRENT] = Kink.deadzone(-drop_v, drop_v)
     return limits
