@@ -161,7 +161,7 @@ class Bench:
         real_time: float | None = None,
         time_limit_s: float | None = None,
         clock: Clock = time.monotonic,
-        builder: Callable[[int, Datasheet], RunBuilder] = RunBuilder,
+        builder: Callable[[int, int, Datasheet], RunBuilder] = RunBuilder,
     ) -> None:
         """Join ``rig`` and ``dut``.
 

@@ -43,7 +43,7 @@ def test_devices_behind_a_link_answer_live(dut: str, tmp_path: Path) -> None:
         async with open_client(bench) as socket:
             client = Client(socket)
             await client.until(lambda state: state["samples"] > 1500)
-            assert await client.ask("turn", name="K_n_per_m", value=15000.0) == ""
+            assert await client.ask("turn", name="K", value=15000.0) == ""
             state = await client.until(lambda state: any(alarm["what"] for alarm in state["alarms"]))
             assert all(alarm["latency_n"] > 0 for alarm in state["alarms"] if alarm["what"])
             assert not state["notices"]
@@ -62,7 +62,7 @@ def test_served_instrument_is_driven_record_by_record(tmp_path: Path) -> None:
             assert "whole records" in await client.ask("step")
             assert await client.ask("generate", on=True) == ""
             await client.until(lambda state: state["samples"] > 0)
-            assert await client.ask("turn", name="K_n_per_m", value=15000.0) == ""
+            assert await client.ask("turn", name="K", value=15000.0) == ""
             state = await client.until(lambda state: any(alarm["what"] == "K" for alarm in state["alarms"]))
             assert state["alarms"][-1]["change"] == 2000
             assert await client.ask("record", on=True) == ""

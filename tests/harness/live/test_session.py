@@ -33,9 +33,9 @@ BLOCK_N = int(RATE_HZ * BLOCK_S)
 
 PLAYED_BY_HAND = (
     (0.0, SetRecording(on=True)),
-    (0.1, Turn("K_n_per_m", 18000.0)),
-    (0.2, Turn("B_n_s_per_m", 3453.0, 100)),
-    (0.3, Turn("M_kg", 60.0)),
+    (0.1, Turn("K", 18000.0)),
+    (0.2, Turn("B", 3453.0, 100)),
+    (0.3, Turn("M", 60.0)),
     (0.4, SetRecording(on=False)),
     (0.41, SetPlaying(on=False)),
 )
@@ -51,10 +51,10 @@ def test_recording_names_the_sample_of_every_turn(recorded: LiveSession) -> None
     run = Run.load(saved.run)
     assert run.samples == saved.samples == 32 * BLOCK_N - BLOCK_N
     scenario = Scenario.load(str(saved.scenario))
-    assert [(each.sample % BLOCK_N, each.overrides(), each.ramp_n) for each in scenario.tweaks] == [
-        (BLOCK_N - 1, {"stiffness_n_per_m": 18000.0}, 0),
-        (BLOCK_N - 1, {"damping_n_s_per_m": 3453.0}, 100),
-        (BLOCK_N - 1, {"mass_kg": 60.0}, 0),
+    assert [(each.sample % BLOCK_N, each.set, each.ramp_n) for each in scenario.tweaks] == [
+        (BLOCK_N - 1, {"K": 18000.0}, 0),
+        (BLOCK_N - 1, {"B": 3453.0}, 100),
+        (BLOCK_N - 1, {"M": 60.0}, 0),
     ]
     assert [segment.start for segment in run.conditions.segments] == [0, *(each.sample for each in scenario.tweaks)]
 
@@ -152,9 +152,9 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (Turn("X", 1.0), "no pot is called 'X'"),
-        (Turn("K_n_per_m", 1e9), "K must be 24.5 to 29518"),
-        (Turn("K_n_per_m", float("nan")), "K must be"),
+        (Turn("X", 1.0), "no pot shows 'X'"),
+        (Turn("K", 1e9), "K must be 15000 to 29000 N/m"),
+        (Turn("K", float("nan")), "K must be"),
         (Generate(frequency_hz=1e9), "exceeds half the sample rate"),
         (Generate(low_v=11.0), "must be finite and not below low_v"),
     ],
@@ -167,7 +167,7 @@ def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
             session.do(command)
 
     session = scripted_session(((0.05, refuse),), tmp_path)
-    assert session.values == dict(session.desk.computer.program.values)
+    assert session.values == session.desk.scenario.plant.parameters()
     assert session.take_number == 1
 
 
@@ -182,10 +182,10 @@ def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> 
 
 
 def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
-    session = scripted_session(((0.05, Turn("K_n_per_m", 18000.0)), (0.1, Restart()), (0.15, ClearLamps())), tmp_path)
+    session = scripted_session(((0.05, Turn("K", 18000.0)), (0.1, Restart()), (0.15, ClearLamps())), tmp_path)
     assert session.take_number == 2
     assert session.ring.end < 0.06 * RATE_HZ
-    assert session.values["K_n_per_m"] == 18000.0
+    assert session.values["K"] == 18000.0
     assert not session.take.changes
 
 
@@ -208,7 +208,7 @@ def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> No
 
     clock = ScriptedClock(
         (
-            (0.02, Turn("K_n_per_m", 18000.0)),
+            (0.02, Turn("K", 18000.0)),
             (0.05, SetPlaying(on=False)),
             (90.0, SetPlaying(on=True)),
             (90.1, SetPlaying(on=False)),
@@ -227,9 +227,9 @@ def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> No
     [
         ("explode", {}, "no command is called 'explode'"),
         (7, {}, "no command is called 7"),
-        ("turn", {"name": "K_n_per_m"}, "the key 'value' is lacking"),
-        ("turn", {"name": "K_n_per_m", "value": "much"}, "must be a number"),
-        ("turn", {"name": "K_n_per_m", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
+        ("turn", {"name": "K"}, "the key 'value' is lacking"),
+        ("turn", {"name": "K", "value": "much"}, "must be a number"),
+        ("turn", {"name": "K", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
         ("tempo", {"factor": 0.0}, "factor must be 0.001 to"),
         ("step", {"samples": 10**9}, "samples must be 1 to"),
         ("operate", {"mode": "FLY"}, "must be one of"),
