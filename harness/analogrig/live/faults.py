@@ -21,10 +21,10 @@ SKEW_N = 0.5
 def labels(channel: str) -> Mapping[Fault, str]:
     """Faults with their labels, for the name of the channel."""
     return {
-        "noise": f"noise of {NOISE_LSB:g} LSB on the {channel}",
-        "hum": f"hum of {HUM_HZ:g} Hz on the {channel}",
-        "stuck": f"{channel} channel stuck",
-        "skew": f"{channel} sampled half a period late",
+        "noise": f"noise of {NOISE_LSB:g} LSB on channel {channel}",
+        "hum": f"hum of {HUM_HZ:g} Hz on channel {channel}",
+        "stuck": f"channel {channel} stuck",
+        "skew": f"channel {channel} sampled half a period late",
     }
 
 

@@ -86,7 +86,8 @@ class Notes:
         for alarm in answers.alarms:
             self._note_alarm(alarm.index)
         for diagnosis in answers.diagnoses:
-            self.diagnosis = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
+            named = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
+            self.diagnosis = self._desk.program.diagnosed.get(named, named)
         for misfit in answers.misfits:
             self.misfit = "" if misfit.cause == Cause.NONE else Cause(misfit.cause).name.lower().replace("_", " ")
         has_searched = self._search_bounds(end)

@@ -29,7 +29,7 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
         "patch": patch_rows(session),
         "ceiling": device.datasheet.ceiling,
-        "diagnoses": device.datasheet.diagnoses,
+        "diagnoses": device.datasheet.diagnoses and bool(desk.program.diagnosed),
         "misfits": device.datasheet.misfits,
     }
 

@@ -127,8 +127,8 @@ def test_modes_faults_generator_and_probes_are_at_hand(opened: Watched, bench: B
     page.get_by_role("button", name="hold", exact=True).click()
     expect(page.get_by_role("button", name="hold", exact=True)).to_have_attribute("aria-pressed", "true")
     page.get_by_role("button", name="operate", exact=True).click()
-    page.get_by_role("button", name="displacement channel stuck").click()
-    expect(page.get_by_role("button", name="displacement channel stuck")).to_have_attribute("aria-pressed", "true")
+    page.get_by_role("button", name="channel displacement stuck").click()
+    expect(page.get_by_role("button", name="channel displacement stuck")).to_have_attribute("aria-pressed", "true")
     assert bench.session.injected == {"stuck"}
     page.get_by_label("Frequency").fill("100")
     page.keyboard.press("Enter")

@@ -238,17 +238,8 @@ def test_client_that_takes_nothing_is_dropped_and_holds_up_nobody(tmp_path: Path
             small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             small.connect(("127.0.0.1", int(host_of(bench).rpartition(":")[2])))
             async with open_client(bench, max_queue=1, sock=small) as two:
-                await two.send(
-                    json.dumps(
-                        {
-                            "do": "view",
-                            "signals": ["U1", "U2", "U3", "U4"],
-                            "trigger": TRIGGER,
-                            "columns": 4000,
-                            "samples": 60000,
-                        }
-                    )
-                )
+                view = {"signals": ["U1", "U2", "U3", "U4"], "trigger": TRIGGER, "columns": 4000, "samples": 60000}
+                await two.send(json.dumps({"do": "view", **view}))
                 two.transport.pause_reading()
                 await driver.until(lambda state: state["clients"] == 1 and state["samples"] > 30_000)
                 frames = [await driver.frame() for _ in range(3)]

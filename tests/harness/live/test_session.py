@@ -10,6 +10,7 @@ import pytest
 
 from analogrig import cli
 from analogrig.errors import ConfigurationError
+from analogrig.judging.verdict import judge
 from analogrig.live.commands import (
     ClearLamps,
     Generate,
@@ -23,9 +24,14 @@ from analogrig.live.commands import (
     Turn,
     command_of,
 )
+from analogrig.live.desk import SteppedDesk
 from analogrig.live.session import BLOCK_S, LiveSession
+from analogrig.program import Program
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_emulator import SuspensionComputer
 from tests.harness.live.benches import SEED, scripted_session
 
 RATE_HZ = 20_000
@@ -82,6 +88,35 @@ def test_replay_and_judge_find_the_alarms_that_were_seen_live(
         assert [(each["latency"], each["bound"]) for each in found["tweaks"]] == [
             (first[each["sample"]].latency_n, first[each["sample"]].bound_n) for each in found["tweaks"]
         ]
+
+
+@pytest.mark.parametrize("program", ["dc-motor", "pendulum", "two-mass"])
+def test_alarm_of_any_program_has_the_latency_and_the_bound_of_its_recording(program: str, tmp_path: Path) -> None:
+    scenario = Scenario.of_program(Program.load(program))
+    name, row = next(iter(scenario.program.parameters.items()))
+    script = ((0.0, SetRecording(on=True)), (0.1, Turn(name, row.high, 40)), (0.2, SetRecording(on=False)))
+    session = scripted_session(script, tmp_path, scenario=scenario, rig="emulator-real")
+    assert list(session.knobs) == list(scenario.program.parameters)
+    assert not session.notes.estimates()  # these programs state none
+    alarm = next(alarm for alarm in session.notes.alarms if alarm.what)
+    (tweak,) = judge(Run.load(session.saved[0].run)).tweaks
+    assert (alarm.what, alarm.latency_n, alarm.bound_n) == (name, tweak.latency_n, tweak.bound_n)
+
+
+def test_digital_pots_that_show_two_parameters_follow_both(tmp_path: Path) -> None:
+    rig = tmp_path / "digital.toml"
+    rig.write_text('kind = "emulator"\n[computer]\npots = "dial"\n[card]\nrange_v = {}\n')
+    script = ((0.0, SetRecording(on=True)), (0.05, Turn("l", 0.55)), (0.1, Turn("m", 0.6)))
+    scenario = Scenario.of_program(Program.load("pendulum"))
+    session = scripted_session((*script, (0.15, SetRecording(on=False))), tmp_path, scenario=scenario, rig=str(rig))
+    assert isinstance(session.desk, SteppedDesk)
+    dials = session.desk.computer.dials
+    with open_rig(str(rig)) as opened:
+        assert isinstance(opened, EmulatorRig)
+        _, _, (_, turn) = opened.set_up(Scenario.load(str(session.saved[0].scenario)), SEED)
+    nominal = SuspensionComputer(scenario.program.circuit, opamp="ideal").dials_for(l=0.55, m=0.6)
+    assert dials == {**dials, **nominal}
+    assert {pot: turn.values[f"{pot}_dial"] for pot in ("P4", "P5")} == {pot: nominal[pot] for pot in ("P4", "P5")}
 
 
 def test_pot_is_felt_within_one_block(recorded: LiveSession) -> None:
@@ -145,7 +180,7 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
     (saved,) = scripted_session(script, tmp_path).saved
     run = Run.load(saved.run)
     assert np.unique(run.codes[2500:, 1]).size <= 12  # the noise of the card alone
-    assert "displacement channel stuck: injected by hand at sample 1750" in run.conditions.faults
+    assert "channel displacement stuck: injected by hand at sample 1750" in run.conditions.faults
     assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
 
 
@@ -203,7 +238,6 @@ def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None
 
 def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
     from analogrig.devices.opening import open_dut
-    from analogrig.rigs.description import open_rig
     from tests.harness.live.benches import ScriptedClock
 
     clock = ScriptedClock(

@@ -72,8 +72,7 @@
 
   function short(value, digits = 4) {
     if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-    const size = Math.abs(value);
-    if (size !== 0 && (size >= 1e6 || size < 1e-3)) return value.toExponential(digits - 1);
+    if (Math.abs(value) >= 1e6) return value.toExponential(digits - 1);
     return String(Number(value.toPrecision(digits)));
   }
 
@@ -125,7 +124,7 @@
     shown = shown.filter((id) => bench.signals.some((each) => each.id === id));
     if (!shown.length) shown = bench.signals.slice(0, 2).map(({ id }) => id);
     if (!shown.includes(current)) [current] = shown;
-    if (!$("source").value) $("level").value = bench.level;
+    if (!$("source").value) $("level").value = short(bench.level);
     const base = $("base").value;
     $("base").replaceChildren();
     for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")} per division`);
@@ -438,7 +437,8 @@
       if (!knob.held && state.values[name] !== undefined) knob.show(state.values[name]);
     }
     for (const each of document.querySelectorAll("#generator [data-key]")) {
-      if (document.activeElement !== each) each.value = state.generator[each.dataset.key];
+      const value = state.generator[each.dataset.key];
+      if (document.activeElement !== each) each.value = typeof value === "number" ? short(value, 6) : value;
       if (each.dataset.key === "duty") each.disabled ||= state.generator.shape !== "pulse";
     }
     for (const each of $("modes").children) each.setAttribute("aria-pressed", String(each.dataset.mode === state.mode));
@@ -481,6 +481,7 @@
       cell(row, alarm.latency_n ?? "–", "number");
       cell(row, alarm.bound_n ?? "–", "number");
     });
+    $("estimates").hidden = !state.estimates.length;
     rows($("estimates"), state.estimates, (row, { name, estimate, truth }) => {
       const head = document.createElement("th");
       head.scope = "row";
