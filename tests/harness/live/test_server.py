@@ -234,6 +234,7 @@ def test_client_that_takes_nothing_is_dropped_and_holds_up_nobody(tmp_path: Path
     async def work(bench: BenchServer) -> None:
         async with open_client(bench) as one:
             driver = Client(one)
+            await driver.ask("view", signals=["force"], trigger=TRIGGER)
             small = socket.socket()
             small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             small.connect(("127.0.0.1", int(host_of(bench).rpartition(":")[2])))
