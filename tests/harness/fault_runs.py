@@ -108,7 +108,9 @@ class SignalsRig(Rig):
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:  # noqa: ARG002
         channels = {name: Channel(0.0, 1.0, "code", 1.0, 1.0) for name in CHANNELS}
-        return Performance(5e-5, 200.0, channels, self._blocks(scenario.samples), lambda: Hindsight(scenario.segments()))
+        return Performance(
+            5e-5, 200.0, channels, self._blocks(scenario.samples), lambda: Hindsight(scenario.segments())
+        )
 
     def _blocks(self, n: int) -> Iterator[Block]:
         for first in range(0, n, RIG_BLOCK):
