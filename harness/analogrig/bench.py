@@ -161,7 +161,7 @@ class Bench:
         real_time: float | None = None,
         time_limit_s: float | None = None,
         clock: Clock = time.monotonic,
-        builder: Callable[[int, Datasheet], RunBuilder] = RunBuilder,
+        builder: Callable[[int, Datasheet], RunBuilder] | None = None,
     ) -> None:
         """Join ``rig`` and ``dut``.
 
@@ -176,7 +176,7 @@ class Bench:
         self._real_time = real_time
         self._time_limit_s = math.inf if time_limit_s is None else time_limit_s
         self._clock = clock
-        self._builder = builder
+        self._builder = builder or RunBuilder
         self._scenario: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def play(self, scenario: Scenario, seed: int) -> Run:
