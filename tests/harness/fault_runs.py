@@ -208,7 +208,7 @@ def _play(link: Link, description: InprocDevice, case: Case) -> Played:
     except AnalogrigError as error:
         return Played(type(error).__name__, str(error))
     verdict = judge(run)
-    if not verdict.valid:
+    if verdict.outcome == "inconclusive":
         return Played("inconclusive", "; ".join(verdict.reasons), run)
     return Played("lost" if run.lost.any() else "as without", "", run)
 
