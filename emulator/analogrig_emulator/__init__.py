@@ -7,7 +7,6 @@ from analogrig_emulator.card.acquisition import acquired, ahead_ticks, probes_pe
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
-from analogrig_emulator.card.smooth import SmoothExcitation, Tone
 from analogrig_emulator.circuit.circuit import (
     Capacitor,
     Circuit,
@@ -145,13 +144,11 @@ __all__ = [
     "SamplerError",
     "Scale",
     "Scales",
-    "SmoothExcitation",
     "Supply",
     "SuspensionComputer",
     "SuspensionParts",
     "SuspensionProgram",
     "Switch",
-    "Tone",
     "TwoMassParts",
     "TwoMassPlant",
     "TwoMassProgram",

@@ -162,6 +162,8 @@ class Scenario:
                     f"the tweak at sample {tweak.sample} lasts {number_of(tweak.ramp_n, 'sample')},"
                     f" beyond the next one at {following.sample}"
                 )
+        if self.random_phase and self.excitation.shape == "recorded":
+            raise ValueError("random_phase: an excitation of the shape recorded has no phase")
         plant = self.plant
         for i, tweak in enumerate(self.tweaks):
             try:

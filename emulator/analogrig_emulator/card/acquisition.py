@@ -158,6 +158,14 @@ class _OnCardClock(Excitation):
         del sample_rate_hz
         return super().period_ticks(self.clock_hz)
 
+    def check_rate(self, sample_rate_hz: float) -> None:
+        del sample_rate_hz
+        super().check_rate(self.clock_hz)
+
+    def smooth_v(self, at: NDArray[np.float64], sample_rate_hz: float) -> NDArray[np.float64]:
+        del sample_rate_hz
+        return super().smooth_v(at / self.probes, self.clock_hz)
+
     def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
         del sample_rate_hz  # the machine's rate; the generator follows clock_hz
         slow = super().edges(-(-start_tick // self.probes), -(-stop_tick // self.probes), self.clock_hz)

@@ -8,23 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig_emulator.card.smooth import MOST_V
 from analogrig_emulator.engine.system import Drive
 from analogrig_emulator.errors import ExcitationError
 
-MOST_V = 1e3
-
-
-class DrivenExcitation:
-    """Generator whose level moves all the time."""
-
-    @property
-    def drive(self) -> Drive:
-        """Signal as the engine takes it."""
-        raise NotImplementedError
-
-
 @dataclass(frozen=True, eq=False)
-class RecordedExcitation(DrivenExcitation):
+class RecordedExcitation:
     """Generator that plays samples_v, (n,) in V, one at each sample instant; the last one holds.
 
     Between samples the signal is band-limited to half the sample rate, as that before the recorder's filter was.
@@ -39,7 +28,14 @@ class RecordedExcitation(DrivenExcitation):
         if not (np.abs(self.samples_v) <= MOST_V).all():
             raise ExcitationError(f"excitation: a recorded sample is not finite, or beyond +-{MOST_V:g} V")
 
+    is_smooth = True
+    """The level moves all the time."""
+
     @functools.cached_property
-    def drive(self) -> Drive:
-        """Signal as the engine takes it."""
+    def signal(self) -> Drive:
+        """Signal from sample 0 on."""
         return Drive.band_limited(np.asarray(self.samples_v, np.float64))
+
+    def drive(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Drive:  # noqa: ARG002 - all at once
+        """Signal as the engine takes it, for the ticks start_tick <= t < stop_tick at least."""
+        return self.signal

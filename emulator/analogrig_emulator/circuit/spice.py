@@ -36,7 +36,7 @@ from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
 from analogrig_emulator.circuit.pot import END_FRACTION, PotTurn
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges
 from analogrig_emulator.errors import CircuitError
 
 STEP_S = 1e-11
@@ -141,14 +141,16 @@ class Accuracy:
 class Deck:
     """A circuit, its excitation and its pot changes: the engine plays it, ngspice runs its text.
 
-    samples: number of samples at ``sample_rate_hz``; edges: levels by input, from tick 0 on, 0 V without any; turns:
-    changes of dials, without ramps; initial_v: V at sample 0 by state (capacitor, op-amp with a pole), else 0 V.
+    samples: number of samples at ``sample_rate_hz``; edges: levels by input, from tick 0 on, 0 V without any; drives:
+    inputs that move all the time instead, for ngspice in straight pieces of a 32nd of a sample period; turns: changes
+    of dials, without ramps; initial_v: V at sample 0 by state (capacitor, op-amp with a pole), else 0 V.
     """
 
     circuit: Circuit
     samples: int = 0
     sample_rate_hz: float = 20e3
     edges: Mapping[str, Edges] = field(default_factory=dict)
+    drives: Mapping[str, Drive] = field(default_factory=dict)
     turns: Sequence[PotTurn] = ()
     initial_v: Mapping[str, float] = field(default_factory=dict)
     title: str = "analogue computer"
@@ -172,7 +174,8 @@ class Deck:
         nodal = Nodal(self.circuit)
         dials: dict[str, float] = {}
         system = nodal.at(dials)
-        engine = Engine(system, self.circuit.nodes if nodes is None else nodes, self.sample_rate_hz)
+        outputs = self.circuit.nodes if nodes is None else nodes
+        engine = Engine(system, outputs, self.sample_rate_hz, drives=self.drives)
         engine.state = np.array([self.initial_v.get(state, 0.0) for state in system.states])
         stretches = []
         for change in [*sorted(self.turns, key=lambda change: change.sample), PotTurn(self.samples - 1, {})]:
@@ -203,7 +206,7 @@ class _DeckWriter:
 
     def check(self, nodes: Sequence[str] | None) -> None:
         circuit = self._circuit
-        _known("input", self._deck.edges, [source.name for source in circuit.inputs])
+        _known("input", {**self._deck.edges, **self._deck.drives}, [source.name for source in circuit.inputs])
         for change in self._deck.turns:
             circuit.with_dials(change.values)
             if change.ramp_n:
@@ -254,7 +257,11 @@ class _DeckWriter:
 
     def _source(self, card: str, source: VoltageSource | CurrentSource) -> Iterator[str]:
         head, level = f"{card} {source.plus} {source.minus}", source.constant
-        if level is None:
+        if source.name in self._deck.drives:
+            at = np.arange((self._deck.samples - 1) * _PIECES_PER_SAMPLE + 1) / _PIECES_PER_SAMPLE
+            levels_v = self._deck.drives[source.name].volts(at)
+            yield from _straight(head, [f"{_number(k * self._period_s)} {_number(v)}" for k, v in zip(at, levels_v, strict=True)])
+        elif level is None:
             yield from _stepped(head, *_levels(self._deck.edges.get(source.name, Edges.none()), self._period_s))
         else:
             yield f"{head} DC {_number(level)}"
@@ -282,6 +289,8 @@ class _DeckWriter:
         self._taken.add(name.lower())
         return name
 
+
+_PIECES_PER_SAMPLE = 32
 
 _LETTERS: Mapping[type, str] = {
     Resistor: "R",
@@ -327,6 +336,11 @@ def _stepped(head: str, times_s: NDArray[np.float64], values: NDArray[np.float64
     points = [f"0 {_number(values[0])}"]
     for time_s, before, after in zip(times_s[1:], values[:-1], values[1:], strict=True):
         points += [f"{_number(time_s)} {_number(before)}", f"{_number(time_s + STEP_S)} {_number(after)}"]
+    yield from _straight(head, points)
+
+
+def _straight(head: str, points: Sequence[str]) -> Iterator[str]:
+    """A PWL source through points, each an instant and a level."""
     yield f"{head} PWL("
     for i in range(0, len(points), _WRAP):
         yield "+ " + " ".join(points[i : i + _WRAP])

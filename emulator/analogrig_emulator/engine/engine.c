@@ -436,11 +436,11 @@ void engine_get_overdue(const engine_t* const self, int64_t* tick) {
     }
 }
 
-engine_status_t engine_drive(engine_t* const self, int product, int64_t samples, const double* terms) {
-    if (product < 0 || product >= self->products || samples < 1) {
+engine_status_t engine_drive(engine_t* const self, int product, int64_t first, int64_t samples, const double* terms) {
+    if (product < 0 || product >= self->products || first < 0 || samples < 1) {
         return ENGINE_EDGE;
     }
-    self->drives[product] = (drive_t){ samples, terms };
+    self->drives[product] = (drive_t){ first, samples, terms };
     return ENGINE_OK;
 }
 

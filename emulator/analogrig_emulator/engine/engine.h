@@ -160,10 +160,11 @@ void engine_watch(engine_t* self, int64_t patience);
 void engine_get_overdue(const engine_t* self, int64_t* tick);
 
 /// Drive a product from now until engine_restart(): add to it the polynomial of the present sample period, with ENGINE_DRIVE_TERMS
-/// coefficients in order of powers of the time since its sample, in sample periods. terms: a row for each of `samples` samples,
-/// the first for sample 0; the last one holds from there on. They are not copied. Neighbouring polynomials must meet. NULL: no
-/// drive. Fails with ENGINE_EDGE iff there is no such product, or samples < 1. Its own curvature shortens no step.
-engine_status_t engine_drive(engine_t* self, int product, int64_t samples, const double* terms);
+/// coefficients in order of powers of the time since its sample, in sample periods. terms: a row for each of `samples` samples
+/// from sample `first` on; the level at the end of the last one holds. They are not copied. Neighbouring polynomials must meet, also
+/// those of one call and the next. No sample before `first` may follow. Fails with ENGINE_EDGE iff there is no such product,
+/// first < 0 or samples < 1. Its own curvature shortens no step.
+engine_status_t engine_drive(engine_t* self, int product, int64_t first, int64_t samples, const double* terms);
 
 /// From now on record y once more `ticks` after each sample, at most one sample period: a row then holds both. To be called
 /// before the first sample. Edges and circuits after the sample are not foreseen, and the samples do not change.

@@ -67,7 +67,7 @@ class Engine:
         drives: Mapping[str, Drive] = MappingProxyType({}),
     ) -> None:
         system = system.driven(tuple(drives))
-        self._drives = dict(drives)
+        self._drives: dict[str, Drive] = {}
         self._outputs = tuple(outputs)
         self._ahead_ticks = ahead_ticks
         self._names = (system.states, system.inputs)
@@ -91,11 +91,8 @@ class Engine:
         weakref.finalize(self, _release, kind, self._handle)
         self._library.engine_look_ahead(self._handle, ahead_ticks)
         self._kinks = len(system.kinks)
-        for product, drive in enumerate(drives.values(), products - len(drives)):
-            terms = drive.terms
-            if terms.shape != (len(terms), library.DRIVE_TERMS) or not (len(terms) and np.isfinite(terms).all()):
-                raise EngineError(f"a drive needs rows of {library.DRIVE_TERMS} finite coefficients")
-            self._check(self._library.engine_drive(self._handle, product, len(terms), terms.ctypes.data))
+        self._driven = {name: product for product, name in enumerate(drives, products - len(drives))}
+        self.follow(drives)
         self._recorded = 0
         self._now_tick = -1
         self._set(system)
@@ -141,6 +138,16 @@ class Engine:
             )
         self._layout = system.layout(self._outputs)
         self._check(self._library.engine_set_system(self._handle, ctypes.byref(self._layout.circuit)))
+
+    def follow(self, drives: Mapping[str, Drive]) -> None:
+        """Replace drives by those of the coming samples, from the one last recorded on. Raises EngineError."""
+        for name, drive in drives.items():
+            terms = drive.terms
+            if terms.shape != (len(terms), library.DRIVE_TERMS) or not (len(terms) and np.isfinite(terms).all()):
+                raise EngineError(f"a drive needs rows of {library.DRIVE_TERMS} finite coefficients")
+            placed = (drive.first, len(terms), terms.ctypes.data)
+            self._check(self._library.engine_drive(self._handle, self._driven[name], *placed))
+            self._drives[name] = drive
 
     def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
         """Record the next samples, each after the edges at its instant: float64 (samples, outputs), V.
@@ -258,10 +265,13 @@ class Engine:
 
     @property
     def overdue_ticks(self) -> NDArray[np.int64]:
-        """First tick by kink at which it had been outside for the ticks of watch(), else -1: int64 (kinks,)."""
+        """First tick by kink at which it had been outside for the ticks of watch(), else -1: int64 (kinks,).
+
+        Arguments of drives are no kinks of the circuit.
+        """
         ticks = np.empty(self._kinks, np.int64)
         self._library.engine_get_overdue(self._handle, ticks.ctypes.data)
-        return ticks
+        return ticks[: self._kinks - 2 * len(self._driven)]
 
     @property
     def now_tick(self) -> int:

@@ -164,7 +164,7 @@ typedef struct {
 
 /// See engine_drive(); terms is NULL without one.
 typedef struct {
-    int64_t       samples;
+    int64_t       first, samples;
     const double* terms;
 } drive_t;
 

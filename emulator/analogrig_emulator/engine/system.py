@@ -79,14 +79,15 @@ class Drive:
     """Level of one input that moves all the time: a polynomial in each sample period.
 
     terms: float64 (samples, DRIVE_TERMS), V: coefficients in order of powers of the time since each sample, in sample
-    periods. Neighbours meet; the last one is constant.
+    periods; first: sample of the first row. Neighbours meet. The level at the end of the last row holds.
     """
 
     terms: Matrix
+    first: int = 0
 
     @classmethod
     def band_limited(cls, samples_v: Matrix) -> Drive:
-        """Band-limited interpolation of samples (n,) in V, which go on in their mirror image; n is at least 1.
+        """Band-limited interpolation of samples (n,) in V, which go on in their mirror image; the last one holds.
 
         The polynomials pass through the interpolation at the nodes of the engine's longest step.
         """
@@ -97,26 +98,45 @@ class Drive:
             for node in _NODES[1:-1]
         ]
         after = np.append(samples_v[1:], samples_v[-1])
-        return cls._through(np.stack([samples_v, *inner, after], axis=1))
+        values = np.stack([samples_v, *inner, after])
+        values[:, -1] = samples_v[-1]
+        return cls._through(values)
 
     @classmethod
-    def through(cls, volts: Callable[[Matrix], Matrix], samples: int) -> Drive:
-        """Signal given by a function of the time in sample periods, at the nodes of the engine's longest step."""
-        at = np.arange(float(samples))
-        return cls._through(np.stack([volts(at + node) for node in _NODES], axis=1))
+    def sampled(cls, volts: Callable[[Matrix], Matrix], start_tick: int, stop_tick: int) -> Drive:
+        """Signal of ticks start_tick <= t < stop_tick, by a function of the time in sample periods.
+
+        The polynomials pass through it at the nodes of the engine's longest step.
+        """
+        first, last = start_tick // TICKS_PER_SAMPLE, (stop_tick - 1) // TICKS_PER_SAMPLE
+        at = np.arange(first, last + 1, dtype=np.float64)
+        values = np.stack([volts(at + node) for node in _NODES])
+        values[-1, :-1] = values[0, 1:]
+        return cls._through(values, first)
 
     @classmethod
-    def _through(cls, values: Matrix) -> Drive:
-        """Polynomials through the values at the nodes of each sample, (n, nodes); the last sample holds."""
-        values[-1] = values[-1, 0]
-        terms = np.ascontiguousarray(values.T)
-        solve_in_place(np.vander(_NODES, increasing=True), terms)
-        return cls(np.ascontiguousarray(terms.T))
+    def _through(cls, values: Matrix, first: int = 0) -> Drive:
+        """Polynomials through the values at the nodes of each sample, (nodes, n), which are overwritten."""
+        solve_in_place(np.vander(_NODES, increasing=True), values)
+        return cls(np.ascontiguousarray(values.T), first)
 
     def at(self, tick: int) -> float:
-        """Level at a tick, from 0 on."""
-        row = min(tick // TICKS_PER_SAMPLE, len(self.terms) - 1)
-        return _polynomial(tuple(self.terms[row].tolist()), tick / TICKS_PER_SAMPLE - row)
+        """Level at a tick from the first sample on."""
+        return float(self.volts(np.array([tick / TICKS_PER_SAMPLE]))[0])
+
+    def volts(self, at: Matrix) -> Matrix:
+        """Level at instants in sample periods, from the first sample on."""
+        row = np.minimum(at.astype(np.int64) - self.first, len(self.terms) - 1)
+        since = np.minimum(at - (row + self.first), 1.0)
+        level = np.zeros(at.shape)
+        for power in reversed(range(library.DRIVE_TERMS)):
+            level *= since
+            level += self.terms[row, power]
+        return level
+
+    def after(self, sample: int) -> Drive:
+        """The same from a sample on, counted from there."""
+        return Drive(self.terms[sample - self.first :])
 
 
 _NODES = (0.0, 0.5 - 0.5 * math.sqrt(3.0 / 7.0), 0.5, 0.5 + 0.5 * math.sqrt(3.0 / 7.0), 1.0)

@@ -56,7 +56,7 @@ class Course:
         """turns: circuits and the probes after which they begin, the first at once. Samples are taken at a probe."""
         self._courses, self._start, self._turns, self._probe = courses, start, turns, probe
         self._edges = courses.edges_from(start.sample)
-        self._engine = courses.engine(turns[0][1])
+        self._engine = courses.engine(turns[0][1], start.sample)
         self._engine.state = start.state
         self._coming = list(turns[1:])
         self._run(1 + probe)
@@ -79,7 +79,7 @@ class Course:
         until = self._engine.recorded + probes
         now = [turn for turn in self._coming if turn[0] < until]
         del self._coming[: len(now)]
-        edges = {SOURCE: self._edges.within(*self._engine.window(probes))}
+        edges = {} if self._edges is None else {SOURCE: self._edges.within(*self._engine.window(probes))}
         return self._engine.run_changing(probes, now, edges) if now else self._engine.run(probes, edges)
 
 
@@ -99,7 +99,9 @@ class Courses:
         program = self._machine.program
         self._nodes = (program.channel_nodes[channel],)
         self.sign = float(program.channel_signs[channel])
-        self._edges = on_card_clock(card, excitation).edges(0, self._tick(samples), self._machine.sample_rate_hz)
+        generator, until = on_card_clock(card, excitation), (0, self._tick(samples), self._machine.sample_rate_hz)
+        self._drive = generator.drive(*until) if generator.is_smooth else None
+        self._edges = None if generator.is_smooth else generator.edges(*until)
         self._later: dict[int, Edges] = {}
 
     @property
@@ -119,12 +121,15 @@ class Courses:
         """
         return Course(self, start, self._turns(before, after, ramp_n), self._probe)
 
-    def engine(self, circuit: PiecewiseLinear) -> Engine:
-        """Engine of the machine, at rest before a first sample."""
-        return Engine(circuit, self._nodes, self._machine.sample_rate_hz)
+    def engine(self, circuit: PiecewiseLinear, sample: int) -> Engine:
+        """Engine of the machine, at rest before a sample, which it counts as its first."""
+        drives = {} if self._drive is None else {SOURCE: self._drive.after(sample * self.probes)}
+        return Engine(circuit, self._nodes, self._machine.sample_rate_hz, drives=drives)
 
-    def edges_from(self, sample: int) -> Edges:
-        """Edges after a sample, counted from there, with the level at the sample first."""
+    def edges_from(self, sample: int) -> Edges | None:
+        """Edges after a sample, counted from there, with the level at the sample first; None for a smooth level."""
+        if self._edges is None:
+            return None
         if sample not in self._later:
             tick = self._tick(sample)
             level_v = self._edges.levels_v[np.searchsorted(self._edges.ticks, tick, "right") - 1]

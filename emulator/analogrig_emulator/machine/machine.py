@@ -197,9 +197,8 @@ class AnalogComputer:
         nodes = self._patched.nodes
         probe = Engine(self._system, nodes, self._sample_rate_hz)
         probe.state = self._engine.state
-        driven_v = {name: drive.at(max(self._engine.now_tick, 0)) for name, drive in self._drives.items()}
-        levels_v = self._levels_v | driven_v
-        volts = probe.run(1, {name: Edges(np.zeros(1, np.int64), np.array([v])) for name, v in levels_v.items()})
+        levels = self._levels_at(max(self._engine.now_tick, 0)).items()
+        volts = probe.run(1, {name: Edges(np.zeros(1, np.int64), np.array([v])) for name, v in levels})
         return dict(zip(nodes, volts[0].tolist(), strict=True))
 
     # ---- pots
@@ -322,6 +321,12 @@ class AnalogComputer:
         with self._all_or_nothing(charged=self._powered):
             self._initial_v = wanted
             self._nodals = {mode: nodal for mode, nodal in self._nodals.items() if mode in (Mode.HOLD, Mode.OPERATE)}
+
+    def follow(self, drives: Mapping[str, Drive]) -> None:
+        """Replace drives by those of the coming samples, as Engine.follow does."""
+        self._drives |= drives
+        if self._powered is not None:
+            self._powered.follow(drives)
 
     def switch(self, mode: Mode) -> None:
         """Switch to a mode at the present instant. The present mode changes nothing.
@@ -482,6 +487,10 @@ class AnalogComputer:
     def _note_levels(self, edges: Mapping[str, Edges]) -> None:
         self._levels_v |= {name: float(train.levels_v[-1]) for name, train in edges.items() if train.ticks.size}
 
+    def _levels_at(self, tick: int) -> dict[str, float]:
+        """Levels of all inputs at the present tick, in V."""
+        return self._levels_v | {name: drive.at(tick) for name, drive in self._drives.items()}
+
     def _check_instants(self, samples: int, ticks: Sequence[int]) -> None:
         _, stop = self.window(samples)
         allowed = [max(self._engine.now_tick, 0), *ticks, stop - 1]
@@ -531,7 +540,8 @@ class AnalogComputer:
 
     def _charge_at_once(self, engine: Engine) -> None:
         if self._ic_ohm is None and self._mode in (Mode.INITIAL_CONDITION, Mode.POT_SET):
-            levels_v = [self._levels_v[name] for name in self._system.inputs]
+            levels = self._levels_at(max(engine.now_tick, 0))
+            levels_v = [levels[name] for name in self._system.inputs]
             engine.state = self._system.rest(np.array(levels_v)).state
 
     def _circuit_in(self, mode: Mode) -> Circuit:

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.card.recorded import DrivenExcitation
+from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
-from analogrig_emulator.engine.system import Drive, Edges, is_integer
+from analogrig_emulator.engine.system import Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
 from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
@@ -134,7 +134,7 @@ class SuspensionComputer:
 
     def play(
         self,
-        excitation: Excitation | DrivenExcitation,
+        excitation: Excitation | RecordedExcitation,
         samples: int,
         changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
@@ -152,7 +152,7 @@ class SuspensionComputer:
 
     def play_planned(
         self,
-        excitation: Excitation | DrivenExcitation,
+        excitation: Excitation | RecordedExcitation,
         samples: int,
         turns: Sequence[PotTurn],
         block_samples: int = BLOCK_SAMPLES,
@@ -178,32 +178,33 @@ class SuspensionComputer:
 
     def _begin(
         self,
-        excitation: Excitation | DrivenExcitation,
+        excitation: Excitation | RecordedExcitation,
         lengths: Iterable[int],
         turns: list[PotTurn],
         ahead_ticks: int,
         probes: Sequence[str] = (),
     ) -> Iterator[NDArray[np.float64]]:
-        drives: dict[str, Drive] = {}
-        generator = None if isinstance(excitation, DrivenExcitation) else excitation
-        if isinstance(excitation, DrivenExcitation):
-            drives[SOURCE] = excitation.drive
-        else:
-            excitation.period_ticks(self.sample_rate_hz)
+        if isinstance(excitation, Excitation):
+            excitation.check_rate(self.sample_rate_hz)
+        drives = {SOURCE: excitation.drive(0, 1, self.sample_rate_hz)} if excitation.is_smooth else {}
         self.machine.read_nodes((*self.program.channel_nodes, *probes))
         self.machine.restart(Mode.OPERATE, ahead_ticks, drives)
         self._plays += 1
-        return self._blocks(self._plays, generator, lengths, turns)
+        return self._blocks(self._plays, excitation, lengths, turns)
 
     def _blocks(
-        self, play: int, excitation: Excitation | None, lengths: Iterable[int], turns: list[PotTurn]
+        self,
+        play: int,
+        excitation: Excitation | RecordedExcitation,
+        lengths: Iterable[int],
+        turns: list[PotTurn],
     ) -> Iterator[NDArray[np.float64]]:
         stop = 0
         for length in lengths:
             stop += length
             parts = []
             window = self.machine.window(length)
-            edges = None if excitation is None else excitation.edges(*window, self.sample_rate_hz)
+            edges = self._excite(excitation, window)
             while play == self._plays and self.machine.recorded < stop:
                 now = [turn for turn in turns if turn.sample < stop]
                 if not self.machine.is_turning and not any(turn.ramp_n for turn in now):
@@ -219,9 +220,16 @@ class SuspensionComputer:
                 raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _advance(self, edges: Edges | None, samples: int, turns: Sequence[PotTurn] = ()) -> NDArray[np.float64]:
+    def _excite(self, excitation: Excitation | RecordedExcitation, window: tuple[int, int]) -> Edges:
+        """Edges of a window; the machine follows a level that moves all the time instead."""
+        if isinstance(excitation, Excitation) and not excitation.is_smooth:
+            return excitation.edges(*window, self.sample_rate_hz)
+        self.machine.follow({SOURCE: excitation.drive(*window, self.sample_rate_hz)})
+        return Edges.none()
+
+    def _advance(self, edges: Edges, samples: int, turns: Sequence[PotTurn] = ()) -> NDArray[np.float64]:
         """Volts of the next samples, with these turns, all at once: (samples, channels)."""
-        trains = {} if edges is None else {SOURCE: edges.within(*self.machine.window(samples))}
+        trains = {SOURCE: edges.within(*self.machine.window(samples))} if edges.ticks.size else {}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
         channels = len(self._signs)

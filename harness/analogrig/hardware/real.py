@@ -135,9 +135,10 @@ class RealRig(Rig):
 
     def _check_force(self, excitation: Excitation, where: str) -> None:
         low_v, high_v = self._description.limits.force_v
-        if excitation.low_v < low_v or excitation.high_v > high_v:
+        least_v, most_v = excitation.range_v
+        if least_v < low_v or most_v > high_v:
             raise ConfigurationError(
-                f"{where}the force of {excitation.low_v:g} V to {excitation.high_v:g} V exceeds limits.force_v,"
+                f"{where}the force of {least_v:g} V to {most_v:g} V exceeds limits.force_v,"
                 f" {low_v:g} V to {high_v:g} V"
             )
         try:

@@ -177,6 +177,10 @@ class RealDescription(RigDescription):
 
         :raises ConfigurationError: the stage between them cannot give the shape.
         """
+        if excitation.is_smooth:
+            raise ConfigurationError(
+                f"generator: a real rig plays the shapes square, pulse and prbs, not {excitation.shape!r}"
+            )
         stage = self.generator
         low_v, high_v = (stage.input_v(volts) for volts in (excitation.low_v, excitation.high_v))
         if low_v <= high_v:

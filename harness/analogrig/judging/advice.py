@@ -162,9 +162,10 @@ def _warm_up(run: Run) -> Iterator[str]:
 
 
 def _excitation(run: Run) -> Excitation | None:
-    """Recorded excitation; None if the scenario has none, or nothing is known of it."""
+    """Recorded excitation with edges; None if the scenario has none, or nothing is known of it."""
     table = run.conditions.scenario.get("excitation") if run.conditions.segments else None
-    return None if table is None else config.build(Excitation, table, "the recorded excitation")
+    found = None if table is None else config.build(Excitation, table, "the recorded excitation")
+    return None if found is None or found.is_smooth else found
 
 
 def _edge_instants(run: Run, excitation: Excitation) -> NDArray[np.float64]:

@@ -35,7 +35,7 @@ class Generate:
     """Set the generator; None leaves a setting as it is. The machine starts from rest."""
 
     on: bool | None = None
-    shape: Literal["square", "pulse", "prbs"] | None = None
+    shape: Literal["square", "pulse", "prbs", "sine"] | None = None
     low_v: float | None = None
     high_v: float | None = None
     frequency_hz: float | None = None

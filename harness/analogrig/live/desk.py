@@ -116,7 +116,7 @@ class SteppedDesk(Desk):
     def check(self, scenario: Scenario) -> None:
         set_up = self._emulated.set_up(scenario, self._seed)
         with emulator_errors():
-            set_up.excitation.period_ticks(self._card.rate_hz)
+            set_up.excitation.check_rate(self._card.rate_hz)
 
     def check_values(self, values: Mapping[str, float]) -> None:
         with emulator_errors():

@@ -8,7 +8,7 @@ from typing import Any
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.scope import signals_of
 from analogrig.live.session import LiveSession
-from analogrig_emulator import Capacitor, Pot, Resistor
+from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
 from analogrig_emulator.machine.patching import patches
 
 
@@ -25,13 +25,19 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
         "modes": ["POT SET", "INITIAL CONDITION", "HOLD", "OPERATE"] if desk.is_stepped else [],
         "faults": dict(desk.faults),
         "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
-        "level": (session.excitation.low_v + session.excitation.high_v) / 2.0,
+        "level": sum(session.excitation.range_v) / 2.0,
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
         "patch": patch_rows(session),
         "ceiling": device.datasheet.ceiling,
         "diagnoses": device.datasheet.diagnoses and bool(desk.program.diagnosed),
         "misfits": device.datasheet.misfits,
     }
+
+
+def _settings(excitation: Excitation) -> dict[str, Any]:
+    """Settings of the generator, without the samples of a recorded one."""
+    names = (each.name for each in dataclasses.fields(excitation) if each.name != "samples_v")
+    return {name: getattr(excitation, name) for name in names}
 
 
 def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
@@ -88,7 +94,7 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "mode": session.mode,
         "lamps": list(session.lamps),
         "values": dict(session.values),
-        "generator": {"on": session.is_on, **dataclasses.asdict(session.excitation)},
+        "generator": {"on": session.is_on, **_settings(session.excitation)},
         "faults": sorted(session.injected),
         "estimates": [{"name": name, "estimate": value, "truth": truth.get(name)} for name, value in estimates.items()],
         "statistic": _last(session, "statistic"),

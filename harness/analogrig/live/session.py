@@ -35,7 +35,7 @@ from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 from analogrig.storage import replace_file
-from analogrig_emulator import EmulatorError
+from analogrig_emulator import EmulatorError, Excitation
 
 BLOCK_S = 0.0125
 """Wall-clock length of a block: a hand is felt within two of them."""
@@ -44,6 +44,8 @@ LATE_S = 0.25
 """Lag behind real time at which the session gives up the lost time."""
 MOST_WAITING = 256
 """Commands that may wait for the next block."""
+
+_OFF = Excitation(low_v=0.0, high_v=0.0)
 
 _MOST_NOTED = 50
 
@@ -187,6 +189,8 @@ class LiveSession:
         wanted = {key: value for key, value in dataclasses.asdict(command).items() if value is not None and key != "on"}
         if wanted.get("shape", self.excitation.shape) != "pulse":
             wanted["duty"] = 0.5
+        if wanted.get("shape", self.excitation.shape) != self.excitation.shape:
+            wanted |= dict.fromkeys(("end_hz", "sweep_s", "harmonics", "samples_v"))
         if "drift_ppm" in wanted:
             wanted["clock"] = "free" if wanted["drift_ppm"] else "card"
         with emulator_errors():
@@ -223,7 +227,7 @@ class LiveSession:
     def _begin_take(self) -> None:
         excitation = self.excitation
         if not self.is_on:
-            excitation = dataclasses.replace(excitation, low_v=0.0, high_v=0.0)
+            excitation = _OFF
         if not self.desk.is_stepped:
             self._wait_to_play()
         scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))

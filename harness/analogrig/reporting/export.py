@@ -17,7 +17,7 @@ from analogrig.rigs.emulator import SetUp, is_emulated
 from analogrig.rigs.rig import Block, Rig
 from analogrig.scenario import Scenario
 from analogrig.storage import replace_file
-from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotTurn
+from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, Excitation, PotTurn
 
 
 def write_signals(
@@ -74,10 +74,18 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
         setup.computer.circuit,
         samples=scenario.samples,
         sample_rate_hz=rate_hz,
-        edges={SOURCE: setup.excitation.edges(0, (scenario.samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)},
+        **_excitation(setup.excitation, scenario.samples, rate_hz),
         turns=_dial_changes(setup, scenario.samples),
         title=f"scenario {scenario.name} on rig {rig.description()['name']}, seed {seed}",
     )
+
+
+def _excitation(excitation: Excitation, samples: int, rate_hz: float) -> dict[str, Any]:
+    """Field of a deck that excites it."""
+    window = (0, (samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)
+    if excitation.is_smooth:
+        return {"drives": {SOURCE: excitation.drive(*window)}}
+    return {"edges": {SOURCE: excitation.edges(*window)}}
 
 
 def _dial_changes(setup: SetUp, samples: int) -> list[PotTurn]:

@@ -433,8 +433,9 @@ class EmulatorRig(Rig):
             computer, excitation, changes = self.set_up(scenario, seed)
             card = self.card(scenario.program)
             with emulator_errors(f"scenario {scenario.name}: "):
-                excitation.edges(0, 1, computer.sample_rate_hz)
+                excitation.check_rate(computer.sample_rate_hz)
                 able = self._draws_offsets_alone(card) and is_repeatable(computer, changes)
+                able &= not excitation.is_smooth
                 play = RepeatedPlay(computer, scenario.samples, changes) if able else None
             channels = _channels(card, computer, scenario.program)
             self._last_prepared = _Prepared(key, computer, card, play, channels, scenario.segments())
