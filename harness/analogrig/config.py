@@ -274,10 +274,11 @@ def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
             raise ConfigurationError(f"{where}: the key 'kind' is lacking")
         kind = convert(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
         return convert(kinds[kind], value, where)
+    some = [argument for argument in arguments if argument is not types.NoneType]
+    if len(some) == 1:
+        return convert(some[0], value, where)
     problems = []
-    for argument in arguments:
-        if argument is types.NoneType:
-            continue
+    for argument in some:
         try:
             return convert(argument, value, where)
         except ConfigurationError as error:

@@ -148,6 +148,11 @@ class Scenario:
             raise ValueError(f"seed must be 0 to 2^63 - 1, not {self.seed}")
         if not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be in 1 .. {MAX_SAMPLES}, not {self.samples}")
+        if self.random_phase and self.excitation.shape == "recorded":
+            raise ValueError("random_phase: an excitation of the shape recorded has no phase")
+        self._check_tweaks()
+
+    def _check_tweaks(self) -> None:
         if len(self.tweaks) > MAX_CHANGES:
             raise ValueError(f"there must be at most {MAX_CHANGES} tweaks, not {len(self.tweaks)}")
         instants = [tweak.sample for tweak in self.tweaks]
@@ -162,8 +167,6 @@ class Scenario:
                     f"the tweak at sample {tweak.sample} lasts {number_of(tweak.ramp_n, 'sample')},"
                     f" beyond the next one at {following.sample}"
                 )
-        if self.random_phase and self.excitation.shape == "recorded":
-            raise ValueError("random_phase: an excitation of the shape recorded has no phase")
         plant = self.plant
         for i, tweak in enumerate(self.tweaks):
             try:

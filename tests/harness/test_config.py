@@ -79,7 +79,11 @@ def test_mistake_is_named_with_its_place(table: dict[str, object], message: str)
         ("sample = 50", "sample = 100", "the tweak at sample 100 is beyond the last of 100 samples"),
         ("mass_kg = 30.0", "mass_kg = -30.0", "tweaks[0]: M must be more than 0, not -30"),
         ("mass_kg = 30.0", "", "tweaks[0]: a pot change must set a parameter of the program"),
-        ('shape = "square"', 'shape = "sine"', "excitation: shape 'sine' must be one of square, pulse, prbs"),
+        (
+            'shape = "square"',
+            'shape = "triangle"',
+            "excitation: shape 'triangle' must be one of square, pulse, prbs, sine, sweep, multisine, recorded",
+        ),
         (
             'shape = "square"',
             "shape = 'square'\nphase = 1.5",
@@ -97,6 +101,45 @@ def test_scenario_file_with_a_mistake_names_it(tmp_path: Path, old: str, new: st
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ('shape = "sweep"', "shape 'sweep' needs end_hz"),
+        ('shape = "sweep"\nend_hz = 9.0', "shape 'sweep' needs sweep_s"),
+        ('shape = "sweep"\nend_hz = -1.0\nsweep_s = 1.0', "end_hz -1.0 must be 0 to 1e12"),
+        ('shape = "sweep"\nend_hz = 9.0\nsweep_s = 0.0', "sweep_s 0.0 must be positive and finite"),
+        ('shape = "sine"\nend_hz = 9.0', "end_hz 9.0 is for the shape sweep"),
+        ('shape = "sine"\nduty = 0.4', "duty 0.4 is for the shape pulse"),
+        ('shape = "sine"\nfrequency_hz = nan', "frequency_hz: must be a number within +-1e+30, not nan"),
+        ('shape = "multisine"', "shape 'multisine' needs harmonics"),
+        ('shape = "multisine"\nharmonics = []', "harmonics () must be different whole numbers, 1 to 1000"),
+        ('shape = "multisine"\nharmonics = [1, 1]', "harmonics (1, 1) must be different whole numbers"),
+        ('shape = "multisine"\nharmonics = [0]', "harmonics (0,) must be different whole numbers"),
+        ('shape = "multisine"\nharmonics = [1.5]', "harmonics[0]: must be a whole number, not 1.5"),
+        ('shape = "square"\nharmonics = [1]', "harmonics (1,) is for the shape multisine"),
+        ('shape = "recorded"', "shape 'recorded' needs samples_v"),
+        ('shape = "recorded"\nsamples_v = []', "samples_v must hold 1 to 1000000 samples, not 0"),
+        ('shape = "recorded"\nsamples_v = [0.0, 2e3]', "samples_v[1] 2000.0 must be within +-1000 V"),
+        ('shape = "recorded"\nsamples_v = [1.0]\nhigh_v = 9.0', "high_v 9.0 is not for the shape recorded"),
+    ],
+)
+def test_excitation_with_a_mistake_is_named_in_one_line(tmp_path: Path, fields: str, message: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(f"samples = 100\n[excitation]\n{fields}\n")
+    with pytest.raises(ConfigurationError) as caught:
+        Scenario.load(str(path))
+    assert str(caught.value).startswith(f"{path}: excitation: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_recorded_excitation_has_no_phase_to_draw(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('samples = 9\nrandom_phase = true\n[excitation]\nshape = "recorded"\nsamples_v = [1.0]\n')
+    with pytest.raises(ConfigurationError, match="random_phase: an excitation of the shape recorded has no phase"):
+        Scenario.load(str(path))
 
 
 def test_missing_file_is_named() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.bench import Bench, direct_bench
 from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.opening import open_dut
 from analogrig.judging import information
 from analogrig.judging.courses import first_at_level
 from analogrig.judging.verdict import BOUNDS, judge
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import Excitation
@@ -102,6 +105,33 @@ def test_information_is_that_of_whole_plays(rig: str, ramp_n: int, tolerance: fl
     run = bench(rig).play(scenario, 3)
     (played,) = information.change_information(run)
     assert played == pytest.approx(information_of_whole_plays(run, rig, scenario), rel=tolerance, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    "excitation",
+    [
+        Excitation("sine", 0.1, 7.0, 150.0),
+        Excitation("sweep", 0.1, 7.0, 20.0, end_hz=600.0, sweep_s=0.01),
+        Excitation("multisine", 0.1, 7.0, 50.0, harmonics=(1, 2, 3, 5, 8, 13)),
+        Excitation("recorded", samples_v=tuple((3.5 + 3.0 * np.sin(np.arange(850) ** 1.5 / 50)).tolist())),
+    ],
+    ids=lambda each: each.shape,
+)
+@pytest.mark.parametrize("rig", ["emulator-skewed", "emulator-real"])
+def test_smooth_excitation_is_played_judged_and_replayed(excitation: Excitation, rig: str, tmp_path: Path) -> None:
+    scenario = Scenario(850, excitation, tweaks=(PotChange(600, {"K": 18000.0}),))
+    with open_rig(rig) as opened, open_dut("inproc") as device:
+        run = Bench(opened, device).play(scenario, 3)
+    (played,) = information.change_information(run)
+    if rig == "emulator-real":  # its card has one probe a sample, as a play of the machine alone has
+        assert played == pytest.approx(information_of_whole_plays(run, rig, scenario), rel=0.05, abs=0.2)
+    verdict = judge(run)
+    assert verdict.outcome == "passed", verdict.reasons
+    run.save(tmp_path / "run.npz")
+    with RecordingRig.open(tmp_path / "run.npz") as recorded, open_dut("inproc") as device:
+        again = Bench(recorded, device).play(recorded.scenario(), 3)
+    assert again.theta_hash() == run.theta_hash()
+    assert judge(again).tweaks == verdict.tweaks
 
 
 def test_two_changes_are_each_judged_from_the_state_at_the_change() -> None:

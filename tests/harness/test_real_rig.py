@@ -388,6 +388,7 @@ def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_pa
     ("scenario", "said"),
     [
         (dataclasses.replace(SHORT, excitation=Excitation("prbs", 0.1, 9.9)), "no prbs"),
+        (dataclasses.replace(SHORT, excitation=Excitation("sine", 0.1, 9.9)), "square, pulse and prbs, not 'sine'"),
         (dataclasses.replace(SHORT, excitation=Excitation(frequency_hz=123.0)), "whole samples"),
         (
             dataclasses.replace(SHORT, excitation=Excitation(frequency_hz=160.0)),

@@ -1,4 +1,4 @@
-"""Signal generator: two-level waveforms with exact edge instants, in ticks of the engine from sample 0, and smooth ones.
+"""Signal generator: two-level waveforms with exact edge instants, in ticks of the engine from sample 0; smooth ones.
 
 The level of a smooth waveform moves all the time; the engine follows it between the samples as well.
 """

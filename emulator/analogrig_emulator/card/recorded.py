@@ -12,6 +12,7 @@ from analogrig_emulator.card.smooth import MOST_V
 from analogrig_emulator.engine.system import Drive
 from analogrig_emulator.errors import ExcitationError
 
+
 @dataclass(frozen=True, eq=False)
 class RecordedExcitation:
     """Generator that plays samples_v, (n,) in V, one at each sample instant; the last one holds.

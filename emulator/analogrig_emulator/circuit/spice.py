@@ -150,10 +150,10 @@ class Deck:
     samples: int = 0
     sample_rate_hz: float = 20e3
     edges: Mapping[str, Edges] = field(default_factory=dict)
-    drives: Mapping[str, Drive] = field(default_factory=dict)
     turns: Sequence[PotTurn] = ()
     initial_v: Mapping[str, float] = field(default_factory=dict)
     title: str = "analogue computer"
+    drives: Mapping[str, Drive] = field(default_factory=dict)
 
     def text(self, nodes: Sequence[str] | None = None, accuracy: Accuracy | None = None) -> str:
         """Deck that ngspice runs, without .tran when there are no samples.
@@ -260,7 +260,9 @@ class _DeckWriter:
         if source.name in self._deck.drives:
             at = np.arange((self._deck.samples - 1) * _PIECES_PER_SAMPLE + 1) / _PIECES_PER_SAMPLE
             levels_v = self._deck.drives[source.name].volts(at)
-            yield from _straight(head, [f"{_number(k * self._period_s)} {_number(v)}" for k, v in zip(at, levels_v, strict=True)])
+            yield from _straight(
+                head, [f"{_number(k * self._period_s)} {_number(v)}" for k, v in zip(at, levels_v, strict=True)]
+            )
         elif level is None:
             yield from _stepped(head, *_levels(self._deck.edges.get(source.name, Edges.none()), self._period_s))
         else:

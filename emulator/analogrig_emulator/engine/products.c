@@ -321,9 +321,8 @@ static void follow_drives(const engine_t* const self, double tick, double* drive
             const double  period = (double)ENGINE_TICKS_PER_SAMPLE;
             const int64_t last = drive->first + drive->samples - 1, now = (int64_t)(tick / period),
                           sample = now < last ? now : last;
-            const double since = tick / period - (double)sample;
-            driven[i]          = evaluate(&drive->terms[(sample - drive->first) * ENGINE_DRIVE_TERMS],
-                                 ENGINE_DRIVE_TERMS - 1,
+            const double since   = tick / period - (double)sample;
+            driven[i] = evaluate(&drive->terms[(sample - drive->first) * ENGINE_DRIVE_TERMS], ENGINE_DRIVE_TERMS - 1,
                                  since < 1.0 ? since : 1.0);
         }
     }

@@ -138,8 +138,7 @@ class RealRig(Rig):
         least_v, most_v = excitation.range_v
         if least_v < low_v or most_v > high_v:
             raise ConfigurationError(
-                f"{where}the force of {least_v:g} V to {most_v:g} V exceeds limits.force_v,"
-                f" {low_v:g} V to {high_v:g} V"
+                f"{where}the force of {least_v:g} V to {most_v:g} V exceeds limits.force_v, {low_v:g} V to {high_v:g} V"
             )
         try:
             self._description.driver.check(self._description.at_generator(excitation))

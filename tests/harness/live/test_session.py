@@ -170,6 +170,19 @@ def test_generator_that_is_off_gives_no_volts(tmp_path: Path) -> None:
     assert np.abs(session.ring.read("probed", end - 500, end)).max() < 0.1
 
 
+def test_generator_plays_a_sine_for_as_long_as_it_is_on(tmp_path: Path) -> None:
+    session = scripted_session(
+        ((0.05, Generate(shape="sine", low_v=1.0, high_v=7.0)), (0.4, SetPlaying(on=False))), tmp_path
+    )
+    end = session.ring.end
+    assert end > 4000
+    force_v = session.ring.read("probed", end - 400, end)[:, 0]
+    assert (session.excitation.shape, session.take_number) == ("sine", 2)
+    lines = np.abs(np.fft.rfft(force_v - force_v.mean())) / 200
+    assert np.argmax(lines) == 4  # 200 Hz at 20 kHz
+    assert np.delete(lines, 4).max() < 0.1 * lines[4]
+
+
 def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path: Path) -> None:
     script = (
         (0.0, SetRecording(on=True)),
@@ -192,6 +205,7 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
         (Turn("K", float("nan")), "K must be"),
         (Generate(frequency_hz=1e9), "exceeds half the sample rate"),
         (Generate(low_v=11.0), "must be finite and not below low_v"),
+        (Generate(shape="sine", frequency_hz=6e3), "exceeds a quarter of the sample rate"),
     ],
 )
 def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
