@@ -22,6 +22,7 @@ from analogrig_emulator.circuit.circuit import (
 from analogrig_emulator.circuit.components import (
     COMPONENTS,
     DIELECTRICS,
+    FINE_OP_AMP_GRADES,
     MULTIPLIER_GRADES,
     NOMINAL,
     OP_AMP_GRADES,
@@ -76,6 +77,7 @@ __all__ = [
     "CHANNELS",
     "COMPONENTS",
     "DIELECTRICS",
+    "FINE_OP_AMP_GRADES",
     "FRONT",
     "IDEAL",
     "LAMP_DELAY_S",

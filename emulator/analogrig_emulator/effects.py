@@ -21,7 +21,7 @@ from analogrig_emulator.card.sampler import Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.components import (
     DIELECTRICS,
     NOMINAL,
-    OP_AMP_GRADES,
+    FINE_OP_AMP_GRADES,
     REFERENCE_C,
     Components,
     Dielectric,
@@ -221,14 +221,14 @@ def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
     yield (
         "noise of TL07x and resistors",
         DRAWS,
-        _constant(_Setup(op_amp=tl07x, noise=dataclasses.replace(OP_AMP_GRADES["tl07x"], flicker_hz=0.0))),
+        _constant(_Setup(op_amp=tl07x, noise=dataclasses.replace(FINE_OP_AMP_GRADES["tl07x"], flicker_hz=0.0))),
     )
     yield from _supply_rows()
     for name in ("tl07x", "741"):
-        grade = OP_AMP_GRADES[name]
+        grade = FINE_OP_AMP_GRADES[name]
         bias = OpAmpGrade(bias_a=grade.bias_a, input_ohm=grade.input_ohm)
         yield f"bias current, {name} ({1e9 * grade.bias_a:g} nA)", 1, _with_components(Components(op_amps=bias))
-    grade = OP_AMP_GRADES["tl07x"]
+    grade = FINE_OP_AMP_GRADES["tl07x"]
     parts = {
         f"input capacitance {1e12 * grade.input_farad:g} pF": OpAmpGrade(input_farad=grade.input_farad),
         "common-mode rejection 100 dB": OpAmpGrade(cmrr=grade.cmrr),
@@ -243,11 +243,11 @@ def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
 def _supply_rows() -> Iterator[tuple[str, int, _Make]]:
     # The same 1/f density beside a white one of no account; resistors without noise.
     cold = _Setup(op_amp=PRESETS["tl07x"], temperature_c=ABSOLUTE_ZERO_C)
-    grade = OP_AMP_GRADES["tl07x"]
+    grade = FINE_OP_AMP_GRADES["tl07x"]
     pink = OpAmpGrade(noise_v_per_rthz=1e-6 * grade.noise_v_per_rthz, flicker_hz=1e12 * grade.flicker_hz)
     yield "1/f noise of TL07x", DRAWS, _constant(dataclasses.replace(cold, noise=pink))
     humming = dataclasses.replace(cold, noise=OpAmpGrade(psrr=grade.psrr), supply=Supply(hum_v=0.1))
-    yield "supply with 0.1 V at 100 Hz, rejected by 100 dB", 1, _constant(humming)
+    yield "hum of 0.1 V, rejected by 100 dB", 1, _constant(humming)
 
 
 def _dielectric_rows() -> Iterator[tuple[str, int, _Make]]:

@@ -55,6 +55,7 @@ RIG: dict[str, Any] = {
         "age_h": 100.0,
         "wiper_noise_ohm": 10.0,
         "noise": True,
+        "fine_effects": True,
         "supply_hum_v": 0.1,
     },
     "card": {

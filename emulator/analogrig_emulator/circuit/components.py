@@ -119,22 +119,25 @@ class Dielectric:
         return 1.0 / (1.0 + sum(part / (1.0 + turn**2) for (part, _), turn in zip(self.absorption, turns, strict=True)))
 
 
-def _constant_loss(tan_delta: float, taus_s: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
-    """Branches, one a decade, of a dielectric with frequency-independent loss.
+_TAUS_S = (4.64e-5, 1e-3, 2.15e-2)
+"""Time constants of the branches: the middles of three even parts of 10 us to 0.1 s on a logarithmic scale."""
 
-    By Kramers and Kronig its capacitance grows by (2 / pi) ln 10 tan delta per decade of time.
+
+def _constant_loss(tan_delta: float) -> tuple[tuple[float, float], ...]:
+    """Branches of a dielectric whose loss does not depend on the frequency: within 18 % from 10 Hz to 3 kHz.
+
+    By Kramers and Kronig its capacitance grows by (2 / pi) ln 10 tan delta per decade of time; a branch stands for 4/3.
     """
-    return tuple((2.0 / math.pi * math.log(10.0) * tan_delta, tau_s) for tau_s in taus_s)
+    return tuple((4.0 / 3.0 * (2.0 / math.pi) * math.log(10.0) * tan_delta, tau_s) for tau_s in _TAUS_S)
 
 
-_TAUS_S = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 _MARKED_HZ = 1e3
 
 DIELECTRICS: Mapping[str, Dielectric] = MappingProxyType(
     {
         "perfect": Dielectric(),
-        "polyester": Dielectric(1e4, _constant_loss(2e-3, _TAUS_S), _MARKED_HZ),
-        "polypropylene": Dielectric(1e5, _constant_loss(1e-4, _TAUS_S), _MARKED_HZ),
+        "polyester": Dielectric(1e4, _constant_loss(2e-3), _MARKED_HZ),
+        "polypropylene": Dielectric(1e5, _constant_loss(1e-4), _MARKED_HZ),
     }
 )
 """Film capacitors with the typical insulation resistance and the loss at 100 Hz of their datasheets.
@@ -184,8 +187,20 @@ class OpAmpGrade:
         _require(self, "bias_a", math.isfinite(self.bias_a), "must be finite")
         _require(self, "input_ohm", math.isfinite(self.input_ohm) or self.bias_a == 0, "must be finite to carry bias_a")
 
+    @property
+    def coarse(self) -> OpAmpGrade:
+        """The grade without its effects below 0.1 LSB of 12 bits on the suspension, which make a play slower.
 
-OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
+        They are an input capacitance below 5 pF, 1/f noise and the limit of the output current.
+        """
+        input_farad = self.input_farad if self.input_farad >= _LEAST_FARAD else 0.0
+        return replace(self, input_farad=input_farad, flicker_hz=0.0, current_limit_a=math.inf)
+
+
+_LEAST_FARAD = 5e-12
+"""Smallest input capacitance of a coarse grade; 3 pF make 0.08 LSB."""
+
+FINE_OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
     {
         "ideal": OpAmpGrade(),
         "tl07x": OpAmpGrade(
@@ -239,7 +254,13 @@ OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
         ),
     }
 )
-"""Grades for the models of the same name in opamp.py; typical values of the datasheets."""
+"""Grades for the models of the same name in opamp.py, with all effects; harness/docs/background/circuit.md has the
+sources."""
+
+OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
+    {name: grade.coarse for name, grade in FINE_OP_AMP_GRADES.items()}
+)
+"""The same without their effects below 0.1 LSB."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from analogrig_emulator import (
     ABSOLUTE_ZERO_C,
     CARDS,
     COMPONENTS,
+    FINE_OP_AMP_GRADES,
     OP_AMP_GRADES,
     PROGRAMS,
     Capacitor,
@@ -138,9 +139,16 @@ class ComputerDescription:
     wiper_noise_ohm: float = 0.0
     """Largest rise of a wiper's resistance while its pot is turned (``ramp_n``)."""
     noise: bool = False
-    """Thermal noise of resistors and noise of the amplifiers; costs about 1 us a sample."""
+    """Thermal noise of resistors and noise of the amplifiers; costs about 0.2 us a sample."""
+    fine_effects: bool = False
+    """Also the effects of the amplifiers that are below 0.1 LSB on the suspension: 1/f noise, and for real components
+    input capacitance and limit of the output current. A play takes up to three times as long."""
     supply_hum_v: float = 0.0
     """Amplitude of a sine of 100 Hz on the amplifiers' supply, of which their rejection lets a part through."""
+
+    @property
+    def _grades(self) -> Mapping[str, OpAmpGrade]:
+        return FINE_OP_AMP_GRADES if self.fine_effects else OP_AMP_GRADES
 
     def components_for(self, seed: int) -> Components:
         """Components of the machine: as measured, or drawn from the seed.
@@ -154,8 +162,8 @@ class ComputerDescription:
             stock = dataclasses.replace(
                 stock, pots=dataclasses.replace(stock.pots, wiper_noise_ohm=self.wiper_noise_ohm)
             )
-        graded = self.components != "nominal" and self.op_amp in OP_AMP_GRADES
-        stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
+        graded = self.components != "nominal" and self.op_amp in self._grades
+        stock = dataclasses.replace(stock, op_amps=self._grades[self.op_amp]) if graded else stock
         return stock if self.values is None else self.values.put_in(stock)
 
     def machine(self, program: ProgramCircuit, seed: int, sample_rate_hz: float) -> SuspensionComputer:
@@ -177,7 +185,7 @@ class ComputerDescription:
         """The machine, with the noise of its components and the hum of its supply if they are described."""
         if not (self.noise or self.supply_hum_v):
             return computer
-        grade, temperature_c = OP_AMP_GRADES.get(self.op_amp, OpAmpGrade()), self.temperature_c
+        grade, temperature_c = self._grades.get(self.op_amp, OpAmpGrade()), self.temperature_c
         if not self.noise:
             grade, temperature_c = OpAmpGrade(psrr=grade.psrr), ABSOLUTE_ZERO_C
         rng, supply = Stream.NOISE.generator(seed), Supply(self.supply_hum_v)
