@@ -20,8 +20,8 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.components import (
     DIELECTRICS,
-    NOMINAL,
     FINE_OP_AMP_GRADES,
+    NOMINAL,
     REFERENCE_C,
     Components,
     Dielectric,

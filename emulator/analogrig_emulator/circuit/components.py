@@ -191,10 +191,10 @@ class OpAmpGrade:
     def coarse(self) -> OpAmpGrade:
         """The grade without its effects below 0.1 LSB of 12 bits on the suspension, which make a play slower.
 
-        They are an input capacitance below 5 pF, 1/f noise and the limit of the output current.
+        They are an input capacitance below 5 pF, 1/f noise, common mode and the limit of the output current.
         """
         input_farad = self.input_farad if self.input_farad >= _LEAST_FARAD else 0.0
-        return replace(self, input_farad=input_farad, flicker_hz=0.0, current_limit_a=math.inf)
+        return replace(self, input_farad=input_farad, flicker_hz=0.0, cmrr=math.inf, current_limit_a=math.inf)
 
 
 _LEAST_FARAD = 5e-12

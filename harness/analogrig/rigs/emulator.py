@@ -142,7 +142,7 @@ class ComputerDescription:
     """Thermal noise of resistors and noise of the amplifiers; costs about 0.2 us a sample."""
     fine_effects: bool = False
     """Also the effects of the amplifiers that are below 0.1 LSB on the suspension: 1/f noise, and for real components
-    input capacitance and limit of the output current. A play takes up to three times as long."""
+    input capacitance, common mode and limit of the output current. A play takes up to three times as long."""
     supply_hum_v: float = 0.0
     """Amplitude of a sine of 100 Hz on the amplifiers' supply, of which their rejection lets a part through."""
 
