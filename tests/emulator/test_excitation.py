@@ -115,7 +115,7 @@ def test_cutting_the_range_changes_no_edge(excitation: Excitation) -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("shape", "sine"),
+        ("shape", "triangle"),
         ("clock", "gps"),
         ("low_v", math.nan),
         ("high_v", -1.0),

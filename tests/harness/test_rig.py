@@ -198,6 +198,19 @@ def elements(rig: str, seed: int) -> dict[str, object]:
         return {each.name: each for each in opened.set_up(Scenario.load("healthy"), seed).computer.circuit.elements}
 
 
+def test_fine_effects_of_the_amplifiers_are_a_switch(tmp_path: Path) -> None:
+    coarse, fine = (
+        elements(own(tmp_path, f'components = "polyester"\nfine_effects = {switch}', switch), 1)
+        for switch in ("false", "true")
+    )
+    added = {"U1_minus_farad", "U2_minus_farad"}
+    assert not added & set(coarse) and added <= set(fine)
+    before, after = coarse["U1"], fine["U1"]
+    assert isinstance(before, OpAmp) and isinstance(after, OpAmp)
+    assert (before.model.limits_current, after.model.limits_current) == (False, True)
+    assert (before.model.cmrr, after.model.cmrr) == (math.inf, 1e5)
+
+
 def test_measured_values_are_those_of_the_machine_whatever_the_seed(tmp_path: Path) -> None:
     rig = own(tmp_path, 'components = "polyester"' + VALUES.removesuffix("[card]"))
     there = elements(rig, 1)

@@ -232,7 +232,7 @@ FINE_OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
             noise_a_per_rthz=0.5e-12,
             flicker_hz=200.0,
             cmrr=3.2e4,
-            psrr=3.2e4,
+            psrr=6.3e4,
             current_limit_a=25e-3,
         ),
         "opa627": OpAmpGrade(
