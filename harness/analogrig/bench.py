@@ -161,11 +161,12 @@ class Bench:
         real_time: float | None = None,
         time_limit_s: float | None = None,
         clock: Clock = time.monotonic,
-        builder: Callable[[int, Datasheet], RunBuilder] = RunBuilder,
+        builder: Callable[[int, int, Datasheet], RunBuilder] | None = None,
     ) -> None:
         """Join ``rig`` and ``dut``.
 
-        ``builder`` makes the collector of each run; one that overrides ``add`` watches the run being played.
+        ``builder`` makes the collector of each run, by default a ``RunBuilder``; one that overrides ``add`` watches
+        the run being played.
 
         ``time_limit_s`` is the longest duration of one play, on ``clock``. It bounds every wait for the device. The
         rig is not interrupted: the limit is checked after each of its blocks.
@@ -176,7 +177,7 @@ class Bench:
         self._real_time = real_time
         self._time_limit_s = math.inf if time_limit_s is None else time_limit_s
         self._clock = clock
-        self._builder = builder
+        self._builder = builder or RunBuilder
         self._scenario: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def play(self, scenario: Scenario, seed: int) -> Run:

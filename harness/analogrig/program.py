@@ -137,6 +137,11 @@ class Program:
         return tuple(name for name in self.parameters if name in self.equations.estimates)
 
     @functools.cached_property
+    def diagnosed(self) -> Mapping[str, str]:
+        """Parameters by the name that diagnoses give them."""
+        return {row.diagnosis: name for name, row in self.parameters.items() if row.diagnosis}
+
+    @functools.cached_property
     def inverse(self) -> frozenset[str]:
         """Parameters by which an equation divides: their pots turn with the reciprocal."""
         lines = (*self.equations.derivatives, *self.equations.definitions)

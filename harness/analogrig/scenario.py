@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -247,13 +247,18 @@ class Scenario:
 
     def segments(self) -> tuple[Segment, ...]:
         """True plant from the start and after each change."""
-        out = [Segment(0, self.plant)]
-        for tweak in self.tweaks:
-            changed = out[-1].plant.changed(tweak.set)
-            if changed == out[-1].plant:
-                continue  # a pot set to where it stood changes nothing, and nothing can be detected
-            out.append(Segment(tweak.sample, changed, tweak.ramp_n))
-        return tuple(out)
+        return segments_of(self.plant, self.tweaks)
+
+
+def segments_of(plant: Plant, tweaks: Iterable[PotChange]) -> tuple[Segment, ...]:
+    """True plant from the start and after each change."""
+    out = [Segment(0, plant)]
+    for tweak in tweaks:
+        changed = out[-1].plant.changed(tweak.set)
+        if changed == out[-1].plant:
+            continue  # a pot set to where it stood changes nothing, and nothing can be detected
+        out.append(Segment(tweak.sample, changed, tweak.ramp_n))
+    return tuple(out)
 
 
 def program_of(table: Any, where: str) -> Program:

@@ -98,7 +98,7 @@ class _Process:
 async def _real_time(seconds: float) -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder, _Process(Path(folder)) as bench:
         async with bench.socket() as socket:
-            await _tell(socket, "view", signals=SIGNALS, samples=2000)
+            await _tell(socket, "view", signals=SIGNALS, samples=2000, trigger={"source": SIGNALS[0], "level": 5.0})
             await _tell(socket, "record", on=True)
             began_s, cpu_s = time.monotonic(), bench.cpu_s()
             frames, felt_ms, state = await _watch(socket, seconds)
@@ -130,7 +130,7 @@ async def _watch(socket: Any, seconds: float) -> tuple[int, list[float], dict[st
         if time.monotonic() >= next_s:
             next_s += TURN_S
             turned += 1
-            await _tell(socket, "turn", name="K_n_per_m", value=24500.0 if turned % 2 else 22000.0)
+            await _tell(socket, "turn", name="K", value=24500.0 if turned % 2 else 22000.0)
         message = await socket.recv()
         if isinstance(message, bytes):
             frames += 1
@@ -155,7 +155,7 @@ async def _state(socket: Any) -> dict[str, Any]:
 
 
 WORDS: tuple[Any, ...] = (
-    *("view", "turn", "generate", "record", "drive", "step", "tempo", "subscribe", "setParameters", "K_n_per_m"),
+    *("view", "turn", "generate", "record", "drive", "step", "tempo", "subscribe", "setParameters", "K"),
     *(0, 1, -1, 1e9, 2**70, 1e308, True, None, "", [], {}, [[]], {"id": 1, "channelId": 1}, "\x00", "é" * 100),
 )
 KEYS = ("do", "op", "id", "name", "value", "signals", "samples", "trigger", "on", "subscriptions", "parameters")
@@ -184,13 +184,13 @@ async def _hostile(path: str, seconds: float) -> list[Figure]:
             answers_ms: list[float] = []
             while time.monotonic() < until_s:
                 began_s = time.monotonic()
-                await _tell(socket, "turn", name="K_n_per_m", value=20000.0, id=len(answers_ms))
+                await _tell(socket, "turn", name="K", value=20000.0, id=len(answers_ms))
                 await _answer(socket, len(answers_ms))
                 answers_ms.append(1000 * (time.monotonic() - began_s))
             sent = sum(await asyncio.gather(*attacks))
             state = await _state(socket)
             growth_mb = bench.memory_mb() - before_mb
-    if not state["drives"] or state["values"]["K_n_per_m"] != 20000.0:
+    if not state["drives"] or state["values"]["K"] != 20000.0:
         raise RuntimeError(f"the driver was harmed: {state}")
     return [
         Figure(f"hostile messages at /{path} in {seconds:g} s", sent, "messages"),

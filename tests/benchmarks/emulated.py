@@ -98,8 +98,9 @@ class Emulated:
             sample_rate_hz=card.true_rate_hz * probes_per_sample(card),
         )
         if change is not None:
-            (setting,) = machine.program.pots[change.parameter].settings
-            turns = [*turns, PotTurn(change.sample, {setting: machine.program.values[setting] * change.factor})]
+            values = machine.program.values.items()  # of the sprung mass first: M2 for M
+            setting, value = next((name, value) for name, value in values if name.startswith(change.parameter))
+            turns = [*turns, PotTurn(change.sample, {setting: value * change.factor})]
         excitation = self.draw(Stream.EXCITATION.generator(seed), samples)
         jitter = Stream.APERTURE.generator(seed)
         (volts,) = acquired(machine, card, excitation, samples, turns, rng=jitter, block_samples=samples)

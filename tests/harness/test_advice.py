@@ -84,7 +84,7 @@ def test_undetectable_change_is_named() -> None:
 
 
 def test_implausible_estimate_is_named() -> None:
-    assert "samples 0-799 describes no mass" in advised(made_run(LOADED, [(0, FRONT)]))
+    assert "samples 0-799 describes no plant" in advised(made_run(LOADED, [(0, FRONT)]))
 
 
 @pytest.mark.parametrize(("frequency_hz", "told"), [(20.0, True), (200.0, False)])

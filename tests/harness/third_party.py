@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from analogrig import Scenario
+from analogrig.plant import Plant
+from analogrig.program import Program
 from analogrig.rigs import Block, Channel, Hindsight, Performance, Rig, RigDescription, Segment
-
-from .plants import front
 
 BLOCK_N, CODES = 100, 4096
 
@@ -45,7 +45,7 @@ class FlatRig(Rig):
             "force": Channel(0.0, lsb, "N", 294.0, 1.0),
             "displacement": Channel(0.0, lsb, "m", 0.01996, 1.0),
         }
-        plant = front(115.0, 3021.0, 24500.0)
+        plant = Plant.of(Program.load("front"))
         changed = plant.changed({"K": 21000.0})
         segments = (Segment(0, plant), Segment(self._description.jump_at, changed))
         return Performance(5e-5, 200.0, channels, self._blocks(scenario, seed), lambda: Hindsight(segments))

@@ -173,6 +173,11 @@ class AnalogComputer:
         return self._engine.recorded
 
     @property
+    def state(self) -> NDArray[np.float64]:
+        """Voltages of the states of the circuit at the last sample recorded."""
+        return self._engine.state
+
+    @property
     def lamps(self) -> dict[str, int | None]:
         """First sample by amplifier with its overload lamp lit, None while it is dark."""
         amplifiers = [amp.name for amp in self._patched.of(OpAmp)]

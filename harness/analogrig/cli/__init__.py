@@ -10,7 +10,6 @@ import errno
 import os
 import shlex
 import sys
-import traceback
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -122,6 +121,8 @@ def _explain(error: BaseException) -> int:
 
 def _package_of(error: BaseException) -> str:
     """Package of somebody else, which adds kinds, in whose code an error was raised; empty if there is none."""
+    import traceback  # here, for --help needs none
+
     from analogrig.devices import registry
     from analogrig.rigs import description
 

@@ -43,10 +43,10 @@ def change_information(run: Run) -> list[NDArray[np.float64]]:
 
     :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
     """
-    model, weight = _model(run), _weight(run)
+    model, weight = _model(run), weights(run.missing, run.conditions.output.noise_lsb)
     if model is None:
         return [np.zeros(0) for _ in run.segments[1:]]
-    return [_information(model, change, weight) for change in _run_changes(run, model)]
+    return [information_of(model, change, weight) for change in _run_changes(run, model)]
 
 
 def is_bounded(run: Run) -> bool:
@@ -64,7 +64,7 @@ def isolation_bounds(run: Run) -> list[int | None]:
 
     :raises ConfigurationError: as ``change_information``.
     """
-    model, weight = _model(run), _weight(run)
+    model, weight = _model(run), weights(run.missing, run.conditions.output.noise_lsb)
     if model is None:
         return [None for _ in run.segments[1:]]
     return [
@@ -101,7 +101,7 @@ def predicted_bounds(
     stretches = [(each.start, end, each.plant.parameters()) for each, end in zip(segments, ends, strict=True)]
     ramps_n = {segment.start: segment.ramp_n for segment in segments}
     return [
-        first_at_level(_information(model, change, weight), math.log(arl0))
+        first_at_level(information_of(model, change, weight), math.log(arl0))
         for change in changes_between(model, stretches, ramps_n)
     ]
 
@@ -121,17 +121,17 @@ def _run_changes(run: Run, model: Model) -> Iterator[PlantChange]:
     return changes_between(model, stretches, ramps_n, run.conditions.records)
 
 
-def _weight(run: Run) -> NDArray[np.float64]:
+def weights(missing: NDArray[np.bool_], noise_lsb: float) -> NDArray[np.float64]:
     """(n,) information per squared LSB of each sample; 0 for a missing one."""
-    return np.where(run.missing, 0.0, _per_lsb2(run.conditions.output.noise_lsb))
+    return np.where(missing, 0.0, _per_lsb2(noise_lsb))
 
 
 def _per_lsb2(noise_lsb: float) -> float:
     return 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2))
 
 
-def _information(model: Model, change: PlantChange, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """I(1), I(2), ... of one change, float64."""
+def information_of(model: Model, change: PlantChange, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """I(1), I(2), ... of one change, float64, for the ``weights`` of all samples; its course is overwritten."""
     out = change.course_lsb
     unchanged = model.course(change.moment, change.before, change.before, 0)
     gathered = 0.0

@@ -28,7 +28,6 @@ from analogrig.judging import information
 from analogrig.judging.courses import first_at_level
 from analogrig.judging.exposure import Exposure, exposure
 from analogrig.plant import Segment, estimated_parameters
-from analogrig.program import Program
 from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
@@ -377,7 +376,7 @@ def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
 def not_judged(run: Run) -> tuple[str, ...]:
     """Quantities that the device does not report, or that the program does not relate to its parameters."""
     program = run.conditions.program
-    stated = {ESTIMATES: program.estimates, DIAGNOSES: _diagnosed(program), BOUNDS: information.is_bounded(run)}
+    stated = {ESTIMATES: program.estimates, DIAGNOSES: program.diagnosed, BOUNDS: information.is_bounded(run)}
     unstated = (name for name, is_stated in stated.items() if not is_stated)
     return tuple(dict.fromkeys((*unreported(run.datasheet), *unstated)))
 
@@ -391,11 +390,6 @@ def unreported(sheet: Datasheet) -> tuple[str, ...]:
         DIAGNOSES: sheet.diagnoses,
     }
     return tuple(name for name, is_reported in reported.items() if not is_reported)
-
-
-def _diagnosed(program: Program) -> dict[str, str]:
-    """Parameters by the name that diagnoses give them."""
-    return {row.diagnosis: name for name, row in program.parameters.items() if row.diagnosis}
 
 
 def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
@@ -542,7 +536,7 @@ def _attribute_alarms(
     by_start = {segment.start: segment for segment in run.conditions.segments}
     detected: set[int] = set()
     tweaks = []
-    diagnosed, is_bounded = _diagnosed(run.conditions.program), information.is_bounded(run)
+    diagnosed, is_bounded = run.conditions.program.diagnosed, information.is_bounded(run)
     isolates = len(run.diagnosis_index) and diagnosed
     isolation_bounds = information.isolation_bounds(run) if isolates else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
@@ -583,7 +577,7 @@ def _judge_diagnosis(
     if not len(reported):
         return None
     first = reported[0]
-    diagnosis, parameters = DIAGNOSABLE[Change(run.diagnosis_change[first])], _diagnosed(run.conditions.program)
+    diagnosis, parameters = DIAGNOSABLE[Change(run.diagnosis_change[first])], run.conditions.program.diagnosed
     named = parameters.get(diagnosis, diagnosis)
     ratio = float(run.diagnosis_extent[first])
     extent = ratio if diagnosis in parameters and math.isfinite(ratio) else None

@@ -1,4 +1,4 @@
-"""Faults of the displacement channel that a hand switches on and off, between computer and card."""
+"""Faults of the channel of the output that a hand switches on and off, between computer and card."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.live.commands import Fault
-from analogrig.run import CHANNELS
-
-_CHANNEL = CHANNELS.index("displacement")
+from analogrig.run import OUTPUT
 
 NOISE_LSB = 20.0
 """Rms of the noise."""
@@ -19,12 +17,15 @@ HUM_LSB, HUM_HZ = 40.0, 50.0
 SKEW_N = 0.5
 """Delay of the skewed channel, in samples."""
 
-LABELS: Mapping[Fault, str] = {
-    "noise": "noise of 20 LSB on the displacement",
-    "hum": "hum of 50 Hz on the displacement",
-    "stuck": "displacement channel stuck",
-    "skew": "displacement sampled half a period late",
-}
+
+def labels(channel: str) -> Mapping[Fault, str]:
+    """Faults with their labels, for the name of the channel."""
+    return {
+        "noise": f"noise of {NOISE_LSB:g} LSB on channel {channel}",
+        "hum": f"hum of {HUM_HZ:g} Hz on channel {channel}",
+        "stuck": f"channel {channel} stuck",
+        "skew": f"channel {channel} sampled half a period late",
+    }
 
 
 class ChannelFaults:
@@ -48,7 +49,7 @@ class ChannelFaults:
 
     def alter(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Volts with the faults: (n, channels)."""
-        true_v = volts[:, _CHANNEL]
+        true_v = volts[:, OUTPUT]
         late_v = np.append(true_v[:1] if self._before_v is None else self._before_v, true_v[:-1])
         times_s = (self._samples + np.arange(len(volts))) / self._rate_hz
         self._samples += len(volts)
@@ -65,5 +66,5 @@ class ChannelFaults:
         if "stuck" in self.on:
             out_v[:] = self._stuck_v
         altered = volts.copy()
-        altered[:, _CHANNEL] = out_v
+        altered[:, OUTPUT] = out_v
         return altered

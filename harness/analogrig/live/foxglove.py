@@ -87,7 +87,7 @@ class Viewer:
 
     async def serve(self) -> None:
         """Serve until the connection closes."""
-        name = f"analogrig bench: {self._session.desk.computer.program.name}"
+        name = f"analogrig bench: {self._session.desk.program.name}"
         capabilities = ["parameters", "parametersSubscribe"]
         info = {"name": name, "capabilities": capabilities, "metadata": {}, "sessionId": str(id(self._session))}
         await self._tell("serverInfo", **info)

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analogrig.answers import Answers
 from analogrig.catalogue import Cause, Change
 from analogrig.devices.device import Device
+from analogrig.errors import ConfigurationError
 from analogrig.judging import information
+from analogrig.judging.courses import Model, PlantChange, first_at_level
+from analogrig.judging.linear import LinearPlant
 from analogrig.judging.verdict import DIAGNOSABLE
-from analogrig.live.desk import Desk
+from analogrig.live.desk import Desk, SteppedDesk
 from analogrig.live.ring import Ring
 from analogrig.live.take import Take
-from analogrig.plant import PARAMETERS, Segment, physical_parameters
+from analogrig.plant import estimated_parameters
 from analogrig.rigs.rig import Block
-from analogrig.run import Conditions, Run
+from analogrig.run import INPUT, OUTPUT, missing_samples
 
-_LEAD_N = 1500
-"""Samples before a change from which its bound is computed: the plant forgets its start in some hundred."""
 _BOUND_AFTER_N = (64, 256, 1024)
 """Samples after a change at which its bound is looked for."""
 _MOST_NOTED = 50
@@ -83,7 +86,8 @@ class Notes:
         for alarm in answers.alarms:
             self._note_alarm(alarm.index)
         for diagnosis in answers.diagnoses:
-            self.diagnosis = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
+            named = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
+            self.diagnosis = self._desk.program.diagnosed.get(named, named)
         for misfit in answers.misfits:
             self.misfit = "" if misfit.cause == Cause.NONE else Cause(misfit.cause).name.lower().replace("_", " ")
         has_searched = self._search_bounds(end)
@@ -91,22 +95,19 @@ class Notes:
 
     def _note_alarm(self, sample: int) -> None:
         alarm = NotedAlarm(self._number, sample)
-        plants = self._take.plants()
-        i = max((i for i, (start, _, _) in enumerate(plants) if start < sample), default=0)
-        seen = any(each.take == self._number and each.what and each.change == plants[i][0] for each in self.alarms)
-        is_ramp = sample <= plants[i][0] + plants[i][2]
-        if i and (is_ramp or not seen):
-            alarm.what = ", ".join(plants[i - 1][1].changes_to(plants[i][1]))
-            alarm.change = plants[i][0]
-            alarm.latency_n = sample - plants[i][0]
+        earlier = [segment for segment in self._take.segments() if segment.start < sample][-2:]
+        start, ramp_n = earlier[-1].start, earlier[-1].ramp_n
+        seen = any(each.take == self._number and each.what and each.change == start for each in self.alarms)
+        if len(earlier) > 1 and (sample <= start + ramp_n or not seen):
+            alarm.what = ", ".join(earlier[0].plant.changes_to(earlier[1].plant))
+            alarm.change = start
+            alarm.latency_n = sample - start
         self.alarms.append(alarm)
         self.alarm_count += 1
 
     def _search_bounds(self, end: int) -> bool:
         """Look for the information bounds of the changes that were detected. Return True if a search was made."""
         has_searched = False
-        if self._take.scenario.caveats:
-            return False
         for alarm in self.alarms:
             is_open = alarm.take == self._number and alarm.what and alarm.bound_n is None
             if not is_open or alarm.searched >= len(_BOUND_AFTER_N):
@@ -118,67 +119,63 @@ class Notes:
         return has_searched
 
     def _bound(self, change: int, end: int) -> int | None:
-        """Information bound of the change at a sample, from the samples before ``end``; None: not reached."""
-        first = max(self._ring.start, change - _LEAD_N)
-        plants = self._take.plants()
-        begun = max(i for i, (start, _, _) in enumerate(plants) if start <= first)
-        number = next(i for i, (start, _, _) in enumerate(plants) if start == change)
-        end = min([end, *(start for start, _, _ in plants[number + 1 :])])
-        segments = [Segment(0, plants[begun][1])]
-        segments += [Segment(start - first, plant, ramp_n) for start, plant, ramp_n in plants[begun + 1 : number + 1]]
-        try:
-            run = self._window(first, end, segments)
-        except LookupError:
-            return None
-        level = self._device.datasheet.log_arl0(self._take.scenario.expect.arl0)
-        return information.first_at_level(information.change_information(run)[-1], level)
+        """Information bound of the change at a sample, from the samples before ``end``; None: not reached, or unknown.
 
-    def _window(self, first: int, end: int, segments: list[Segment]) -> Run:
-        """Samples of the ring as a run.
-
-        :raises LookupError: the ring does not hold them.
+        The course starts from the machine's own state at the change; that of a linear plant follows the input of the
+        record, which begins at rest.
         """
-        performance = self._desk.performance
+        segments, performance = self._take.segments(), self._desk.performance
+        number = next(i for i, segment in enumerate(segments) if segment.start == change)
+        end = min([end, *(segment.start for segment in segments[number + 1 :])])
+        before, after = (segment.plant.parameters() for segment in segments[number - 1 : number + 1])
         if performance is None:
-            raise LookupError("nothing is played yet")
-        columns: Any = {name: self._ring.read(name, first, end) for name in self._ring.columns if name != "probed"}
-        conditions = Conditions(
-            seed=self._seed,
-            samples_asked=end - first,
-            sample_period_s=performance.sample_period_s,
-            time_scale=performance.time_scale,
-            channels=performance.channels,
-            segments=tuple(segments),
-            scenario={},
-            rig={},
-            dut=self._device.description(),
-            link=self._device.link_name,
-        )
-        none = np.zeros(0, np.int64)
-        return Run(
-            conditions,
-            alarm_index=none,
-            alarm_kind=none.astype(np.uint8),
-            alarm_statistic=none.astype(np.float32),
-            **columns,
-        )
+            return None
+        program, output = self._desk.program, performance.channels[self._desk.program.channels[OUTPUT]]
+        try:
+            clipped: Any = self._ring.read("clipped", change, end)
+            model: Model
+            moment: Any
+            if isinstance(self._desk, SteppedDesk):
+                model, moment = self._desk.machine(end, output.lsb_v), self._desk.moments[change]
+            elif program.is_linear:
+                codes: Any = self._ring.read("codes", 0, end)
+                driven = performance.channels[program.channels[INPUT]].physical(codes[:, INPUT])
+                period_s = performance.sample_period_s * performance.time_scale
+                model = LinearPlant(program, driven, output.lsb, period_s)
+                unchanged = model.course(model.at_rest(0, before), before, before, 0)
+                unchanged.advance(change)
+                moment = unchanged.moment()
+            else:
+                return None
+            course_lsb = model.course(moment, before, after, segments[number].ramp_n).advance(end - change - 1)
+            weight = information.weights(missing_samples(clipped), output.noise_lsb)
+            found = information.information_of(model, PlantChange(0, before, after, moment, course_lsb), weight)
+        except (LookupError, ConfigurationError):  # no longer in the ring; or a machine that cannot play so
+            return None
+        return first_at_level(found, self._device.datasheet.log_arl0(self._take.scenario.expect.arl0))
+
+    def estimated(self, theta: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Parameters ``program.estimates`` (n, m) of estimates theta; NaN if they describe no such plant."""
+        program, sheet, performance = self._desk.program, self._device.datasheet, self._desk.performance
+        if sheet.model is None or performance is None:
+            return np.full((len(theta), len(program.estimates)), np.nan)
+        input_per_code, output_per_code = (performance.channels[name].lsb for name in program.measured)
+        period_s = performance.sample_period_s * performance.time_scale
+        return estimated_parameters(program, theta, sheet.model, input_per_code, output_per_code, period_s)
+
+    @property
+    def estimate_names(self) -> tuple[str, ...]:
+        """Parameters that the device estimates."""
+        return self._desk.program.estimates if self._device.datasheet.model is not None else ()
 
     def estimates(self) -> dict[str, float | None]:
-        """Last estimates by parameter; empty if the device reports none."""
-        sheet, performance = self._device.datasheet, self._desk.performance
+        """Last estimates by parameter."""
         end = self._ring.end
-        if sheet.model is None or not sheet.theta_n or performance is None or not end:
+        if not self.estimate_names or not end:
             return {}
         try:
             theta: Any = self._ring.read("theta", end - 1, end)
         except LookupError:
             return {}
-        channels = performance.channels
-        found = physical_parameters(
-            theta,
-            sheet.model,
-            n_per_code=channels["force"].lsb,
-            m_per_code=channels["displacement"].lsb,
-            period_s=performance.sample_period_s * performance.time_scale,
-        )[0]
-        return {name: None if np.isnan(value) else float(value) for name, value in zip(PARAMETERS, found, strict=True)}
+        found = zip(self.estimate_names, self.estimated(theta)[0].tolist(), strict=True)
+        return {name: None if math.isnan(value) else value for name, value in found}

@@ -17,18 +17,19 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
     desk, device = session.desk, session.device
     return {
         "rig": str(desk.description().get("name", "")),
-        "program": desk.computer.program.name,
+        "program": desk.program.name,
         "dut": device.name,
         "link": device.link_name,
-        "time_scale": desk.computer.scales.time,
+        "time_scale": desk.program.circuit.scales.time,
         "stepped": desk.is_stepped,
         "modes": ["POT SET", "INITIAL CONDITION", "HOLD", "OPERATE"] if desk.is_stepped else [],
         "faults": dict(desk.faults),
         "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
+        "level": (session.excitation.low_v + session.excitation.high_v) / 2.0,
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
         "patch": patch_rows(session),
         "ceiling": device.datasheet.ceiling,
-        "diagnoses": device.datasheet.diagnoses,
+        "diagnoses": device.datasheet.diagnoses and bool(desk.program.diagnosed),
         "misfits": device.datasheet.misfits,
     }
 
@@ -71,8 +72,7 @@ def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
 def state_table(session: LiveSession) -> dict[str, Any]:
     """State of the bench."""
     take = session.take
-    plants = take.plants()
-    truth = plants[-1][1].parameters() if not take.scenario.caveats else {}
+    truth = take.segments()[-1].plant.parameters()
     estimates = session.notes.estimates()
     end = session.ring.end
     return {

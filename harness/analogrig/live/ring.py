@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Answers
 from analogrig.rigs.rig import Block
-from analogrig.run import CHANNELS
 
 RING_N = 1 << 17
 """Samples in the ring: 6.5 s at 20,000 samples/s, 12 MB."""
@@ -18,11 +17,11 @@ RING_N = 1 << 17
 class Ring:
     """Last ``RING_N`` answered samples of a play, by their indices from its start."""
 
-    def __init__(self, probes: int, theta_n: int) -> None:
+    def __init__(self, channels: int, probes: int, theta_n: int) -> None:
         self._lock = threading.Lock()
         self.columns: dict[str, NDArray[np.generic]] = {
-            "codes": np.zeros((RING_N, len(CHANNELS)), np.uint16),
-            "clipped": np.zeros((RING_N, len(CHANNELS)), np.bool_),
+            "codes": np.zeros((RING_N, channels), np.uint16),
+            "clipped": np.zeros((RING_N, channels), np.bool_),
             "probed": np.zeros((RING_N, probes), np.float32),
             "theta": np.zeros((RING_N, theta_n), np.float32),
             "innovation": np.zeros(RING_N, np.float32),

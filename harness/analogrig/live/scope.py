@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.live.ring import RING_N
 from analogrig.live.session import LiveSession
-from analogrig.plant import PARAMETERS, physical_parameters
-from analogrig.run import CHANNELS
 
 MOST_SIGNALS = 16
 LEAST_WINDOW_N, MOST_WINDOW_N = 16, RING_N // 2
@@ -50,9 +48,9 @@ class Signal:
 class Trigger:
     """Trigger of a screen."""
 
-    source: str = "force"
+    source: str
     slope: Literal["rising", "falling"] = "rising"
-    level: float = 5.0
+    level: float = 0.0
     mode: Literal["auto", "normal", "single"] = "auto"
     position: float = 0.25
     """Position on the screen, 0 to 1."""
@@ -66,12 +64,12 @@ class Trigger:
 class View:
     """Screen that a client asks for. ValueError: a value is out of range."""
 
-    signals: tuple[str, ...] = ("force", "displacement")
+    signals: tuple[str, ...]
+    trigger: Trigger
     samples: int = 400
     columns: int = 1000
     kind: Literal["yt", "xy", "fft"] = "yt"
     measure: bool = True
-    trigger: Trigger = field(default_factory=Trigger)
     arm: int = 0
     """Number of the arming: another one arms a single trigger again."""
 
@@ -85,15 +83,13 @@ class View:
 def signals_of(session: LiveSession) -> dict[str, Signal]:
     """Signals of a session, by their ids."""
     desk, sheet = session.desk, session.device.datasheet
-    program = desk.computer.program
-    quantities = program.scales.quantities
+    quantities = desk.program.circuit.scales.quantities
     performance = session.performance
     out = []
-    for name in CHANNELS:
+    for name in desk.program.channels:
         if performance is None or name in performance.channels:
-            unit = "" if performance is None else performance.channels[name].unit
-            node = quantities[name].node if name in quantities else ""
-            out.append(Signal(name, name.replace("_", " "), "channel", unit, quantities[name].full / 10.0, node))
+            full, node = quantities[name].full, quantities[name].node
+            out.append(Signal(name, name.replace("_", " "), "channel", desk.program.unit(name), full / 10.0, node))
     nodes = {scale.node: (name, scale) for name, scale in quantities.items()}
     for name, node in zip(desk.amplifiers, desk.nodes, strict=True):
         quantity, scale = nodes.get(node, ("", None))
@@ -101,8 +97,8 @@ def signals_of(session: LiveSession) -> dict[str, Signal]:
         out.append(Signal(name, label, "amplifier", "", 1.0, node))
     reported = {"statistic": sheet.statistic, "innovation": sheet.innovation}
     out += [Signal(name, name, "device", "", 1.0) for name, is_reported in reported.items() if is_reported]
-    if sheet.model is not None and sheet.theta_n:
-        out += [Signal(f"estimate {name}", f"estimate of {name}", "device", "", 1.0) for name in PARAMETERS]
+    names = session.notes.estimate_names
+    out += [Signal(f"estimate {name}", f"estimate of {name}", "device", "", 1.0) for name in names]
     return {signal.id: signal for signal in out}
 
 
@@ -116,23 +112,16 @@ def read_signal(session: LiveSession, name: str, first: int, end: int) -> Values
         raise LookupError("nothing is played yet")
     if name in performance.channels:
         codes: Any = ring.read("codes", first, end)
-        return performance.channels[name].volts(codes[:, CHANNELS.index(name)])
+        return performance.channels[name].volts(codes[:, session.desk.program.channels.index(name)])
     if name in session.desk.amplifiers:
         return ring.read("probed", first, end)[:, session.desk.amplifiers.index(name)].astype(np.float64)
     if name in ("statistic", "innovation"):
         return ring.read(name, first, end).astype(np.float64)
-    parameter = name.removeprefix("estimate ")
-    model = session.device.datasheet.model
-    if parameter in PARAMETERS and model is not None:
+    names, parameter = session.notes.estimate_names, name.removeprefix("estimate ")
+    if parameter in names:
         stride = max(1, (end - first) // _MOST_ESTIMATES)
         theta: Any = ring.read("theta", first, end)[::stride]
-        found = physical_parameters(
-            theta,
-            model,
-            n_per_code=performance.channels["force"].lsb,
-            m_per_code=performance.channels["displacement"].lsb,
-            period_s=performance.sample_period_s * performance.time_scale,
-        )[:, PARAMETERS.index(parameter)]
+        found = session.notes.estimated(theta)[:, names.index(parameter)]
         return np.repeat(found, stride)[: end - first]
     raise LookupError(f"no signal is called {name!r}")
 
@@ -140,15 +129,16 @@ def read_signal(session: LiveSession, name: str, first: int, end: int) -> Values
 class Screen:
     """Screen of one client: remembers its last trigger, and whether a single one has come."""
 
-    def __init__(self, view: View) -> None:
-        self.view = view
+    def __init__(self) -> None:
+        self.view: View | None = None
+        """View that the client has asked for."""
         self._is_waiting = True
         self._shown: tuple[int, int, float] | None = None
         """Take, last sample and trigger of the last frame."""
 
     def change(self, view: View) -> None:
         """Show another view."""
-        if view.arm != self.view.arm or view.trigger.mode != self.view.trigger.mode:
+        if self.view is None or view.arm != self.view.arm or view.trigger.mode != self.view.trigger.mode:
             self._is_waiting = True
         self.view = view
         self._shown = None
@@ -156,20 +146,19 @@ class Screen:
     def frame(self, session: LiveSession) -> bytes | None:
         """Next frame; None if there is nothing new to show."""
         view, ring = self.view, session.ring
-        if view.trigger.mode == "single" and not self._is_waiting:
+        if view is None or (view.trigger.mode == "single" and not self._is_waiting):
             return None
         end, take = ring.end, session.take_number
         if end < LEAST_WINDOW_N or (self._shown is not None and self._shown[:2] == (take, end)):
             return None
         try:
-            return self._frame(session, take, end)
+            return self._frame(view, session, take, end)
         except LookupError:  # the ring has moved on, or the take has ended
             return None
 
-    def _frame(self, session: LiveSession, take: int, end: int) -> bytes | None:
-        view = self.view
+    def _frame(self, view: View, session: LiveSession, take: int, end: int) -> bytes | None:
         samples = min(view.samples, end)
-        found = None if view.kind == "fft" else self._find_trigger(session, end, samples)
+        found = None if view.kind == "fft" else _find_trigger(view.trigger, session, end, samples)
         if found is None and view.trigger.mode != "auto" and view.kind != "fft":
             return None
         if found is None:
@@ -198,27 +187,27 @@ class Screen:
         header |= {"points": len(columns[0]), "per": per}
         return packed(header, columns)
 
-    def _find_trigger(self, session: LiveSession, end: int, samples: int) -> float | None:
-        """Last instant of a trigger after which the screen is full, in samples; None if there is none."""
-        trigger = self.view.trigger
-        before = round(trigger.position * samples)
-        last = end - (samples - before)
-        first = max(session.ring.start, before, last - max(samples, 4000))
-        if last - first < 2:
-            return None
-        source = read_signal(session, trigger.source, first, last)
-        signed = source if trigger.slope == "rising" else -source
-        level = trigger.level if trigger.slope == "rising" else -trigger.level
-        low = level - _HYSTERESIS * float(np.ptp(signed))
-        crossings = np.flatnonzero((signed[1:] >= level) & (signed[:-1] < level))
-        below = np.flatnonzero(signed <= low)
-        for k in crossings[::-1].tolist():
-            at = np.searchsorted(below, k, "right") - 1
-            since = below[at] if at >= 0 else -1
-            if since >= 0 and not (crossings[np.searchsorted(crossings, since)] < k):
-                step = signed[k + 1] - signed[k]
-                return float(first + k + (level - signed[k]) / step)
+
+def _find_trigger(trigger: Trigger, session: LiveSession, end: int, samples: int) -> float | None:
+    """Last instant of a trigger after which the screen is full, in samples; None if there is none."""
+    before = round(trigger.position * samples)
+    last = end - (samples - before)
+    first = max(session.ring.start, before, last - max(samples, 4000))
+    if last - first < 2:
         return None
+    source = read_signal(session, trigger.source, first, last)
+    signed = source if trigger.slope == "rising" else -source
+    level = trigger.level if trigger.slope == "rising" else -trigger.level
+    low = level - _HYSTERESIS * float(np.ptp(signed))
+    crossings = np.flatnonzero((signed[1:] >= level) & (signed[:-1] < level))
+    below = np.flatnonzero(signed <= low)
+    for k in crossings[::-1].tolist():
+        at = np.searchsorted(below, k, "right") - 1
+        since = below[at] if at >= 0 else -1
+        if since >= 0 and not (crossings[np.searchsorted(crossings, since)] < k):
+            step = signed[k + 1] - signed[k]
+            return float(first + k + (level - signed[k]) / step)
+    return None
 
 
 def reduced(signals: list[Values], columns: int) -> tuple[list[Values], float]:

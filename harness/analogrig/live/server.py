@@ -66,7 +66,7 @@ class _PageClient:
     """Client of the page."""
 
     socket: ServerConnection
-    screen: Screen = field(default_factory=lambda: Screen(View()))
+    screen: Screen = field(default_factory=Screen)
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when it must get the state at once."""
 

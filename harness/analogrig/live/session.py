@@ -26,7 +26,6 @@ from analogrig.live import commands
 from analogrig.live.clock import LiveClock, WallClock
 from analogrig.live.commands import Command
 from analogrig.live.desk import CHANGE_N, SteppedDesk, open_desk
-from analogrig.live.knobs import scenario_values
 from analogrig.live.notes import Notes
 from analogrig.live.ring import Ring
 from analogrig.live.take import MOST_RECORDED_N, Take, TakeBuilder
@@ -90,12 +89,9 @@ class LiveSession:
         self._lock = threading.Lock()
         self._woken = threading.Event()
         self._waiting: deque[tuple[Command, float]] = deque()
-        overrides = self.desk.scenario.plant.overrides()
-        self.values = {
-            name: overrides.get(self.knobs[name].field, value)
-            for name, value in self.desk.computer.program.values.items()
-        }
-        """Settings of the pots."""
+        parameters = self.desk.scenario.plant.parameters()
+        self.values = {name: parameters[name] for name in self.knobs}
+        """Values of the parameters with knobs."""
         self.excitation = self.desk.scenario.excitation
         self.is_on = self.desk.is_stepped
         """True while the generator is on."""
@@ -108,7 +104,7 @@ class LiveSession:
         """Samples by which the session has fallen behind real time."""
         self.take_number = 0
         self.take = Take(self.desk.scenario)
-        self.ring = Ring(len(self.desk.amplifiers), device.datasheet.theta_n)
+        self.ring = Ring(len(self.desk.program.channels), len(self.desk.amplifiers), device.datasheet.theta_n)
         self.notes = Notes(self.desk, device, self.ring, seed)
         self.notices: deque[tuple[int, str]] = deque(maxlen=_MOST_NOTED)
         self.saved: deque[Saved] = deque(maxlen=_MOST_NOTED)
@@ -165,11 +161,9 @@ class LiveSession:
         match command:
             case commands.Turn():
                 if command.name not in self.knobs:
-                    raise ConfigurationError(f"no pot is called {command.name!r}: there are {', '.join(self.knobs)}")
-                knob = self.knobs[command.name]
-                knob.check(command.value)
-                if self.is_recording and not knob.field:
-                    raise ConfigurationError(f"no scenario can change {knob.label}: end the recording first")
+                    raise ConfigurationError(f"no pot shows {command.name!r}: there are {', '.join(self.knobs)}")
+                self.knobs[command.name].check(command.value)
+                self.desk.check_values(self.values | {command.name: command.value})
             case commands.Generate():
                 self._refuse_while_recording("the generator")
                 excitation = self._generated(command)
@@ -209,7 +203,11 @@ class LiveSession:
         """Play from rest until something demands a new start."""
         self._begin_take()
         keeps = self.take.is_recorded
-        bench = Bench(self.desk, self.device, builder=lambda _, sheet: TakeBuilder(sheet, self._watch, keeps=keeps))
+        bench = Bench(
+            self.desk,
+            self.device,
+            builder=lambda _, channels, sheet: TakeBuilder(channels, sheet, self._watch, keeps=keeps),
+        )
         try:
             run = bench.play(self.take.scenario, self.seed)
         except AnalogrigError as error:
@@ -219,7 +217,7 @@ class LiveSession:
         if keeps:
             self._conclude(run)
             self.is_recording = self.is_recording and self.desk.is_stepped  # other rigs record one record
-        if run.conditions.faults and not self._is_closed and run.conditions.faults != self.take.scenario.caveats:
+        if run.conditions.faults and not self._is_closed:
             self._stop_after(run.conditions.faults[-1])
 
     def _begin_take(self) -> None:
@@ -228,16 +226,13 @@ class LiveSession:
             excitation = dataclasses.replace(excitation, low_v=0.0, high_v=0.0)
         if not self.desk.is_stepped:
             self._wait_to_play()
-        known = scenario_values(self.knobs, self.values)
-        plant = dataclasses.replace(self.desk.scenario.plant, **known)
+        scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))
         tweaks: tuple[PotChange, ...] = ()
         if not self.desk.is_stepped and self._turns:
-            changed = scenario_values(self.knobs, self._turns)
-            tweaks = (PotChange(CHANGE_N, **changed),)
+            tweaks = (PotChange(CHANGE_N, self._turns),)
             self.values |= self._turns
             self._turns, self._turned_at = {}, []
-        scenario = dataclasses.replace(self.desk.scenario, excitation=excitation, plant=plant, tweaks=tweaks)
-        scenario = dataclasses.replace(scenario, seed=self.seed)
+        scenario = dataclasses.replace(scenario, excitation=excitation, tweaks=tweaks, seed=self.seed)
         self.take_number += 1
         self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
         self._ends_take = False
@@ -264,7 +259,6 @@ class LiveSession:
 
     def _lengths(self) -> Iterator[int]:
         """Lengths of the blocks, each when it is due; ends with the take."""
-        self._restore_pots()
         while True:
             self._apply_commands()
             if self._ends_take or self._is_closed:
@@ -286,12 +280,6 @@ class LiveSession:
                 return
             self._taken += length
             yield length
-
-    def _restore_pots(self) -> None:
-        """Settings that no scenario has: those of the take before."""
-        others = {name: value for name, value in self.values.items() if not self.knobs[name].field}
-        if others and isinstance(self.desk, SteppedDesk):
-            self.desk.turn(others, 0)
 
     def _paced_length(self) -> int:
         """Length of the next block if it is due; else wait, and return 0."""
@@ -394,19 +382,21 @@ class LiveSession:
             self.notify(f"the recording has reached its limit of {MAX_CHANGES} changes")
             self.is_recording, self._ends_take = False, True
             return
-        sample, ramp_n = self._taken - 1, self._ramp_n if self._taken > 1 else 0
+        sample = self._taken - 1
+        is_fresh = sample > (self.take.changes[-1].sample if self.take.changes else 0)
+        ramp_n = self._ramp_n if is_fresh else 0
         turns, self._turns = self._turns, {}
         times_s, self._turned_at = self._turned_at, []
         turns = {name: value for name, value in turns.items() if value != self.values[name]}
         if not turns:
             return
         try:
-            desk.turn(turns, ramp_n)
+            desk.turn(self.values | turns, turns, sample, ramp_n)
         except AnalogrigError as error:
             self.notify(str(error))
             return
         self.values |= turns
-        self.take.change(sample, scenario_values(self.knobs, turns), ramp_n)
+        self.take.change(sample, turns, ramp_n)
         self.notes.await_turn(sample + 1, times_s)
         self.version += 1
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from analogrig.answers import Answers
 from analogrig.bench import RunBuilder
 from analogrig.datasheet import Datasheet
-from analogrig.plant import Plant
+from analogrig.plant import Segment
 from analogrig.rigs.rig import Block
 from analogrig.run import Run
-from analogrig.scenario import PotChange, Scenario
+from analogrig.scenario import PotChange, Scenario, segments_of
 
 MOST_RECORDED_N = 2_000_000
 """Samples of the longest recording: 100 s at 20,000 samples/s, 80 MB."""
@@ -32,27 +31,18 @@ class Take:
     caveats: list[str] = field(default_factory=list)
     """Reasons that its recording cannot be judged."""
 
-    def change(self, sample: int, values: Mapping[str, Any], ramp_n: int) -> None:
-        """Note a change of pots after a sample; values by their names in a scenario."""
-        if not values:
-            return
+    def change(self, sample: int, values: Mapping[str, float], ramp_n: int) -> None:
+        """Note a change of parameters after a sample."""
         if sample < 1:
-            plant = dataclasses.replace(self.scenario.plant, **values)
-            self.scenario = dataclasses.replace(self.scenario, plant=plant)
+            self.scenario = self.scenario.with_plant(self.scenario.plant.changed(values))
         elif self.changes and self.changes[-1].sample == sample:
-            self.changes[-1] = dataclasses.replace(self.changes[-1], **values)
+            self.changes[-1] = dataclasses.replace(self.changes[-1], set={**self.changes[-1].set, **values})
         else:
-            self.changes.append(PotChange(sample, ramp_n=ramp_n, **values))
+            self.changes.append(PotChange(sample, values, ramp_n))
 
-    def plants(self) -> list[tuple[int, Plant, int]]:
-        """Sample, plant from there on and length of the ramp, at the start and after each change."""
-        wide = dataclasses.replace(self.scenario, tweaks=())
-        out = [(0, wide.plant.plant(), 0)]
-        for change in self.changes:
-            plant = dataclasses.replace(out[-1][1], **change.overrides())
-            if plant != out[-1][1]:
-                out.append((change.sample, plant, change.ramp_n))
-        return out
+    def segments(self) -> tuple[Segment, ...]:
+        """True plant from the start and after each change."""
+        return segments_of(self.scenario.plant, self.changes)
 
     def played(self, samples: int) -> Scenario:
         """Scenario that plays this take again: the first ``samples``, with the changes among them."""
@@ -78,8 +68,8 @@ class Take:
 class TakeBuilder(RunBuilder):
     """Collector of a take: passes every block on, and keeps the samples only of a take that is recorded."""
 
-    def __init__(self, sheet: Datasheet, watch: Watch, *, keeps: bool) -> None:
-        super().__init__(MOST_RECORDED_N if keeps else 0, sheet)
+    def __init__(self, channels: int, sheet: Datasheet, watch: Watch, *, keeps: bool) -> None:
+        super().__init__(MOST_RECORDED_N if keeps else 0, channels, sheet)
         self._keeps = keeps
         self._watch = watch
 

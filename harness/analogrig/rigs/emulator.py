@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
-from analogrig.plant import Segment
+from analogrig.plant import Plant, Segment
 from analogrig.program import Program
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
 from analogrig.run import OUTPUT, Channel
@@ -314,11 +314,6 @@ class EmulatorRig(Rig):
     def description(self) -> Mapping[str, Any]:
         return self._table
 
-    @property
-    def card(self) -> Card:
-        """Card of the rig."""
-        return self._card
-
     def in_blocks(self, samples: int) -> EmulatorRig:
         """The same rig with blocks of at most ``samples`` samples. Only the speed differs.
 
@@ -339,9 +334,11 @@ class EmulatorRig(Rig):
             computer = self._computer(scenario, seed)
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         changes: list[PotTurn] = []
+        plant = scenario.plant
         for i, tweak in enumerate(scenario.tweaks):
+            plant = plant.changed(tweak.set)
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = self._pot_settings(tweak.set, scenario.program)
+                settings = self.pot_settings(plant, tweak.set)
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
@@ -394,6 +391,7 @@ class EmulatorRig(Rig):
     def perform_in_steps(
         self,
         set_up: SetUp,
+        program: Program,
         seed: int,
         lengths: Iterable[int],
         probes: Sequence[str],
@@ -408,17 +406,16 @@ class EmulatorRig(Rig):
         """
         if self._description.computer.noise:
             raise ConfigurationError(f"{self._description.name}: computer.noise: a play in steps has no such noise")
-        computer = set_up.computer
+        computer, card = set_up.computer, self.card(program)
         with emulator_errors():
-            machine = _SteppedMachine(computer, lengths, probes_per_sample(self._card), probes)
-            jitter = Stream.APERTURE.generator(seed)
-            volts = acquired(machine, self._card, set_up.excitation, 0, rng=jitter)
+            machine = _SteppedMachine(computer, lengths, probes_per_sample(card), probes)
+            volts = acquired(machine, card, set_up.excitation, 0, rng=Stream.APERTURE.generator(seed))
         return Performance(
-            sample_period_s=1.0 / self._card.rate_hz,
+            sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
-            channels=self._channels(computer),
-            blocks=_sample(map(alter, volts), self.sampler(Stream.CARD.generator(seed))),
-            hindsight=lambda: Hindsight((), _lit_lamps(computer.machine.lamps, probes_per_sample(self._card))),
+            channels=_channels(card, computer, program),
+            blocks=_sample(map(alter, volts), Sampler(card, Stream.CARD.generator(seed))),
+            hindsight=lambda: Hindsight((), _lit_lamps(computer.machine.lamps, probes_per_sample(card))),
         )
 
     def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
@@ -465,15 +462,21 @@ class EmulatorRig(Rig):
         card = self.card(scenario.program)
         rate_hz = card.true_rate_hz * probes_per_sample(card)
         computer = _drawn_machine(self._description.computer, scenario.program.circuit, seed, rate_hz, anew=True)
-        computer.set(**self._pot_settings(scenario.plant.parameters(), scenario.program))
+        computer.set(**self.pot_settings(scenario.plant, scenario.program.parameters))
         return computer
 
-    def _pot_settings(self, settings: Mapping[str, float], program: Program) -> dict[str, float]:
-        """Pot settings for these parameters, as coefficients or as dials."""
+    def pot_settings(self, plant: Plant, changed: Iterable[str]) -> dict[str, float]:
+        """Pot settings for a plant in which these parameters have changed, as coefficients or as dials.
+
+        :raises PotError: a pot cannot show them.
+        """
+        names = {plant.program.names[name] for name in changed}
+        values = plant.parameters()
         if self._description.computer.pots == "coefficient":
-            return dict(settings)
-        dials = _nominal(program).dials_for(**settings)
-        return {f"{pot}_dial": dial for pot, dial in dials.items()}
+            return {name: value for name, value in values.items() if name in names}
+        dials = _nominal(plant.program).dials_for(**values)
+        pots = plant.program.circuit.pots
+        return {f"{pot}_dial": dial for pot, dial in dials.items() if names.intersection(pots[pot].settings)}
 
 
 def _channels(card: Card, computer: SuspensionComputer, program: Program) -> dict[str, Channel]:
@@ -553,10 +556,10 @@ def _drawn_machine(
 ) -> SuspensionComputer:
     """Machine of a seed; the last one unless ``anew``. Courses leave a machine as it is, and drawing takes long."""
     global _last_machine  # noqa: PLW0603 - a cache of one entry
-    key = (computer, program, seed, rate_hz)
-    if anew or _last_machine is None or _last_machine[0] != key:
-        _last_machine = key, computer.machine(program, seed, rate_hz)
-    return _last_machine[1]
+    key, last = (computer, program, seed, rate_hz), _last_machine
+    if anew or last is None or last[0] != key:
+        last = _last_machine = key, computer.machine(program, seed, rate_hz)  # another thread may draw at this time
+    return last[1]
 
 
 def nominal_courses(scenario: Scenario) -> Courses:

@@ -52,13 +52,12 @@ class ScriptedClock:
 
 
 def scripted_session(
-    script: Sequence[tuple[float, Action]], folder: Path, *, rig: str = "emulator", dut: str = "inproc"
+    script: Sequence[tuple[float, Action]], folder: Path, *, scenario: Scenario | None = None, rig: str = "emulator"
 ) -> LiveSession:
     """Session that has played a script to its end; time is that of the machine."""
     clock = ScriptedClock(script)
-    description = describe(dut)
-    with open_rig(rig) as opened, description.direct() as device:
-        session = LiveSession(opened, Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
+    with open_rig(rig) as opened, describe("inproc").direct() as device:
+        session = LiveSession(opened, scenario or Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
         clock.session = session
         session.run()
     return session

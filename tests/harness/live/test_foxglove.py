@@ -104,16 +104,16 @@ def test_subscribed_channels_send_what_their_schemas_describe(bench: BenchServer
 def test_pots_are_parameters_that_can_be_read_set_and_watched(bench: BenchServer) -> None:
     async def work() -> None:
         async with open_viewer(bench) as socket, open_viewer(bench) as other:
-            await other.send(json.dumps({"op": "subscribeParameterUpdates", "parameterNames": ["K_n_per_m"]}))
+            await other.send(json.dumps({"op": "subscribeParameterUpdates", "parameterNames": ["K"]}))
             await socket.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "one"}))
             answer = await text(socket, "parameterValues")
             assert answer["id"] == "one"
             assert {each["name"]: each["value"] for each in answer["parameters"]} == bench.session.values
-            setting = {"name": "K_n_per_m", "value": 18000, "type": "float64"}
+            setting = {"name": "K", "value": 18000, "type": "float64"}
             await socket.send(json.dumps({"op": "setParameters", "parameters": [setting], "id": "two"}))
             answer = await text(socket, "parameterValues")
             assert answer["id"] == "two"
-            assert [each["name"] for each in answer["parameters"]] == ["K_n_per_m"]
+            assert [each["name"] for each in answer["parameters"]] == ["K"]
             while True:  # the first report may be of the value before
                 told = await text(other, "parameterValues")
                 if told["parameters"][0]["value"] == 18000.0:
@@ -133,7 +133,7 @@ def test_alarm_is_sent_with_its_latency(bench: BenchServer) -> None:
             while bench.session.ring.end < 2000:
                 await socket.send(json.dumps({"op": "getParameters", "parameterNames": []}))
                 await text(socket, "parameterValues")
-            setting = {"name": "K_n_per_m", "value": 15000.0}
+            setting = {"name": "K", "value": 15000.0}
             await socket.send(json.dumps({"op": "setParameters", "parameters": [setting]}))
             alarm: dict[str, Any] = {"what": ""}
             while alarm["what"] != "K":
@@ -146,16 +146,14 @@ def test_alarm_is_sent_with_its_latency(bench: BenchServer) -> None:
 def test_parameters_obey_the_limits_and_the_driver(bench: BenchServer) -> None:
     async def work() -> None:
         async with open_viewer(bench) as socket:
-            beyond = {"op": "setParameters", "parameters": [{"name": "K_n_per_m", "value": 1e9}]}
+            beyond = {"op": "setParameters", "parameters": [{"name": "K", "value": 1e9}]}
             await socket.send(json.dumps(beyond))
             status = await text(socket, "status")
             assert status["level"] == 2
             assert "K must be" in status["message"]
             async with open_client(bench):
-                await socket.send(
-                    json.dumps({"op": "setParameters", "parameters": [{"name": "K_n_per_m", "value": 2e4}]})
-                )
+                await socket.send(json.dumps({"op": "setParameters", "parameters": [{"name": "K", "value": 2e4}]}))
                 assert "the page drives" in (await text(socket, "status"))["message"]
 
     played(work)
-    assert bench.session.values["K_n_per_m"] != 2e4
+    assert bench.session.values["K"] != 2e4

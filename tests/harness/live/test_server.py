@@ -24,6 +24,7 @@ from analogrig.run import Run
 from tests.harness.live.benches import LiveBench
 
 TIMEOUT_S = 600.0  # only if something is broken, also under a load of ten
+TRIGGER = {"source": "force", "level": 5.0}
 
 
 @pytest.fixture
@@ -140,11 +141,11 @@ def test_first_client_drives_and_others_watch(bench: BenchServer) -> None:
     async def work() -> None:
         async with open_client(bench) as one, open_client(bench) as two:
             driver, watcher = Client(one), Client(two)
-            assert await driver.ask("turn", name="K_n_per_m", value=18000.0) == ""
-            assert "watches" in await watcher.ask("turn", name="K_n_per_m", value=20000.0)
+            assert await driver.ask("turn", name="K", value=18000.0) == ""
+            assert "watches" in await watcher.ask("turn", name="K", value=20000.0)
             assert "another client drives" in await watcher.ask("drive")
-            assert await watcher.ask("view", signals=["U1"], samples=100) == ""
-            state = await watcher.until(lambda state: state["values"]["K_n_per_m"] == 18000.0)
+            assert await watcher.ask("view", signals=["U1"], trigger=TRIGGER, samples=100) == ""
+            state = await watcher.until(lambda state: state["values"]["K"] == 18000.0)
             assert not state["drives"]
             header, _ = await watcher.frame()
             assert header["signals"] == ["U1"]
@@ -173,15 +174,15 @@ def test_limits_of_the_rig_hold_whatever_a_client_sends(bench: BenchServer) -> N
     async def work() -> None:
         async with open_client(bench) as socket:
             client = Client(socket)
-            assert "K must be" in await client.ask("turn", name="K_n_per_m", value=1e12)
-            assert "must be a number" in await client.ask("turn", name="K_n_per_m", value="1")
+            assert "K must be" in await client.ask("turn", name="K", value=1e12)
+            assert "must be a number" in await client.ask("turn", name="K", value="1")
             assert "high_v" in await client.ask("generate", low_v=20.0, high_v=10.0)
-            assert "no signal is called" in await client.ask("view", signals=["secret"])
-            assert "samples must be" in await client.ask("view", signals=["U1"], samples=10**9)
+            assert "no signal is called" in await client.ask("view", signals=["secret"], trigger=TRIGGER)
+            assert "samples must be" in await client.ask("view", signals=["U1"], trigger=TRIGGER, samples=10**9)
             assert "no command is called" in await client.ask("__class__")
 
     played(work)
-    assert bench.session.values == dict(bench.session.desk.computer.program.values)
+    assert bench.session.values == bench.session.desk.scenario.plant.parameters()
 
 
 HOSTILE = (
@@ -194,7 +195,7 @@ HOSTILE = (
     "[" * 5000,
     '{"do": {}}',
     '{"do": "turn", "name": [], "value": {}}',
-    '{"do": "turn", "name": "K_n_per_m", "value": NaN}',
+    '{"do": "turn", "name": "K", "value": NaN}',
     '{"do": "view", "signals": [], "trigger": 1}',
     '{"do": "step", "samples": 1e99}',
     '{"do": "tempo", "factor": -1}',
@@ -223,8 +224,8 @@ def test_wrong_messages_are_answered_and_the_driver_is_unharmed(bench: BenchServ
                     await socket.send("x" * (MOST_MESSAGE_BYTES + 1))
                     await socket.wait_closed()
                     assert socket.close_code == 1009
-            assert await driver.ask("turn", name="K_n_per_m", value=18000.0) == ""
-            await driver.until(lambda state: state["values"]["K_n_per_m"] == 18000.0)
+            assert await driver.ask("turn", name="K", value=18000.0) == ""
+            await driver.until(lambda state: state["values"]["K"] == 18000.0)
 
     played(work)
 
@@ -233,13 +234,13 @@ def test_client_that_takes_nothing_is_dropped_and_holds_up_nobody(tmp_path: Path
     async def work(bench: BenchServer) -> None:
         async with open_client(bench) as one:
             driver = Client(one)
+            await driver.ask("view", signals=["force"], trigger=TRIGGER)
             small = socket.socket()
             small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             small.connect(("127.0.0.1", int(host_of(bench).rpartition(":")[2])))
             async with open_client(bench, max_queue=1, sock=small) as two:
-                await two.send(
-                    json.dumps({"do": "view", "signals": ["U1", "U2", "U3", "U4"], "columns": 4000, "samples": 60000})
-                )
+                view = {"signals": ["U1", "U2", "U3", "U4"], "trigger": TRIGGER, "columns": 4000, "samples": 60000}
+                await two.send(json.dumps({"do": "view", **view}))
                 two.transport.pause_reading()
                 await driver.until(lambda state: state["clients"] == 1 and state["samples"] > 30_000)
                 frames = [await driver.frame() for _ in range(3)]
@@ -267,9 +268,7 @@ def test_frames_hold_what_the_card_has_seen(bench: BenchServer) -> None:
     async def work() -> None:
         async with open_client(bench) as socket:
             client = Client(socket)
-            await client.ask(
-                "view", signals=["force"], samples=400, trigger={"source": "force", "level": 5.0, "mode": "normal"}
-            )
+            await client.ask("view", signals=["force"], samples=400, trigger=TRIGGER | {"mode": "normal"})
             header, values = await client.frame()
             force = values["force"]
             trigger = header["trigger"] - header["first"]
@@ -277,7 +276,7 @@ def test_frames_hold_what_the_card_has_seen(bench: BenchServer) -> None:
             assert force[int(trigger)] < 5.0 < force[int(trigger) + 2]
             assert header["measures"]["force"]["frequency"] == pytest.approx(200.0, rel=0.01)
             assert np.ptp(force) == pytest.approx(9.8, abs=0.1)
-            await client.ask("view", signals=["force"], samples=20000, columns=100)
+            await client.ask("view", signals=["force"], trigger=TRIGGER, samples=20000, columns=100)
             header, values = await client.frame()
             while header["samples"] < 20000:
                 header, values = await client.frame()
@@ -291,7 +290,7 @@ def test_single_trigger_shows_one_screen_until_it_is_armed_again(bench: BenchSer
     async def work() -> None:
         async with open_client(bench) as socket:
             client = Client(socket)
-            trigger = {"source": "force", "level": 5.0, "mode": "single"}
+            trigger = TRIGGER | {"mode": "single"}
             await client.ask("view", signals=["force"], samples=100, trigger=trigger)
             header, _ = await client.frame()
             seen = client.state.get("samples", 0)

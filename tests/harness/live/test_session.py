@@ -10,6 +10,7 @@ import pytest
 
 from analogrig import cli
 from analogrig.errors import ConfigurationError
+from analogrig.judging.verdict import judge
 from analogrig.live.commands import (
     ClearLamps,
     Generate,
@@ -23,9 +24,14 @@ from analogrig.live.commands import (
     Turn,
     command_of,
 )
+from analogrig.live.desk import SteppedDesk
 from analogrig.live.session import BLOCK_S, LiveSession
+from analogrig.program import Program
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_emulator import SuspensionComputer
 from tests.harness.live.benches import SEED, scripted_session
 
 RATE_HZ = 20_000
@@ -33,9 +39,9 @@ BLOCK_N = int(RATE_HZ * BLOCK_S)
 
 PLAYED_BY_HAND = (
     (0.0, SetRecording(on=True)),
-    (0.1, Turn("K_n_per_m", 18000.0)),
-    (0.2, Turn("B_n_s_per_m", 3453.0, 100)),
-    (0.3, Turn("M_kg", 60.0)),
+    (0.1, Turn("K", 18000.0)),
+    (0.2, Turn("B", 3453.0, 100)),
+    (0.3, Turn("M", 60.0)),
     (0.4, SetRecording(on=False)),
     (0.41, SetPlaying(on=False)),
 )
@@ -51,10 +57,10 @@ def test_recording_names_the_sample_of_every_turn(recorded: LiveSession) -> None
     run = Run.load(saved.run)
     assert run.samples == saved.samples == 32 * BLOCK_N - BLOCK_N
     scenario = Scenario.load(str(saved.scenario))
-    assert [(each.sample % BLOCK_N, each.overrides(), each.ramp_n) for each in scenario.tweaks] == [
-        (BLOCK_N - 1, {"stiffness_n_per_m": 18000.0}, 0),
-        (BLOCK_N - 1, {"damping_n_s_per_m": 3453.0}, 100),
-        (BLOCK_N - 1, {"mass_kg": 60.0}, 0),
+    assert [(each.sample % BLOCK_N, each.set, each.ramp_n) for each in scenario.tweaks] == [
+        (BLOCK_N - 1, {"K": 18000.0}, 0),
+        (BLOCK_N - 1, {"B": 3453.0}, 100),
+        (BLOCK_N - 1, {"M": 60.0}, 0),
     ]
     assert [segment.start for segment in run.conditions.segments] == [0, *(each.sample for each in scenario.tweaks)]
 
@@ -82,6 +88,35 @@ def test_replay_and_judge_find_the_alarms_that_were_seen_live(
         assert [(each["latency"], each["bound"]) for each in found["tweaks"]] == [
             (first[each["sample"]].latency_n, first[each["sample"]].bound_n) for each in found["tweaks"]
         ]
+
+
+@pytest.mark.parametrize("program", ["dc-motor", "pendulum", "two-mass"])
+def test_alarm_of_any_program_has_the_latency_and_the_bound_of_its_recording(program: str, tmp_path: Path) -> None:
+    scenario = Scenario.of_program(Program.load(program))
+    name, row = next(iter(scenario.program.parameters.items()))
+    script = ((0.0, SetRecording(on=True)), (0.1, Turn(name, row.high, 40)), (0.2, SetRecording(on=False)))
+    session = scripted_session(script, tmp_path, scenario=scenario, rig="emulator-real")
+    assert list(session.knobs) == list(scenario.program.parameters)
+    assert not session.notes.estimates()  # these programs state none
+    alarm = next(alarm for alarm in session.notes.alarms if alarm.what)
+    (tweak,) = judge(Run.load(session.saved[0].run)).tweaks
+    assert (alarm.what, alarm.latency_n, alarm.bound_n) == (name, tweak.latency_n, tweak.bound_n)
+
+
+def test_digital_pots_that_show_two_parameters_follow_both(tmp_path: Path) -> None:
+    rig = tmp_path / "digital.toml"
+    rig.write_text('kind = "emulator"\n[computer]\npots = "dial"\n[card]\nrange_v = {}\n')
+    script = ((0.0, SetRecording(on=True)), (0.05, Turn("l", 0.55)), (0.1, Turn("m", 0.6)))
+    scenario = Scenario.of_program(Program.load("pendulum"))
+    session = scripted_session((*script, (0.15, SetRecording(on=False))), tmp_path, scenario=scenario, rig=str(rig))
+    assert isinstance(session.desk, SteppedDesk)
+    dials = session.desk.computer.dials
+    with open_rig(str(rig)) as opened:
+        assert isinstance(opened, EmulatorRig)
+        _, _, (_, turn) = opened.set_up(Scenario.load(str(session.saved[0].scenario)), SEED)
+    nominal = SuspensionComputer(scenario.program.circuit, opamp="ideal").dials_for(l=0.55, m=0.6)
+    assert dials == {**dials, **nominal}
+    assert {pot: turn.values[f"{pot}_dial"] for pot in ("P4", "P5")} == {pot: nominal[pot] for pot in ("P4", "P5")}
 
 
 def test_pot_is_felt_within_one_block(recorded: LiveSession) -> None:
@@ -145,16 +180,16 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
     (saved,) = scripted_session(script, tmp_path).saved
     run = Run.load(saved.run)
     assert np.unique(run.codes[2500:, 1]).size <= 12  # the noise of the card alone
-    assert "displacement channel stuck: injected by hand at sample 1750" in run.conditions.faults
+    assert "channel displacement stuck: injected by hand at sample 1750" in run.conditions.faults
     assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
 
 
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (Turn("X", 1.0), "no pot is called 'X'"),
-        (Turn("K_n_per_m", 1e9), "K must be 24.5 to 29518"),
-        (Turn("K_n_per_m", float("nan")), "K must be"),
+        (Turn("X", 1.0), "no pot shows 'X'"),
+        (Turn("K", 1e9), "K must be 15000 to 29000 N/m"),
+        (Turn("K", float("nan")), "K must be"),
         (Generate(frequency_hz=1e9), "exceeds half the sample rate"),
         (Generate(low_v=11.0), "must be finite and not below low_v"),
     ],
@@ -167,7 +202,7 @@ def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
             session.do(command)
 
     session = scripted_session(((0.05, refuse),), tmp_path)
-    assert session.values == dict(session.desk.computer.program.values)
+    assert session.values == session.desk.scenario.plant.parameters()
     assert session.take_number == 1
 
 
@@ -182,10 +217,10 @@ def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> 
 
 
 def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
-    session = scripted_session(((0.05, Turn("K_n_per_m", 18000.0)), (0.1, Restart()), (0.15, ClearLamps())), tmp_path)
+    session = scripted_session(((0.05, Turn("K", 18000.0)), (0.1, Restart()), (0.15, ClearLamps())), tmp_path)
     assert session.take_number == 2
     assert session.ring.end < 0.06 * RATE_HZ
-    assert session.values["K_n_per_m"] == 18000.0
+    assert session.values["K"] == 18000.0
     assert not session.take.changes
 
 
@@ -203,12 +238,11 @@ def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None
 
 def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
     from analogrig.devices.opening import open_dut
-    from analogrig.rigs.description import open_rig
     from tests.harness.live.benches import ScriptedClock
 
     clock = ScriptedClock(
         (
-            (0.02, Turn("K_n_per_m", 18000.0)),
+            (0.02, Turn("K", 18000.0)),
             (0.05, SetPlaying(on=False)),
             (90.0, SetPlaying(on=True)),
             (90.1, SetPlaying(on=False)),
@@ -227,9 +261,9 @@ def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> No
     [
         ("explode", {}, "no command is called 'explode'"),
         (7, {}, "no command is called 7"),
-        ("turn", {"name": "K_n_per_m"}, "the key 'value' is lacking"),
-        ("turn", {"name": "K_n_per_m", "value": "much"}, "must be a number"),
-        ("turn", {"name": "K_n_per_m", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
+        ("turn", {"name": "K"}, "the key 'value' is lacking"),
+        ("turn", {"name": "K", "value": "much"}, "must be a number"),
+        ("turn", {"name": "K", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
         ("tempo", {"factor": 0.0}, "factor must be 0.001 to"),
         ("step", {"samples": 10**9}, "samples must be 1 to"),
         ("operate", {"mode": "FLY"}, "must be one of"),

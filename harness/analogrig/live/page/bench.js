@@ -17,8 +17,8 @@
   let state = null;
   let frame = null;
   let frames = 0;
-  let shown = ["force", "displacement"];
-  let current = "force";
+  let shown = [];
+  let current = "";
   const scales = new Map(); // of each signal: volts per division, and volts at the middle
   let plot = null;
   let plotKey = "";
@@ -72,8 +72,7 @@
 
   function short(value, digits = 4) {
     if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-    const size = Math.abs(value);
-    if (size !== 0 && (size >= 1e6 || size < 1e-3)) return value.toExponential(digits - 1);
+    if (Math.abs(value) >= 1e6) return value.toExponential(digits - 1);
     return String(Number(value.toPrecision(digits)));
   }
 
@@ -125,6 +124,7 @@
     shown = shown.filter((id) => bench.signals.some((each) => each.id === id));
     if (!shown.length) shown = bench.signals.slice(0, 2).map(({ id }) => id);
     if (!shown.includes(current)) [current] = shown;
+    if (!$("source").value) $("level").value = short(bench.level);
     const base = $("base").value;
     $("base").replaceChildren();
     for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")} per division`);
@@ -145,7 +145,7 @@
     $("knobs").replaceChildren();
     for (const knob of bench.knobs) {
       const made = new Knob(knob);
-      knobs.set(knob.setting, made);
+      knobs.set(knob.name, made);
       $("knobs").append(made.element);
     }
   }
@@ -263,25 +263,25 @@
       this.value = knob.low;
       this.held = false;
       this.due = 0;
-      const { label, unit, setting } = knob;
+      const { name, unit, pots } = knob;
       this.element = document.createElement("div");
       this.element.className = "knob";
       this.slider = document.createElement("div");
       this.slider.setAttribute("role", "slider");
       this.slider.tabIndex = 0;
-      this.slider.dataset.setting = setting;
-      const attributes = { label: `pot ${label}`, valuemin: knob.low, valuemax: knob.high, orientation: "vertical" };
+      this.slider.dataset.parameter = name;
+      const attributes = { label: `parameter ${name}`, valuemin: knob.low, valuemax: knob.high, orientation: "vertical" };
       for (const [name, value] of Object.entries(attributes)) this.slider.setAttribute(`aria-${name}`, value);
       this.slider.innerHTML = `<svg viewBox="-50 -50 100 100" aria-hidden="true"><path class="track"/><path class="value"/><circle class="cap" r="30"/><line class="hand" x1="0" y1="-14" x2="0" y2="-27"/></svg>`;
       this.slider.querySelector(".track").setAttribute("d", arc(1));
-      const name = document.createElement("label");
+      const title = document.createElement("label");
       this.input = document.createElement("input");
       this.input.type = "number";
       this.input.step = "any";
-      name.append(`${label}${unit ? `, ${unit}` : ""}`, this.input);
+      title.append(`${name}${unit ? `, ${unit}` : ""}`, this.input);
       const limits = document.createElement("small");
-      limits.textContent = `${short(knob.low, 3)} to ${short(knob.high, 3)}`;
-      this.element.append(this.slider, name, limits);
+      limits.textContent = `${short(knob.low, 3)} to ${short(knob.high, 3)}, pot ${pots.join(", ")}`;
+      this.element.append(this.slider, title, limits);
       this.slider.onkeydown = (event) => this.key(event);
       this.slider.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
       this.slider.onpointerdown = (event) => this.grasp(event);
@@ -298,20 +298,20 @@
 
     show(value) {
       this.value = value;
-      const { unit, label } = this.knob;
+      const { unit, name } = this.knob;
       this.slider.setAttribute("aria-valuenow", String(value));
-      this.slider.setAttribute("aria-valuetext", `${label} ${short(value, 5)} ${unit}`);
+      this.slider.setAttribute("aria-valuetext", `${name} ${short(value, 5)} ${unit}`.trimEnd());
       this.slider.querySelector(".value").setAttribute("d", arc(this.fraction));
       this.slider.querySelector(".hand").setAttribute("transform", `rotate(${-135 + 270 * this.fraction})`);
       if (document.activeElement !== this.input) this.input.value = short(value, 6);
     }
 
     turn(value, ramp = 0) {
-      const { low, high, setting } = this.knob;
+      const { low, high, name } = this.knob;
       const within = Math.min(Math.max(value, low), high);
       this.input.blur();
       this.show(within);
-      send("turn", { name: setting, value: within, ramp_n: ramp });
+      send("turn", { name, value: within, ramp_n: ramp });
     }
 
     key(event) {
@@ -431,13 +431,14 @@
     pressed("generator-on", state.generator.on, state.generator.on ? "Switch off" : "Switch on");
     if (document.activeElement !== $("tempo")) $("tempo").value = String(state.factor);
     $("clock").textContent = `take ${state.take}, ${withPrefix(state.samples / state.rate, "s")}, ${state.samples} samples`;
-    for (const [setting, knob] of knobs) {
+    for (const [name, knob] of knobs) {
       knob.input.disabled = !drives;
       knob.slider.setAttribute("aria-disabled", String(!drives));
-      if (!knob.held && state.values[setting] !== undefined) knob.show(state.values[setting]);
+      if (!knob.held && state.values[name] !== undefined) knob.show(state.values[name]);
     }
     for (const each of document.querySelectorAll("#generator [data-key]")) {
-      if (document.activeElement !== each) each.value = state.generator[each.dataset.key];
+      const value = state.generator[each.dataset.key];
+      if (document.activeElement !== each) each.value = typeof value === "number" ? short(value, 6) : value;
       if (each.dataset.key === "duty") each.disabled ||= state.generator.shape !== "pulse";
     }
     for (const each of $("modes").children) each.setAttribute("aria-pressed", String(each.dataset.mode === state.mode));
@@ -480,6 +481,7 @@
       cell(row, alarm.latency_n ?? "–", "number");
       cell(row, alarm.bound_n ?? "–", "number");
     });
+    $("estimates").hidden = !state.estimates.length;
     rows($("estimates"), state.estimates, (row, { name, estimate, truth }) => {
       const head = document.createElement("th");
       head.scope = "row";
