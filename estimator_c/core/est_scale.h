@@ -13,15 +13,10 @@
 /// was before the change.
 #define EST_BLOCK_N 32U
 
-/// Smallest share of a new block in the noise variance: a memory of 700 equations. Before the trigger is armed the
+/// Smallest share of a new block in the noise variance: a memory of 350 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
-#define EST_SHARE_MIN 0.045F
+#define EST_SHARE_MIN 0.09F
 #define EST_SHARE_WARM 0.25F
-
-/// Smallest share of a block above the noise variance: noise that grows or comes in bursts is followed soon. The level of
-/// the squares makes up for that with white noise.
-#define EST_SHARE_RISE 0.135F
-#define EST_RISE_LEVEL 0.9F
 
 /// A block is high if its mean square reaches this many noise variances that contain it. A high block counts a step,
 /// each other block takes one off; at the limit an alarm is due. It finds a change that an inflated scale hides: the
@@ -31,7 +26,7 @@
 #define EST_HIGH_LIMIT 6U
 
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
-#define EST_MARGIN 2.0F
+#define EST_MARGIN 1.0F
 
 /// Smallest noise variance that is followed, in configured ones: quantisation alone, with the default. The innovations of
 /// a plant without noise come in bursts.
@@ -41,10 +36,10 @@
 /// all bounds; later it raises an alarm.
 #define EST_GROWTH_MAX 9.0F
 
-/// Inflation: factor per unjustified alarm, factor per block on the way back to 1 (a factor of 16 in 400,000 equations),
+/// Inflation: factor per unjustified alarm, factor per block on the way back to 1 (a factor of 4 in 400,000 equations),
 /// and largest value.
-#define EST_INFLATION_STEP 16.0F
-#define EST_INFLATION_DECAY 0.9997782F
+#define EST_INFLATION_STEP 4.0F
+#define EST_INFLATION_DECAY 0.9998933F
 #define EST_INFLATION_MAX 1.0e6F
 
 /// After an alarm, the old estimate is compared with the new one from equation EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N,
@@ -67,8 +62,8 @@
 #define EST_CREDIT_MAX 4.0F
 #define EST_CREDIT_PER_BLOCK ((float)EST_BLOCK_N / 5000.0F)
 
-/// Mean square of a block, of the sum of its terms over their weight, at the level of the noise variance.
-#define EST_MEAN_SQUARE (EST_RISE_LEVEL / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE * (float)EST_BLOCK_N))
+/// Mean square of a block, of the sum of its terms over their weight.
+#define EST_MEAN_SQUARE (1.0F / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE * (float)EST_BLOCK_N))
 
 /// Equations to the end of the warm-up below which the noise variance is followed with its final memory.
 #define EST_WARM_N 64U
@@ -103,23 +98,22 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
 /// Noise variance after a complete block, at least `least`. `share_least`: smallest share of the next block.
 static inline float
 est_scale_follow(est_scale_t* const self, const float noise_variance, const float least, const float share_least) {
-    const float mean  = (self->sum * EST_MEAN_SQUARE) / self->weight;
-    const float most  = EST_GROWTH_MAX * noise_variance;
-    const bool  rises = (mean > noise_variance) && (mean < most);
-    const float share = rises ? est_max(self->share, EST_SHARE_RISE) : self->share;
-    const float noise = noise_variance + (share * (est_min(mean, most) - noise_variance));
-    self->share       = est_max(self->share / (1.0F + self->share), share_least);
+    const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
+    const float limited = est_min(mean, EST_GROWTH_MAX * noise_variance);
+    const float noise   = noise_variance + (self->share * (limited - noise_variance));
+    self->share         = est_max(self->share / (1.0F + self->share), share_least);
     return est_max(noise, least);
 }
 
 /// Count a complete block if it is high.
 static inline void est_scale_count_high(est_scale_t* const self, const float noise_variance) {
-    if ((self->sum * EST_MEAN_SQUARE) >= (EST_HIGH * noise_variance * self->weight)) {
+    const bool high = (self->sum * EST_MEAN_SQUARE) >= (EST_HIGH * noise_variance * self->weight);
+    if (high && (self->high_n < EST_HIGH_LIMIT)) {
         self->high_n = (uint8_t)(self->high_n + EST_HIGH_STEP);
-    } else if (self->high_n > 0U) {
+    } else if (!high && (self->high_n > 0U)) {
         self->high_n--;
     } else {
-        // no block was high
+        // at a bound
     }
 }
 

@@ -162,7 +162,7 @@ def test_small_force_is_lack_of_excitation(estimator: Estimator) -> None:
     assert watched.strength > 1.0
 
 
-@pytest.mark.parametrize(("inflation", "cause"), [(64.0, "slow plant"), (1.0, "none")])
+@pytest.mark.parametrize(("inflation", "cause"), [(16.0, "slow plant"), (1.0, "none")])
 def test_lack_of_excitation_of_a_slow_plant_is_stated_with_false_alarms(
     estimator: Estimator, inflation: float, cause: str
 ) -> None:
@@ -176,7 +176,7 @@ def test_no_force_at_all_is_lack_of_excitation(estimator: Estimator) -> None:
 
 def test_likeliest_cause_is_stated_if_the_scale_is_inflated(estimator: Estimator) -> None:
     """Two alarms were not justified: the model does not fit, though no statistic exceeds its limit."""
-    watched = Steps().judged(estimator, inflation=64.0)
+    watched = Steps().judged(estimator, inflation=16.0)
     assert final(watched) == "noise"
     assert watched.strength == pytest.approx(2.0)
     assert np.flatnonzero(watched.cause[0])[0] < SETTLING_N + PERIOD_N

@@ -8,17 +8,14 @@ from analogrig.testing.reference.regression import Vector
 BLOCK_N = 32
 """Equations between two updates."""
 
-SHARE_MIN, SHARE_WARM, WARM_N = 0.045, 0.25, 64
+SHARE_MIN, SHARE_WARM, WARM_N = 0.09, 0.25, 64
 """Smallest shares of a block in the noise variance, armed and before; equations before which it is armed."""
-
-SHARE_RISE, RISE_LEVEL = 0.135, 0.9
-"""Smallest share of a block above the noise variance; level of the squares that makes up for it."""
 
 HIGH, HIGH_STEP, HIGH_LIMIT = 3.25, 2, 6
 """Mean square of a high block in noise variances that contain it, its step, and the count at which an alarm is due."""
 
-MARGIN, GROWTH_MAX = 2.0, 9.0
-INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 16.0, 0.9997782, 1e6
+MARGIN, GROWTH_MAX = 1.0, 9.0
+INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 4.0, 0.9998933, 1e6
 TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
 JUSTIFIED, CREDIT_MAX, CREDIT_PER_BLOCK = 4.0, 4.0, BLOCK_N / 5000.0
 PLAIN = 64.0 * (TRIAL_N - TRIAL_BEGIN_N)
@@ -130,20 +127,19 @@ class ReferenceScale:
             return
         self.is_doubtful |= abs(excess - 1.0) < NEAR
         if excess < 1.0:
-            mean, most = RISE_LEVEL * self._squares / BLOCK_N, GROWTH_MAX * self.noise_variance
-            self.is_doubtful |= abs(mean / most - 1.0) < NEAR
-            share = max(self._share, SHARE_RISE) if self.noise_variance < mean < most else self._share
-            self.noise_variance = max(
-                self.noise_variance + share * (min(mean, most) - self.noise_variance), self._least
-            )
+            mean = min(self._squares / BLOCK_N, GROWTH_MAX * self.noise_variance)
+            self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), self._least)
             least = SHARE_WARM if warm or self._share > SHARE_WARM else SHARE_MIN
             self._share = max(self._share / (1.0 + self._share), least)
 
     def _relax(self) -> None:
         """Count a high block. Let the inflation decrease, and the number of alarms that may be justified increase."""
-        height = RISE_LEVEL * self._squares / BLOCK_N / (HIGH * self.noise_variance)
+        height = self._squares / BLOCK_N / (HIGH * self.noise_variance)
         self.is_doubtful |= abs(height - 1.0) < NEAR
-        self.high_n = self.high_n + HIGH_STEP if height >= 1.0 else max(self.high_n - 1, 0)
+        if height < 1.0:
+            self.high_n = max(self.high_n - 1, 0)
+        elif self.high_n < HIGH_LIMIT:
+            self.high_n += HIGH_STEP
         self.inflation = max(self.inflation * INFLATION_DECAY, 1.0)
         self._credit = min(self._credit + CREDIT_PER_BLOCK, CREDIT_MAX)
         self._restart()
