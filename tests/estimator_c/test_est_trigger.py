@@ -192,7 +192,7 @@ INFLATION = 1e5
 def alarms_behind_an_inflated_scale(
     estimator: Estimator, onset: int, seed: int, **settings: float | tuple[float, float]
 ) -> list[int]:
-    """Alarms after the scale was inflated at sample 900 of 2,500, of a front suspension that is stiffer from the onset."""
+    """Alarms after the scale was inflated at sample 900 of 2,500, of a front suspension stiffer from the onset on."""
     u, y = suspension([(0, FRONT), (onset, (115.0, 3021.0, 29400.0))], np.arange(10.0, 2500.0, 50.0), 2500, 1.0, seed)
     assert estimator.init(**settings)
     assert not len(estimator.run(u[:900], y[:900]).alarms)
