@@ -13,20 +13,20 @@
 /// was before the change.
 #define EST_BLOCK_N 32U
 
-/// Smallest share of a new block in the noise variance: a memory of 350 equations. Before the trigger is armed the
+/// Smallest share of a new block in the noise variance: a memory of 1,000 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
-#define EST_SHARE_MIN 0.09F
+#define EST_SHARE_MIN 0.032F
 #define EST_SHARE_WARM 0.25F
 
 /// A block is high if its mean square reaches this many noise variances that contain it. A high block counts a step,
 /// each other block takes one off; at the limit an alarm is due. It finds a change that an inflated scale hides: the
 /// residual of a misfit has peaks, a change lasts.
-#define EST_HIGH 3.25F
+#define EST_HIGH 5.0F
 #define EST_HIGH_STEP 2U
 #define EST_HIGH_LIMIT 6U
 
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
-#define EST_MARGIN 1.0F
+#define EST_MARGIN 2.0F
 
 /// Smallest noise variance that is followed, in configured ones: quantisation alone, with the default. The innovations of
 /// a plant without noise come in bursts.

@@ -24,10 +24,8 @@
 /// the innovations are larger.
 #define ENOUGH_N 400.0F
 
-/// Limit of an innovation in standard deviations, squared, and the share of a new limit: the noise variance is followed
-/// faster than the kurtosis of the limited innovations bears.
+/// Limit of an innovation in standard deviations, squared.
 #define CLIP 9.0F
-#define LIMIT_SHARE 0.2F
 
 /// Innovations of a block, of which some may be lost.
 static const uint16_t BLOCK_N = EST_FIT_BLOCK_N;
@@ -394,7 +392,7 @@ static void evaluate(est_fit_watch_t* const self, const est_t* const estimator, 
 static void close_sum(est_fit_watch_t* const self, const est_t* const estimator) {
     est_fit_moments_t* const all = &self->sums.all;
     self->entered                = self->pending.clear;
-    self->limit += LIMIT_SHARE * (improve_root(self->limit, CLIP * est_noise_variance(estimator)) - self->limit);
+    self->limit                  = improve_root(self->limit, CLIP * est_noise_variance(estimator));
     if (self->settling_n > 0U) {
         self->settling_n--;
     } else {

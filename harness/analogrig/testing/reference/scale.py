@@ -8,13 +8,13 @@ from analogrig.testing.reference.regression import Vector
 BLOCK_N = 32
 """Equations between two updates."""
 
-SHARE_MIN, SHARE_WARM, WARM_N = 0.09, 0.25, 64
+SHARE_MIN, SHARE_WARM, WARM_N = 0.032, 0.25, 64
 """Smallest shares of a block in the noise variance, armed and before; equations before which it is armed."""
 
-HIGH, HIGH_STEP, HIGH_LIMIT = 3.25, 2, 6
+HIGH, HIGH_STEP, HIGH_LIMIT = 5.0, 2, 6
 """Mean square of a high block in noise variances that contain it, its step, and the count at which an alarm is due."""
 
-MARGIN, GROWTH_MAX = 1.0, 9.0
+MARGIN, GROWTH_MAX = 2.0, 9.0
 INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 4.0, 0.9998933, 1e6
 TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
 JUSTIFIED, CREDIT_MAX, CREDIT_PER_BLOCK = 4.0, 4.0, BLOCK_N / 5000.0
