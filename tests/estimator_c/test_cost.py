@@ -64,7 +64,7 @@ BEYOND = {
     "M4F, n = 6, edges may slip, worst": 808,
     "M4F, n = 6, edges may slip, fixed, worst": 740,
     "M3, n = 4, edges locked, worst": 8415,
-    "M4F, code of the core at -Os, everything": 5920,
+    "M4F, code of the core at -Os, everything": 6024,
     "M4F, code of the core at -Os, trigger alone": 1550,
 }
 """Limits that the core still misses, with values not to exceed; one that it keeps must leave this list.
