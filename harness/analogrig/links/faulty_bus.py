@@ -72,6 +72,11 @@ class FaultyBus(FaultyLine[CanBus, can.Message]):
     def waiting(self) -> int:
         return super().waiting + len(self._ready)
 
+    def mend(self) -> None:
+        super().mend()
+        self._off_until_s = None
+        self._ready.clear()
+
     def _write(self, sent: Sequence[can.Message]) -> None:
         for frame in sent:
             self._line.send(frame)

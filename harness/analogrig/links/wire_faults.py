@@ -124,6 +124,12 @@ class Lane(Generic[T]):
             self.put(*(sent for n, sent in self.held if n <= 1))
             self.held = [(n - 1, sent) for n, sent in self.held if n > 1]
 
+    def mend(self) -> None:
+        """End outage, stall and noise, and lose the frames that are held back."""
+        self.held.clear()
+        self.queue.clear()
+        self.stalled_s, self.babble, self.lost_n = 0.0, "", 0
+
     def due(self) -> list[T]:
         """Frames that have arrived by now."""
         out = []
@@ -164,6 +170,26 @@ class FaultyLine(ABC, Generic[L, T]):
     def waiting(self) -> int:
         """Number of frames that are held back."""
         return sum(len(lane.queue) + len(lane.held) for lane in self._lanes.values())
+
+    @property
+    def lasting(self) -> Sequence[str]:
+        """Kinds of the faults in force."""
+        return sorted(self._lasting | {lane.babble for lane in self._lanes.values() if lane.babble})
+
+    def inject(self, kind: str, direction: Direction) -> None:
+        """Apply a fault at the next frame of this direction.
+
+        :raises ConfigurationError: the line has no such fault.
+        """
+        if kind not in self.KINDS:
+            raise ConfigurationError(f"the line has no fault {kind!r}: it has {', '.join(self.KINDS)}")
+        self._at[direction, self._lanes[direction].frames] = kind
+
+    def mend(self) -> None:
+        """End the faults in force; frames that are held back are lost."""
+        self._lasting.clear()
+        for lane in self._lanes.values():
+            lane.mend()
 
     def close(self) -> None:
         self._line.close()
