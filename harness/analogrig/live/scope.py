@@ -21,7 +21,7 @@ from analogrig.live.session import LiveSession
 MOST_SIGNALS = 16
 LEAST_WINDOW_N, MOST_WINDOW_N = 16, RING_N // 2
 MOST_COLUMNS = 4000
-_MOST_ESTIMATES = 2048
+_MOST_ESTIMATES = 512
 """Rows of theta that are converted for one screen."""
 _MEASURE_S = 0.2
 """Time between two measurements, which people read."""
@@ -120,10 +120,12 @@ def read_signal(session: LiveSession, name: str, first: int, end: int) -> Values
         return ring.read(name, first, end).astype(np.float64)
     names, parameter = session.notes.estimate_names, name.removeprefix("estimate ")
     if parameter in names:
-        stride = max(1, (end - first) // _MOST_ESTIMATES)
-        theta: Any = ring.read("theta", first, end)[::stride]
-        found = session.notes.estimated(theta)[:, names.index(parameter)]
-        return np.repeat(found, stride)[: end - first]
+        theta: Any = ring.read("theta", first, end)
+        is_new = np.append(True, (theta[1:] != theta[:-1]).any(axis=1))  # reports are often far apart
+        starts = np.flatnonzero(is_new)
+        starts = starts[:: -(-len(starts) // _MOST_ESTIMATES)]
+        found = session.notes.estimated(theta[starts])[:, names.index(parameter)]
+        return np.repeat(found, np.diff(starts, append=end - first))
     raise LookupError(f"no signal is called {name!r}")
 
 

@@ -5,6 +5,7 @@
   const BASES_S = [0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2];
   const DIVISIONS = 5; // above and below the middle
   const SCALES = [1, 2, 2.5, 5];
+  const WIDTH = 1; // of curves: wider ones take three times as long to draw without a graphics processor
   const KEPT = 12; // frames of the persistence
   const RETRY_MS = 500;
   const HAND_MS = 40; // time between two messages of a hand that turns a pot
@@ -28,6 +29,9 @@
   let arm = 0;
   let number = 0;
   const knobs = new Map();
+  const voltages = new Map(); // texts of the patch by amplifier
+  const settings = document.querySelectorAll("#generator [data-key]");
+  let operated = []; // what only the page that drives can operate
 
   // ---- messages
 
@@ -144,6 +148,10 @@
     buildFaults();
     buildPatch();
     buildSignals();
+    operated = document.querySelectorAll(
+      ".bar button, .bar select, #generator button, #generator [data-key], #modes button, #fault-section button, " +
+        "#fault-section select, #clear-lamps",
+    );
   }
 
   function buildKnobs() {
@@ -387,6 +395,7 @@
     $("patch-section").hidden = !bench.patch.length;
     const drawing = $("patch");
     drawing.replaceChildren();
+    voltages.clear();
     let y = 12;
     for (const row of bench.patch) {
       const height = 30 * Math.max(1, row.inputs.length);
@@ -408,7 +417,7 @@
       svg(group, "path", { class: "wire", d: `M310 ${y + height / 2}H340` });
       svg(group, "text", { x: 248, y: y + height / 2 + 4, class: "small" }, row.name);
       svg(group, "text", { x: 348, y: y + height / 2 + 4 }, `${row.node}${row.quantity ? `: ${row.quantity}` : ""}`);
-      svg(group, "text", { x: 540, y: y + height / 2 + 4, "data-volts": row.name, "text-anchor": "end" }, "–");
+      voltages.set(row.name, svg(group, "text", { x: 540, y: y + height / 2 + 4, "text-anchor": "end" }, "–"));
       group.onclick = () => toggle(row.name);
       group.onkeydown = (event) => {
         if (event.key !== "Enter" && event.key !== " ") return;
@@ -433,8 +442,7 @@
         : "Nobody drives the bench.";
     $("drive").hidden = state.driven;
     document.documentElement.dataset.role = drives ? "drives" : "watches";
-    const mine = "#play, #step, #restart, #tempo, #record, #generator *, #modes button, #faults button, #line-section *, #clear-lamps";
-    for (const each of document.querySelectorAll(mine)) each.disabled = !drives;
+    for (const each of operated) each.disabled = !drives;
     if (!bench.stepped) $("tempo").disabled = true;
     pressed("play", state.playing, state.playing ? "Pause" : "Run");
     pressed("record", state.recording, state.recording ? "End the recording" : "Record");
@@ -446,7 +454,7 @@
       knob.slider.setAttribute("aria-disabled", String(!drives));
       if (!knob.held && state.values[name] !== undefined) knob.show(state.values[name]);
     }
-    for (const each of document.querySelectorAll("#generator [data-key]")) {
+    for (const each of settings) {
       const value = state.generator[each.dataset.key];
       if (document.activeElement !== each) each.value = typeof value === "number" ? short(value, 6) : value;
       if (each.dataset.key === "duty") each.disabled ||= state.generator.shape !== "pulse";
@@ -457,8 +465,7 @@
     put($("lamps"), state.lamps.length ? state.lamps.join(", ") : "none");
     $("lamps").classList.toggle("lit", state.lamps.length > 0);
     for (const [name, volts] of Object.entries(state.volts)) {
-      const text = $("patch").querySelector(`[data-volts="${name}"]`);
-      if (text) put(text, `${volts.toFixed(2)} V`);
+      if (voltages.has(name)) put(voltages.get(name), `${volts.toFixed(2)} V`);
     }
     showDevice();
     const notices = state.notices.map(([, text]) => text).reverse();
@@ -631,7 +638,7 @@
         return short((at * per + middle) * (isSpectrum ? 1 : factorOf(current)), 3);
       });
     const vertical = Array.from({ length: 2 * DIVISIONS + 1 }, (_, i) => i - DIVISIONS);
-    const curves = frame.signals.map((id) => plotting.curve(id, ink(colourOf(id)), { unit: "", width: id === current ? 2 : 1.5 }));
+    const curves = frame.signals.map((id) => plotting.curve(id, ink(colourOf(id)), { unit: "", width: WIDTH }));
     plot = new uPlot(
       {
         width: box.clientWidth,
@@ -754,7 +761,7 @@
     $("clear-lamps").onclick = () => send("clear lamps");
     $("spoil").onclick = () => send("spoil", { kind: $("line-fault").value, direction: $("line-direction").value });
     $("mend").onclick = () => send("mend");
-    for (const each of document.querySelectorAll("#generator [data-key]")) {
+    for (const each of settings) {
       each.onchange = () => {
         const value = each.type === "number" ? Number(each.value) : each.value;
         each.blur();
