@@ -217,6 +217,8 @@ class LiveSession:
         )
         try:
             run = bench.play(self.take.scenario, self.seed)
+            if not (run.samples or run.conditions.faults):
+                self.device.stop()  # it was started, and had no record to end
         except AnalogrigError as error:
             self._stop_after(str(error))
             return
