@@ -36,6 +36,7 @@ from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 from analogrig.storage import replace_file
+from analogrig.wording import number_of
 from analogrig_emulator import EmulatorError
 
 BLOCK_S = 0.0125
@@ -455,16 +456,17 @@ class LiveSession:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             number = next(n for n in itertools.count(1) if not self._file(n, "npz").exists())
-            concluded.save(self._file(number, "npz"))
             table = {k: v for k, v in concluded.conditions.scenario.items() if v != "" and k not in ("name", "rig")}
             with replace_file(self._file(number, "toml")) as file:
                 file.write(config.to_toml(table).encode())
+            concluded.save(self._file(number, "npz"))  # last: no recording is without its scenario
         except (AnalogrigError, OSError) as error:
             self.notify(f"the recording could not be saved: {error}")
             return
         saved = Saved(self._file(number, "npz"), self._file(number, "toml"), run.samples, len(run.alarm_index))
         self.saved.append(saved)
-        self.notify(f"{saved.run}: {run.samples} samples, {saved.alarms} alarms; scenario: {saved.scenario}")
+        held = f"{number_of(run.samples, 'sample', form=',')}, {number_of(saved.alarms, 'alarm')}"
+        self.notify(f"saved {saved.run}: {held}; scenario: {saved.scenario}")
 
     def _file(self, number: int, suffix: str) -> Path:
         return self._folder / f"take-{number}.{suffix}"

@@ -469,6 +469,7 @@
     }
     showDevice();
     const notices = state.notices.map(([, text]) => text).reverse();
+    put($("notice"), notices[0] ?? "");
     const files = state.saved.map(({ run }) => `analogrig replay ${run}`);
     list($("notices"), [...notices, ...files.map((text) => `to play it again: ${text}`)]);
   }
