@@ -322,6 +322,7 @@ class FaultyLink:
     line_s = 0.0
     carries_blocks = True
     unread_n = None
+    faulty = None
 
     def __init__(self) -> None:
         self.clock = VirtualClock()
