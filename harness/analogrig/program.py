@@ -148,6 +148,12 @@ class Program:
         return frozenset(name for line in lines for name in line.formula.divisors())
 
     @functools.cached_property
+    def order(self) -> int:
+        """Order of the plant for a linear model: its number of states if it is linear, otherwise at most 2."""
+        states = len(self.equations.states)
+        return states if self.is_linear else min(states, 2)
+
+    @functools.cached_property
     def is_linear(self) -> bool:
         """True if the plant is linear, starts from equilibrium, and its input does not reach its output at once."""
         n = len(self.equations.states)

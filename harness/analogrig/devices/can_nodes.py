@@ -7,10 +7,11 @@ import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from analogrig.devices.child import Child
-from analogrig.devices.library import ALWAYS_ROOM, LibraryDevice
+from analogrig.devices.library import ALWAYS_ROOM, LIBRARY, LibraryDevice
 from analogrig.errors import LinkClosed
 from analogrig.links.can_bus import PythonCanBus
 from analogrig.links.line import CanLine
@@ -68,10 +69,17 @@ class MemoryBus(LibraryDevice):
     damaged = 0
 
     def __init__(
-        self, boot_nonce: int, *, is_fd: bool = False, line: CanLine | None = None, input_blocks: int = ALWAYS_ROOM
+        self,
+        boot_nonce: int,
+        *,
+        is_fd: bool = False,
+        line: CanLine | None = None,
+        input_blocks: int = ALWAYS_ROOM,
+        library: Path = LIBRARY,
     ) -> None:
         """Boot a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
-        super().__init__("can", ctypes.c_bool(is_fd), boot_nonce=boot_nonce, input_blocks=input_blocks)
+        port = ctypes.c_bool(is_fd)
+        super().__init__("can", port, boot_nonce=boot_nonce, input_blocks=input_blocks, library=library)
         self.is_fd, self.line = is_fd, line
         self.clock = VirtualClock()
         self._output = (_Frame * _OUTPUT_N)()

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from analogrig.links.can_bus import CanBus
 
 HOST_PROGRAM = PROGRAMS / "analogrig-device"
+WIDE_HOST_PROGRAM = PROGRAMS / "analogrig-device-wide"
+"""The same with room for plants of higher order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,15 +30,15 @@ class HostDevice(EitherDevice):
 
     @property
     def program(self) -> Path:
-        return HOST_PROGRAM
+        return WIDE_HOST_PROGRAM if self.estimator.is_wide else HOST_PROGRAM
 
     def wire(self) -> ChildWire:
-        return host_wire()
+        return host_wire(program=self.program)
 
     def bus(self) -> CanBus:
         from analogrig.devices.can_nodes import ChildBus
 
-        child = host_child(["--slcan"])
+        child = host_child(["--slcan"], self.program)
         return child.connect(lambda port: ChildBus(self.slcan(port), lambda _: child, name="slcan"))
 
 
