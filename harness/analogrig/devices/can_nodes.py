@@ -109,14 +109,16 @@ class MemoryBus(LibraryDevice):
 class InhabitedBus(PythonCanBus):
     """A bus with a device in this process, which a thread serves over a connection of its own."""
 
-    def __init__(self, config: Mapping[str, Any]) -> None:
+    def __init__(self, config: Mapping[str, Any], library: Path = LIBRARY) -> None:
         """Open two connections to the same bus, and boot the device.
 
         :raises ConfigurationError, LinkError: as for ``PythonCanBus``, or the project's library was not built.
         """
         super().__init__(config)
         try:
-            self._device = MemoryBus(secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
+            self._device = MemoryBus(
+                secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS, library=library
+            )
             self._devices_bus = PythonCanBus(config)
         except BaseException:
             super().close()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 from analogrig.devices.catalogue_description import EitherDevice
 from analogrig.devices.child import PROGRAMS, Child, ChildWire
 from analogrig.errors import LinkError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.wire import PortWire
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class HostDevice(EitherDevice):
 
     @property
     def program(self) -> Path:
-        return WIDE_HOST_PROGRAM if self.estimator.is_wide else HOST_PROGRAM
+        return host_program_for(self.estimator)
 
     def wire(self) -> ChildWire:
         return host_wire(program=self.program)
@@ -40,6 +41,11 @@ class HostDevice(EitherDevice):
 
         child = host_child(["--slcan"], self.program)
         return child.connect(lambda port: ChildBus(self.slcan(port), lambda _: child, name="slcan"))
+
+
+def host_program_for(estimator: EstimatorConfig) -> Path:
+    """Program of the device with room for these settings."""
+    return WIDE_HOST_PROGRAM if estimator.is_wide else HOST_PROGRAM
 
 
 def host_child(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> Child:
