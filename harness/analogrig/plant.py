@@ -236,10 +236,10 @@ def discretise(program: Program, parameters: NDArray[np.float64], period_s: floa
     """Discretise plants of a linear program, (p, m) parameters: (p, n, n + 1), the states from states and input."""
     generators = program.generators(parameters)
     generators[:, -1] = 0.0
-    return _exponentials(generators * period_s)[:, :-1]
+    return exponentials(generators * period_s)[:, :-1]
 
 
-def _exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+def exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """Matrix exponentials of (k, n, n), of the same shape. Importing scipy.linalg would take longer than numpy."""
     norms = np.abs(matrices).sum(axis=2).max(axis=1)
     squarings = np.maximum(0, np.frexp(norms)[1] + 4)

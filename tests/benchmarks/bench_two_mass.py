@@ -45,7 +45,7 @@ device is `inproc` with the settings that the program chooses, na = 4, nb = 5. C
 and down in turn. Delays and bounds are means over the detected changes. A bound comes from
 noise-free plays with and without the change.
 
-Changes of M1 and B1 are mostly missed. They carry 0.4 nats a sample, and the trigger's sum rises
+Changes of M1 and B1 are mostly missed. They carry 0.37 nats a sample, and the trigger's sum rises
 from {LEAST_NATS:.2f} nats."""
 
 
