@@ -83,9 +83,8 @@ def test_setting_of_a_test_that_names_an_order_makes_it_a_given_one() -> None:
 
 def test_device_without_room_is_refused_with_its_cure() -> None:
     narrow = InprocDevice(name="narrow", library=str(InprocDevice(name="").program))
-    with open_rig("emulator") as rig, narrow.connect() as dut:
-        with pytest.raises(DeviceRefused) as refused:
-            Bench(rig, dut).play(SHORT, 1)
+    with open_rig("emulator") as rig, narrow.connect() as dut, pytest.raises(DeviceRefused) as refused:
+        Bench(rig, dut).play(SHORT, 1)
     assert str(refused.value) == (
         "device narrow: na = 4 was not applied: OUT_OF_RANGE, it has 2; the program's order needs it: compile the"
         " device with -DEST_NA_MAX=4U -DEST_NB_MAX=5U -DEST_THETA_MAX=10U, or give it a lower order in [estimator]"
