@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.bench import Bench, direct_bench
+from analogrig.bench import Bench, can_be_direct, direct_bench
 from analogrig.cli import main
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.opening import open_dut, reopen_dut
@@ -57,6 +57,7 @@ def test_program_chooses_the_orders_of_a_device_without_settings(device: str) ->
 def test_blocks_and_messages_have_the_same_estimates_of_order_4() -> None:
     with open_rig("emulator") as rig, open_dut("inproc") as dut:
         by_messages = Bench(rig, dut).play(TWO_MASS, 3)
+        assert can_be_direct(rig, describe("inproc"))
         assert direct_bench(rig, describe("inproc")).play(TWO_MASS, 3).theta_hash() == by_messages.theta_hash()
         assert judge(by_messages).outcome == "passed"
         with reopen_dut(by_messages.conditions.dut, "run.npz") as replayed:
