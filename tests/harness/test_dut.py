@@ -296,8 +296,8 @@ def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Fed) -> None:
 def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
     dut = CatalogueDevice(FramedLink(MemoryWire(1)), InprocDevice(name="bob"))
     dut.recover()
-    with pytest.raises(DeviceRefused, match=r"^device bob: nb = 7 was not applied: OUT_OF_RANGE, it has 3$"):
-        dut.configure(nb=7)
+    with pytest.raises(DeviceRefused, match=r"^device bob: nk = 7 was not applied: OUT_OF_RANGE, it has 0$"):
+        dut.configure(nk=7)
 
 
 def test_running_device_cannot_be_configured_or_started() -> None:
