@@ -206,8 +206,8 @@ def _check_words(equations: Equations) -> None:
         if row.alias in _KEYS_OF_CHANGES:
             raise ProgramError(f"parameters.{name}.alias: {row.alias} is a key of changes in scenarios; choose another")
         if row.diagnosis and row.diagnosis not in _DIAGNOSES:
-            known = ", ".join(_DIAGNOSES)
-            raise ProgramError(f"parameters.{name}.diagnosis: no device names {row.diagnosis[:40]!r}; there are {known}")
+            known, given = ", ".join(_DIAGNOSES), row.diagnosis[:40]
+            raise ProgramError(f"parameters.{name}.diagnosis: no device names {given!r}; there are {known}")
 
 
 def _check_channels(equations: Equations) -> None:

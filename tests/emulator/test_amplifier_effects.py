@@ -273,7 +273,7 @@ def test_a_supply_that_cannot_be_is_refused(fields: dict[str, float]) -> None:
 
 
 def test_noise_of_a_multiplier_is_its_density_over_its_bandwidth() -> None:
-    """The bandwidth of one pole is pi/2 times 1 MHz. The data sheet of the AD633 has 100 uV rms from 10 Hz to 10 kHz."""
+    """One pole has a bandwidth of pi/2 times 1 MHz. The data sheet of the AD633 has 100 uV rms up to 10 kHz."""
     assert 50e-6 < MULTIPLIERS["ad633"].noise_v_per_rthz * math.sqrt(10e3) < 100e-6
     elements: list[Element] = [
         VoltageSource("F", "in"),
