@@ -45,6 +45,7 @@ from analogrig.errors import (
 )
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.link import CanListener, Link
+from analogrig.links.wire_faults import FaultyLine
 from analogrig.protocol.conversation import Conversation
 from analogrig.protocol.exchange import Exchange, Packing, most_answers
 from analogrig.protocol.pace import Pace, check_line
@@ -116,6 +117,10 @@ class CatalogueDevice(Device):
     def parameters(self) -> int:
         """Number of elements of theta."""
         return self.estimator.parameters
+
+    @property
+    def faulty_line(self) -> FaultyLine[Any, Any] | None:
+        return self._talk.link.faulty
 
     def listen(self, listener: CanListener) -> None:
         self._listener = listener

@@ -16,6 +16,7 @@ from analogrig.run import Channel
 
 if TYPE_CHECKING:
     from analogrig.links.link import CanListener
+    from analogrig.links.wire_faults import FaultyLine
 
 
 class Device(ABC):
@@ -148,6 +149,11 @@ class Device(ABC):
     def line(self) -> Mapping[str, int]:
         """Bit rates of the line, if known, with ``samples_per_message`` and ``window`` of the packing."""
         return {}
+
+    @property
+    def faulty_line(self) -> FaultyLine[Any, Any] | None:
+        """Line that applies faults to its frames; None if the device was opened without line faults."""
+        return None
 
     def listen(self, listener: CanListener) -> None:  # noqa: B027 - few lines carry CAN frames
         """Report all CAN frames to the listener from now on; a line without any ignores it."""
