@@ -11,7 +11,7 @@ import pytest
 
 from estimator_c.fuzz.fuzz import LONGEST_INPUT, build, fuzz
 
-RUNS = {"fuzz_est": 60_000, "fuzz_serial": 10_000, "fuzz_can": 10_000, "fuzz_slcan": 10_000}
+RUNS = {"fuzz_est": 40_000, "fuzz_serial": 4_000, "fuzz_can": 4_000, "fuzz_slcan": 4_000}
 """Inputs by target."""
 
 
