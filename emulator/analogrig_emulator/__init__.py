@@ -37,6 +37,7 @@ from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn
 from analogrig_emulator.circuit.spice import Deck, to_spice
 from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.engine.response import sampled_response
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
 from analogrig_emulator.errors import (
     CircuitError,
@@ -142,5 +143,6 @@ __all__ = [
     "piecewise_linear",
     "preset",
     "probes_per_sample",
+    "sampled_response",
     "to_spice",
 ]

@@ -145,6 +145,11 @@ class SampledPlant:
             for (xx, xv, xf), (vx, vv, vf) in discretise(parameters.reshape(-1, 3), period_s).tolist()
         ]
 
+    @functools.cached_property
+    def matrices(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Transition (2, 2) and response (2,)."""
+        return np.array(self.transition).reshape(2, 2), np.array(self.response)
+
     def next(self, state: State, force_n: float) -> State:
         """State one sample later."""
         x, v = state

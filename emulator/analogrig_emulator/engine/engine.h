@@ -194,6 +194,11 @@ void engine_noise_add(int                   n,
                       double*               x,
                       double*               volts);
 
+/// Step a sampled linear system of n states: x becomes phi x + gamma u in each of `samples` periods, with one number u of input,
+/// and out takes the first element of x after each. n is at most ENGINE_MAX_STATES.
+void engine_follow(
+    int n, int64_t samples, const double* phi, const double* gamma, const double* input, double* x, double* out);
+
 /// Round the instants of `count` edges to ticks, and up to a multiple of grid; those before tick 0 move there. Of edges at one
 /// tick keep the last, and of those only the ones that change the level. Write the edges from tick start to stop - 1 to tick and
 /// level, and return their number. instant: rising; level: the level after each instant, overwritten.

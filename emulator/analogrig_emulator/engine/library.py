@@ -56,6 +56,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
     ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
     ("engine_noise_add", None, (c_int, c_int, c_int64, POINTER(Noise), *(c_void_p,) * 4)),
+    ("engine_follow", None, (c_int, c_int64, *(c_void_p,) * 5)),
     ("engine_take", None, (c_int64, c_int, c_int64, c_void_p, c_double, *(c_void_p,) * 4)),
     ("engine_edges", c_int64, (*(c_int64,) * 4, *(c_void_p,) * 3)),
     ("engine_see", c_int, (c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),

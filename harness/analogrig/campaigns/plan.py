@@ -165,8 +165,10 @@ class Plan:
 
     def draw(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""
+        if not (axes := self.spec.draw.axes()):
+            return {}
         rng = np.random.default_rng([seed, _DRAWS])
-        return {axis: float(rng.uniform(low, high)) for axis, (low, high) in self.spec.draw.axes().items()}
+        return {axis: float(rng.uniform(low, high)) for axis, (low, high) in axes.items()}
 
     def case(self, cell: Cell, seed: int, drawn: Mapping[str, float] | None = None) -> Case:
         """:raises ConfigurationError: the values make no scenario."""
@@ -179,6 +181,11 @@ class Plan:
         if "noise_lsb" in values:
             rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
         return Case(rig, self.devices[cell.device], scenario, seed)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of each trial."""
+        return self._base.samples
 
     @functools.cached_property
     def _base(self) -> Scenario:

@@ -15,7 +15,6 @@ reaches ln 20. A rival is a plant with one other parameter changed.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 
 from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, discretise
 from analogrig.run import CHUNK_SAMPLES, Run
-from analogrig_emulator import PROGRAMS, TICKS_PER_SAMPLE, Edges
+from analogrig_emulator import PROGRAMS, TICKS_PER_SAMPLE, Edges, sampled_response
 
 if TYPE_CHECKING:
     from analogrig.scenario import Scenario
@@ -75,7 +74,7 @@ def change_information(run: Run) -> list[NDArray[np.float64]]:
 def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
     """I(1), I(2), ... of one change, float64."""
     changed = _Motion.of_change(change, period_s)
-    unchanged = _Motion(change.state, itertools.repeat(SampledPlant.from_plant(change.before, period_s)))
+    unchanged = _Motion(change.state, SampledPlant.from_plant(change.before, period_s))
     out = np.empty(len(change.force_n))
     gathered = 0.0
     for first in range(0, len(out), CHUNK_SAMPLES):
@@ -89,26 +88,32 @@ def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
 class _Motion:
     """Simulation of a plant under a force, chunk by chunk."""
 
-    def __init__(self, state: State, steps: Iterator[SampledPlant]) -> None:
-        """Start from ``state``; ``steps`` yields the plant of each sample period."""
-        self.state = state
-        self._steps = steps
+    def __init__(self, state: State, settled: SampledPlant, ramp: Sequence[SampledPlant] = ()) -> None:
+        """Start from ``state``; ``ramp`` is the plant in each of the first sample periods."""
+        self._state = np.array(state)
+        self._settled = settled
+        self._ramp = ramp
 
     @classmethod
     def of_change(cls, change: _Change, period_s: float) -> _Motion:
         """Motion of the true plant from the change on."""
-        settled = itertools.repeat(SampledPlant.from_plant(change.after, period_s))
-        return cls(change.state, itertools.chain(change.ramp, settled))
+        return cls(change.state, SampledPlant.from_plant(change.after, period_s), change.ramp)
+
+    @property
+    def state(self) -> State:
+        """State after the last force."""
+        x, v = self._state.tolist()
+        return x, v
 
     def displacement_m(self, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacement after each of the next n forces, (n,) metres."""
-        state = self.state
-        out = np.empty(len(force_n))
-        for k, (force, step) in enumerate(zip(force_n.tolist(), self._steps, strict=False)):
-            state = step.next(state, force)
-            out[k] = state[0]
-        self.state = state
-        return out
+        ramp, self._ramp = self._ramp[: len(force_n)], self._ramp[len(force_n) :]
+        parts = [self._displacement_m(step, force_n[k : k + 1]) for k, step in enumerate(ramp)]
+        parts.append(self._displacement_m(self._settled, force_n[len(ramp) :]))
+        return np.concatenate(parts) if ramp else parts[0]
+
+    def _displacement_m(self, plant: SampledPlant, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
+        return sampled_response(*plant.matrices, self._state, force_n)
 
 
 def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096) -> bool:

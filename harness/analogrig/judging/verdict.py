@@ -13,8 +13,9 @@ if the hypotheses disagree, or if a change cannot be found in the samples.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -25,7 +26,7 @@ from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
-from analogrig.judging.exposure import Exposure, exposure
+from analogrig.judging.exposure import Exposure, exposures
 from analogrig.plant import PARAMETERS, Segment, physical_parameters
 from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
@@ -253,6 +254,8 @@ class Verdict:
     ceiling: float | None
     """Alarm threshold of the trigger's statistic; None without a trigger, or if it is not known."""
     missing_n: int
+    armed_n: int
+    """Samples in which the trigger was armed."""
     theta_hash: str
     """``Run.theta_hash``; empty if the device reports no estimate."""
     alarm_hash: str = ""
@@ -294,11 +297,35 @@ def judge(run: Run) -> Verdict:
 
     :raises ConfigurationError: the recorded scenario has an invalid expectation.
     """
-    expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
+    return judge_all([run])[0]
+
+
+def judge_all(runs: Iterable[Run]) -> list[Verdict]:
+    """Verdict on each run, as of ``judge``.
+
+    Consecutive runs that differ in seed and samples alone are judged together, in a part of the time.
+    """
+    return [verdict for _, alike in itertools.groupby(runs, _common) for verdict in _judge_alike(list(alike))]
+
+
+def _common(run: Run) -> tuple[object, ...]:
+    """Values that runs have in common which are judged together."""
+    known = run.conditions
+    return run.samples, known.segments, known.records, known.channels, known.scenario, known.dut
+
+
+def _judge_alike(runs: Sequence[Run]) -> Iterator[Verdict]:
+    expect = config.build(Expectations, runs[0].conditions.scenario.get("expect", {}), "the recorded scenario: expect")
+    for run, shown, estimates in zip(runs, exposures(runs), _segment_estimates(runs), strict=True):
+        yield _judge(run, expect, shown, estimates)
+
+
+def _judge(run: Run, expect: Expectations, shown: Exposure, estimates: tuple[SegmentEstimate, ...]) -> Verdict:
+    """Verdict on a run with this exposure and these estimates."""
     sheet = run.datasheet
     level = sheet.log_arl0(expect.arl0)
     results = _evaluate_hypotheses(run, expect, level)
-    invalid = invalid_reasons(run, exposure(run), expect)
+    invalid = invalid_reasons(run, shown, expect)
     outcome, reasons = _decide_outcome(results, expect)
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
     possible = {index for each in results for index in each.false_alarms}
@@ -308,10 +335,11 @@ def judge(run: Run) -> Verdict:
         tweaks=_merge_hypotheses(results),
         false_alarms=tuple(sorted(certain)),
         doubtful_alarms=tuple(sorted(possible - certain)),
-        estimates=_segment_estimates(run.with_change_instants(Segment.earliest)),
+        estimates=estimates,
         arl0=math.exp(min(level, LARGEST_LEVEL)),
         ceiling=sheet.ceiling,
         missing_n=int(np.count_nonzero(run.missing)),
+        armed_n=shown.armed,
         theta_hash=run.theta_hash(),
         alarm_hash=run.alarm_hash(),
         not_judged=unreported(sheet),
@@ -372,8 +400,12 @@ def unreported(sheet: Datasheet) -> tuple[str, ...]:
 
 def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
     """Estimated M, B, K after each of ``samples``, (n, 3) float64; NaN if theta does not describe them."""
+    return _physical(run, run.theta[samples])
+
+
+def _physical(run: Run, theta: NDArray[np.float32]) -> NDArray[np.float64]:
+    """M, B, K, (n, 3) float64, of estimates (n, p) under the conditions of ``run``; NaN if they do not describe them."""
     channels, model = run.conditions.channels, run.datasheet.model
-    theta = run.theta[samples]
     if model is None or not theta.shape[1]:
         return np.full((len(theta), len(PARAMETERS)), np.nan)
     return physical_parameters(
@@ -448,7 +480,7 @@ class _HypothesisResult:
 def _evaluate_hypotheses(run: Run, expect: Expectations, level: float) -> list[_HypothesisResult]:
     """Results at the likeliest instants and, unless these are exact, at the earliest and the latest."""
     runs = [run]
-    if not all(segment.is_exact for segment in run.conditions.segments):
+    if not _is_exact(run):
         runs += [run.with_change_instants(Segment.earliest), run.with_change_instants(Segment.latest)]
     out = []
     for supposed in runs:
@@ -628,13 +660,21 @@ def _failure_reasons(
     return reasons
 
 
-def _segment_estimates(run: Run) -> tuple[SegmentEstimate, ...]:
-    """Last estimate of each segment whose plant is known."""
+def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]:
+    """Last estimate of each segment whose plant is known, for each run."""
+    run = runs[0] if _is_exact(runs[0]) else runs[0].with_change_instants(Segment.earliest)
     unseen = {segment.start for segment in run.conditions.segments if segment.unseen}
-    segments = [segment for segment in run.segments if segment[0] not in unseen]
-    lasts = trajectory(run, [end - 1 for _, end, _ in segments])
-    out = []
-    for (start, end, plant), last in zip(segments, lasts, strict=True):
-        estimate = None if np.isnan(last).any() else dict(zip(PARAMETERS, last.tolist(), strict=True))
-        out.append(SegmentEstimate(start, end, plant.parameters(), estimate))
-    return tuple(out)
+    segments = [(start, end, plant.parameters()) for start, end, plant in run.segments if start not in unseen]
+    ends = [end - 1 for _, end, _ in segments]
+    lasts = _physical(run, np.concatenate([each.theta[ends] for each in runs]))
+    found = [
+        None if is_none else dict(zip(PARAMETERS, last, strict=True))
+        for last, is_none in zip(lasts.tolist(), np.isnan(lasts).any(axis=1).tolist(), strict=True)
+    ]
+    estimates = iter(found)
+    return [tuple(SegmentEstimate(*each, next(estimates)) for each in segments) for _ in runs]
+
+
+def _is_exact(run: Run) -> bool:
+    """True if the instants of all changes are known."""
+    return all(segment.is_exact for segment in run.conditions.segments)
