@@ -2,6 +2,8 @@
 
 #include "library.h"
 
+#include <string.h>
+
 size_t library_size(void) { return sizeof(library_t); }
 
 void library_init(library_t* const self) { self->settings = settings_default(); }
@@ -16,9 +18,9 @@ static void
 keep(const library_t* const self, const size_t k, const est_step_t* const step, const library_out_t* const out) {
     if (out->theta != 0) {
         const uint8_t count = est_theta_count(&self->estimator);
-        for (uint8_t i = 0U; i < count; i++) {
-            out->theta[(k * count) + i] = est_theta(&self->estimator, i);
-        }
+        float         theta[EST_THETA_MAX];
+        est_copy_theta(&self->estimator, theta);
+        (void)memcpy(&out->theta[k * count], theta, count * sizeof theta[0]);
     }
     if (out->innovation != 0) {
         out->innovation[k] = step->innovation;
