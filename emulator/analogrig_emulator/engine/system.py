@@ -39,6 +39,17 @@ def is_integer(number: object) -> bool:
     return isinstance(number, Integral)
 
 
+class EdgeRows(NamedTuple):
+    """Level changes of one input in several plays: the first counts[i] of row i, as in Edges."""
+
+    counts: NDArray[np.int64]
+    """(plays,)"""
+    ticks: NDArray[np.int64]
+    """(plays, room)"""
+    levels_v: NDArray[np.float64]
+    """(plays, room), all finite."""
+
+
 @dataclass(frozen=True)
 class Edges:
     """Level changes of one input: levels_v[i] applies from tick ticks[i] on.
