@@ -9,7 +9,7 @@ import itertools
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -327,7 +327,44 @@ def can_be_direct(rig: Rig, device: DeviceDescription) -> TypeGuard[EmulatorRig]
     return is_emulated(rig) and "blocks" in device.capabilities
 
 
-def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bool = False) -> Bench:
+class DirectBench(Bench):
+    """Bench of an emulated rig and a device without messages."""
+
+    def play_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Run]:
+        """Runs of ``play`` with each seed, to the bit. Those of one block are computed together, in half of the time.
+
+        :raises ConfigurationError, DeviceError, RigError: one of them would raise it, or have it as a fault.
+        """
+        if scenario.samples > DIRECT_BLOCK_SAMPLES:
+            return [self.play(scenario, seed) for seed in seeds]
+        performances = self.rig.perform_all(scenario, seeds)
+        self.dut.prepare(performances[0].channels, performances[0].sample_period_s)
+        blocks = [next(each.blocks) for each in performances]
+        answered = self.dut.play_records([block.samples() for block in blocks])
+        return [
+            self._run_of(performance, scenario, seed, block, *each)
+            for seed, performance, block, each in zip(seeds, performances, blocks, answered, strict=True)
+        ]
+
+    def _run_of(
+        self,
+        performance: Performance,
+        scenario: Scenario,
+        seed: int,
+        block: Block,
+        answers: Answers,
+        counters: Mapping[str, int],
+    ) -> Run:
+        """Run of one block."""
+        initial = self._initial_conditions(performance, scenario, seed)
+        builder = RunBuilder(scenario.samples, self.dut.datasheet)
+        builder.begin_record()
+        builder.add(block, answers)
+        builder.end_record(self.dut.line_s, counters)
+        return builder.build(self._final_conditions(initial, performance.hindsight(), scenario.caveats, builder))
+
+
+def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bool = False) -> DirectBench:
     """Bench with the estimator in this process and whole blocks: the fastest way.
 
     If ``can_be_direct``, the runs are those over the line to the bit, without what needs messages.
@@ -339,4 +376,4 @@ def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bo
     # glibc returns freed memory to the system beyond a threshold that grows with the largest block freed. Without this
     # line every play would fault its pages in again, which takes a tenth of the time.
     np.empty(_RETAINED_BYTES, np.uint8)
-    return Bench(rig.in_blocks(DIRECT_BLOCK_SAMPLES), device.direct(alarms_only=alarms_only))
+    return DirectBench(rig.in_blocks(DIRECT_BLOCK_SAMPLES), device.direct(alarms_only=alarms_only))

@@ -76,6 +76,36 @@ size_t library_run_codes(library_t* const           self,
     return alarms;
 }
 
+/// Start of the rows of record r in a result; a null pointer remains one.
+#define ROWS(result, r, size) ((result) == 0 ? 0 : &(result)[(r) * (size)])
+
+bool library_run_records(library_t* const           self,
+                         const size_t               records,
+                         const size_t               n,
+                         const size_t               stride,
+                         const uint16_t* const      u,
+                         const uint16_t* const      y,
+                         const uint8_t* const       valid,
+                         const library_out_t* const out,
+                         est_counters_t* const      counters) {
+    bool started = true;
+    for (size_t r = 0U; started && (r < records); r++) {
+        const library_out_t rows = {
+            .theta      = ROWS(out->theta, r, n * library_theta_count(self)),
+            .innovation = ROWS(out->innovation, r, n),
+            .statistic  = ROWS(out->statistic, r, n),
+            .status     = ROWS(out->status, r, n),
+            .alarm      = ROWS(out->alarm, r, n),
+        };
+        started = library_start(self);
+        if (started) {
+            (void)library_run_codes(self, n, stride, &u[r * n * stride], &y[r * n * stride], ROWS(valid, r, n), &rows);
+            counters[r] = library_counters(self);
+        }
+    }
+    return started;
+}
+
 uint8_t library_theta_count(const library_t* const self) { return est_theta_count(&self->estimator); }
 
 est_counters_t library_counters(const library_t* const self) { return est_counters(&self->estimator); }

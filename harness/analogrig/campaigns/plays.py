@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
+from analogrig.bench import Bench, DirectBench, can_be_direct, direct_bench, raise_if_interrupted
 from analogrig.campaigns import builds
 from analogrig.campaigns.plan import Case, Cell, Part, Plan, device_of, open_table
 from analogrig.campaigns.rows import Row, row, row_of_none
@@ -78,14 +78,14 @@ class _Benches(threading.local):
     def __init__(self) -> None:
         self._rigs: _Cache[Rig] = _Cache(open_table)
         self._devices: _Cache[Device] = _Cache(lambda table: device_of(table).connect())
-        self._direct: _Cache[Bench | None] = _Cache(self._direct_bench)
+        self._direct: _Cache[DirectBench | None] = _Cache(self._direct_bench)
 
     def _direct_bench(
         self,
         rig: Any,
         device: Any,
         alarms_only: bool,  # noqa: FBT001 - part of the key
-    ) -> AbstractContextManager[Bench | None]:
+    ) -> AbstractContextManager[DirectBench | None]:
         opened, planned = self._rigs.get(rig), device_of(device)
         if not can_be_direct(opened, planned):
             return contextlib.nullcontext()
@@ -102,8 +102,8 @@ class _Benches(threading.local):
         """
         bench = self._direct.get(case.rig, case.device, alarms_only)
         try:
-            bench = bench or Bench(self._rigs.get(case.rig), self._devices.get(case.device))
-            run = bench.play(case.scenario, case.seed)
+            used = bench or Bench(self._rigs.get(case.rig), self._devices.get(case.device))
+            run = used.play(case.scenario, case.seed)
         except BaseException as error:
             self._devices.drop(case.device)
             if isinstance(error, RigError):
@@ -112,6 +112,13 @@ class _Benches(threading.local):
         if run.conditions.faults:
             self._devices.drop(case.device)
         return raise_if_interrupted(run)
+
+    def play_together(self, case: Case, seeds: Sequence[int]) -> list[Run]:
+        """Runs of a case with these seeds instead of its own; none where ``play`` must play them one by one."""
+        bench = self._direct.get(case.rig, case.device, False)
+        with contextlib.suppress(AnalogrigError):
+            return [] if bench is None else bench.play_all(case.scenario, seeds)
+        return []
 
     def close(self) -> None:
         for kept in (self._direct, self._devices, self._rigs):
@@ -152,9 +159,10 @@ def play_part(plan: str, part: Part) -> list[Row]:
 
 
 def _play_batch(plan: Plan, number: int, cell: Cell, seeds: Sequence[int]) -> Iterator[Row]:
-    """Rows of some trials, which are judged together. One that cannot be played is inconclusive."""
+    """Rows of some trials, played together where they can be. One that cannot be played is inconclusive."""
     drawn = [plan.draw(seed) for seed in seeds]
-    played = [_play_trial(plan, number, cell, *each) for each in zip(seeds, drawn, strict=True)]
+    played: Sequence[Run | str] = [] if any(drawn) else _benches.play_together(plan.case(cell, seeds[0], {}), seeds)
+    played = played or [_play_trial(plan, number, cell, *each) for each in zip(seeds, drawn, strict=True)]
     verdicts = iter(judge_all(each for each in played if isinstance(each, Run)))
     for each, seed, values in zip(played, seeds, drawn, strict=True):
         yield row(each, next(verdicts), values) if isinstance(each, Run) else row_of_none(seed, values, each)

@@ -222,6 +222,8 @@ def _changes_between(
 
 def _ramp_plants(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
     """Plant in the middle of each sample period of a ramp."""
+    if not ramp_n:
+        return []
     return SampledPlant.from_plants(
         [before.interpolate(after, (k + 0.5) / ramp_n) for k in range(min(ramp_n, samples))], period_s
     )

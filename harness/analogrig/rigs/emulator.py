@@ -7,7 +7,7 @@ import dataclasses
 import enum
 import functools
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeGuard
 
@@ -328,10 +328,8 @@ class EmulatorRig(Rig):
         return SetUp(computer, excitation, tuple(changes))
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
-        if scenario.samples <= self._block_samples:
-            prepared = self._prepare(scenario, seed)
-            if prepared.play is not None:
-                return self._repeat(prepared, prepared.play, scenario, seed)
+        if repeated := self._repeat(scenario, [seed]):
+            return repeated[0]
         computer, excitation, changes = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._description.computer.add_noise(computer, seed)
@@ -355,6 +353,9 @@ class EmulatorRig(Rig):
             ),
         )
 
+    def perform_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
+        return self._repeat(scenario, seeds) or super().perform_all(scenario, seeds)
+
     def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
         """Prepared data of the scenario; the last set is reused for the same key."""
         key = (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
@@ -375,24 +376,43 @@ class EmulatorRig(Rig):
         is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
         return is_nominal and is_on_time
 
-    def _repeat(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
+    def _repeat(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
+        """Performances whose blocks are computed together with the first one; none if there is no repeated play."""
+        if scenario.samples > self._block_samples:
+            return []
+        prepared = self._prepare(scenario, seeds[0])
+        if (play := prepared.play) is None:
+            return []
+        taken: list[tuple[Block, Mapping[str, int]]] = []
+
+        def blocks(i: int) -> Iterator[Block]:
+            if not taken:
+                taken.extend(self._repeated_blocks(prepared, play, scenario, seeds))
+            yield taken[i][0]
+
+        return [
+            Performance(
+                sample_period_s=1.0 / self._card.rate_hz,
+                time_scale=prepared.computer.scales.time,
+                channels=prepared.channels,
+                blocks=blocks(i),
+                hindsight=lambda i=i: Hindsight(prepared.segments, taken[i][1] if taken else {}),
+            )
+            for i in range(len(seeds))
+        ]
+
+    def _repeated_blocks(
+        self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seeds: Sequence[int]
+    ) -> Iterator[tuple[Block, Mapping[str, int]]]:
+        """Samples and lit lamps of each seed."""
         count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
-        offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
-        excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
-        lit: dict[str, int] = {}
-
-        def volts() -> Iterator[NDArray[np.float64]]:
-            repeat = play.play(excitation, offsets_v)
-            lit.update(_lit_lamps(repeat.lamps, 1))
-            yield repeat.volts
-
-        return Performance(
-            sample_period_s=1.0 / self._card.rate_hz,
-            time_scale=prepared.computer.scales.time,
-            channels=prepared.channels,
-            blocks=_sample(volts(), self.sampler(Stream.CARD.generator(seed))),
-            hindsight=lambda: Hindsight(prepared.segments, lit),
-        )
+        generators = (Stream.COMPONENTS.generator(seed) for seed in seeds)
+        offsets_v = np.stack([drawn_offsets_v(self._amplifier, count, rng, offset_v) for rng in generators])
+        phases = np.array([scenario.draw_phase(Stream.EXCITATION.generator(seed)) for seed in seeds])
+        with emulator_errors(as_error=RigError):
+            for seed, (volts, lamps) in zip(seeds, play.play_all(scenario.excitation, phases, offsets_v), strict=True):
+                codes, clipped = self.sampler(Stream.CARD.generator(seed)).sample(volts)
+                yield Block(0, volts, codes, clipped), _lit_lamps(lamps, 1)
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
