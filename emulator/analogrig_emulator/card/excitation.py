@@ -120,9 +120,7 @@ class Excitation:
         part = slice(int(found.counts[0]))
         return Edges(found.ticks[0, part], found.levels_v[0, part])
 
-    def edges_at(
-        self, phases: NDArray[np.float64], start_tick: int, stop_tick: int, sample_rate_hz: float
-    ) -> EdgeRows:
+    def edges_at(self, phases: NDArray[np.float64], start_tick: int, stop_tick: int, sample_rate_hz: float) -> EdgeRows:
         """Edges of edges() for each of these phases (plays,). Raises ExcitationError likewise."""
         period = self.period_ticks(sample_rate_hz)
         # An edge on the card's clock may be up to a sample later than its ideal instant: begin a period early.

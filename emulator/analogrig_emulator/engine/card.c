@@ -10,8 +10,8 @@
 static bool is_same(double one, double other) { return one <= other && one >= other; }
 
 /// engine_edges() for one play; return the number of edges.
-static int64_t
-edges_of(int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick) {
+static int64_t edges_of(
+    int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick) {
     int64_t edges = 0, first = 0;
     for (int64_t i = 0; i < count; i++) {
         const int64_t ideal = (int64_t)rint(instant[i]), at = ideal < 0 ? 0 : (ideal + grid - 1) / grid * grid;

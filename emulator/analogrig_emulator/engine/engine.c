@@ -445,15 +445,8 @@ engine_status_t engine_play_all(engine_t*                self,
         set_numbers(schedule, &constants[i * schedule->turns * schedule->places]);
         engine_restart(self);
         engine_watch(self, schedule->patience);
-        status = engine_play(self,
-                             schedule->turns,
-                             schedule->circuit,
-                             schedule->until,
-                             edges[i],
-                             &tick[i * room],
-                             input,
-                             &level[i * room],
-                             y);
+        status = engine_play(self, schedule->turns, schedule->circuit, schedule->until, edges[i], &tick[i * room],
+                             input, &level[i * room], y);
         engine_get_overdue(self, &overdue[i * self->kinks]);
         y += self->counts.samples * self->outputs;
     }

@@ -152,13 +152,13 @@ engine_status_t engine_play(engine_t*              self,
 /// Circuits of repeated plays, as of engine_play(), and the places in them of the numbers that differ between the plays.
 typedef struct {
     int64_t                turns;
-    const engine_system_t* circuit;   ///< matrices within the rows of numbers
+    const engine_system_t* circuit;  ///< matrices within the rows of numbers
     const int64_t*         until;
     int64_t                patience;  ///< as for engine_watch()
     double*                numbers;   ///< a row for each turn
     int64_t                row;       ///< length of a row
     int64_t                places;
-    const int64_t*         place;     ///< indices in a row
+    const int64_t*         place;  ///< indices in a row
 } engine_schedule_t;
 
 /// Call engine_restart(), engine_watch(), engine_play() and engine_get_overdue() for each of `plays` plays, which differ in

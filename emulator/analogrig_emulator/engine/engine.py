@@ -213,9 +213,9 @@ class Engine:
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Play a schedule from rest, once for each row of constants (plays, systems, places) and of edges of one input.
 
-        Returns V, float64 (plays, schedule.samples, outputs), and overdue_ticks of each play, int64 (plays, kinks). Each
-        play equals alternating set_system() and run() on a new engine, at a fraction of the cost. Clock and watch()
-        restart. Raises EngineError.
+        Returns V, float64 (plays, schedule.samples, outputs), and overdue_ticks of each play, int64 (plays, kinks).
+        Each play equals alternating set_system() and run() on a new engine, at a fraction of the cost. Clock and
+        watch() restart. Raises EngineError.
         """
         ((name, trains),) = edges.items()
         plays, room = trains.ticks.shape
@@ -327,7 +327,8 @@ class CircuitSchedule:
     """Circuits of one play in the engine's memory layout, for repeated plays with other constants.
 
     systems: of the same states, inputs and kinks; last_samples: last sample of each, ascending; patience_ticks: as for
-    Engine.watch; varied: rows of abc (state, None) or of cde (None, kink) whose last column is the constants of a play.
+    Engine.watch; varied: (row of abc, row of cde or None) of the last columns that constants of a play replace: that of
+    abc only where there is none of cde.
     """
 
     def __init__(
@@ -344,9 +345,8 @@ class CircuitSchedule:
         self.until_ticks = np.array(last_samples, np.int64) * TICKS_PER_SAMPLE
         width = systems[0].abc.shape[1]
         abc, cde = (starts[field] // layouts[0].block.itemsize - 1 for field in (0, 2))
-        self._places = np.array(
-            [(abc + (pole + 1) * width if kink is None else cde + (kink + 1) * width) for pole, kink in varied], np.int64
-        )
+        places = [abc + (pole + 1) * width if kink is None else cde + (kink + 1) * width for pole, kink in varied]
+        self._places = np.array(places, np.int64)
         self._blocks = np.stack([layout.block for layout in layouts])
         circuits = (library.System * len(systems))(
             *(library.System(*(row.ctypes.data + start for start in starts)) for row in self._blocks)

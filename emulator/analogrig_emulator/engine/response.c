@@ -3,8 +3,8 @@
 #include <string.h>
 
 /// engine_follow() for a number of states that the compiler may know.
-static inline void follow(
-    int n, int64_t samples, const double* phi, const double* gamma, const double* input, double* x, double* out) {
+static inline void
+follow(int n, int64_t samples, const double* phi, const double* gamma, const double* input, double* x, double* out) {
     double now[ENGINE_MAX_STATES], next[ENGINE_MAX_STATES];
     memcpy(now, x, (size_t)n * sizeof x[0]);
     for (int64_t k = 0; k < samples; k++) {

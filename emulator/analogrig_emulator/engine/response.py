@@ -16,7 +16,7 @@ def sampled_response(
 ) -> NDArray[np.float64]:
     """First state after each sample period, (samples,), for one number of input each.
 
-    transition: (n, n) and response: (n,), of a sample period; n is at most 32. state: contiguous (n,), advanced in place.
+    transition: (n, n) and response: (n,), of a sample period; n is at most 32. state: (n,), advanced in place.
     """
     inputs = np.ascontiguousarray(inputs, np.float64)
     out = np.empty_like(inputs)

@@ -80,8 +80,7 @@ class RepeatedPlay:
         edges = excitation.edges_at(phases, 0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
         volts, overdue_ticks = self._engine.play_all(self._schedule, constants, {SOURCE: edges})
         volts *= self._signs
-        dark = dict.fromkeys(self._amplifiers)
         return [
-            Repeat(each, lamp_samples(self._amplifiers, self._kinks, ticks) if is_lit else dark)
-            for each, ticks, is_lit in zip(volts, overdue_ticks, (overdue_ticks >= 0).any(axis=1).tolist(), strict=True)
+            Repeat(each, lamp_samples(self._amplifiers, self._kinks, ticks))
+            for each, ticks in zip(volts, overdue_ticks, strict=True)
         ]

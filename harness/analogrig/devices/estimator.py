@@ -52,9 +52,7 @@ class EstimatorOutput:
         return np.frombuffer(self.status.tobytes().translate(_FLAGS), np.uint8)
 
 
-_Arrays = tuple[
-    NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]
-]
+_Arrays = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]]
 
 _NO_ALARMS = np.empty(0, np.int64)
 
@@ -182,10 +180,9 @@ class Estimator:
         codes = [array.ctypes.data for array in (u, y, valid)]
         if not self._c.library_run_records(self._state, *u.shape, 1, *codes, ctypes.byref(out), counters.ctypes.data):
             self._refuse()
-        have_alarms = arrays[-1].any(axis=1).tolist()
-        for *rows, alarm, has_alarms, counted in zip(*arrays, have_alarms, counters.tolist(), strict=True):
-            alarms = np.flatnonzero(alarm) if has_alarms else _NO_ALARMS
-            yield EstimatorOutput(*rows, alarms), dict(zip(_COUNTERS, counted, strict=True))
+        for theta, innovation, statistic, status, alarm, counted in zip(*arrays, counters.tolist(), strict=True):
+            output = EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm))
+            yield output, dict(zip(_COUNTERS, counted, strict=True))
 
     def _room(self, shape: tuple[int, ...], *, with_theta: bool) -> tuple[_Arrays, _Out]:
         """Arrays for theta, innovation, statistic, status and alarm of samples of this shape."""

@@ -97,20 +97,20 @@ def exposures(runs: Sequence[Run]) -> list[Exposure]:
         are_finite &= np.isfinite(stack([each.theta[:, i] for each in runs]))
     counts = np.zeros((3, len(runs)), np.int64)
     for start, end in run.records:
-        alarms = [
-            each.alarm_index[(each.alarm_index >= start) & (each.alarm_index < end)] - start for each in runs
-        ]
+        alarms = [each.alarm_index[(each.alarm_index >= start) & (each.alarm_index < end)] - start for each in runs]
         part = slice(start, end)
         counts += _count(force[:, part], flags[:, part], are_finite[:, part], alarms, sheet, noise_lsb)
-    return [Exposure(run.samples, *each, sheet) for each in counts.T.tolist()]
+    return [
+        Exposure(run.samples, armed, unexcited, non_finite, sheet) for armed, unexcited, non_finite in counts.T.tolist()
+    ]
 
 
 def record_exposure(record: ObservedRecord, sheet: Datasheet, noise_lsb: float) -> Exposure:
     """Exposure of one record; ``noise_lsb`` is the noise of the force channel, rms in LSB."""
-    (counts,) = _count(
-        record.force[None], record.flags[None], record.are_finite[None], [record.alarms], sheet, noise_lsb
-    ).T.tolist()
-    return Exposure(len(record.force), *counts, sheet)
+    force, flags, are_finite = (each[None] for each in (record.force, record.flags, record.are_finite))
+    counts = _count(force, flags, are_finite, [record.alarms], sheet, noise_lsb)
+    armed, unexcited, non_finite = counts[:, 0].tolist()
+    return Exposure(len(record.force), armed, unexcited, non_finite, sheet)
 
 
 def _count(

@@ -404,7 +404,7 @@ def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArra
 
 
 def _physical(run: Run, theta: NDArray[np.float32]) -> NDArray[np.float64]:
-    """M, B, K, (n, 3) float64, of estimates (n, p) under the conditions of ``run``; NaN if they do not describe them."""
+    """M, B, K, (n, 3) float64, of estimates (n, p) of a device as in ``run``; NaN if they do not describe them."""
     channels, model = run.conditions.channels, run.datasheet.model
     if model is None or not theta.shape[1]:
         return np.full((len(theta), len(PARAMETERS)), np.nan)
@@ -528,6 +528,8 @@ def _undecided_reason(tweak: ChangeVerdict) -> str:
 def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[ChangeVerdict, ...]:
     """Verdicts at the likeliest instants, each with the differing verdicts of the other hypotheses."""
     likeliest, *others = (each.tweaks for each in results)
+    if not others:
+        return likeliest
     return tuple(
         dataclasses.replace(tweak, alternatives=tuple(each[i] for each in others if each[i] != tweak))
         for i, tweak in enumerate(likeliest)
@@ -667,11 +669,11 @@ def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]
     segments = [(start, end, plant.parameters()) for start, end, plant in run.segments if start not in unseen]
     ends = [end - 1 for _, end, _ in segments]
     lasts = _physical(run, np.concatenate([each.theta[ends] for each in runs]))
-    found = [
-        None if is_none else dict(zip(PARAMETERS, last, strict=True))
-        for last, is_none in zip(lasts.tolist(), np.isnan(lasts).any(axis=1).tolist(), strict=True)
-    ]
-    estimates = iter(found)
+    is_known = ~np.isnan(lasts).any(axis=1)
+    estimates = (
+        dict(zip(PARAMETERS, last, strict=True)) if known else None
+        for last, known in zip(lasts.tolist(), np.asarray(is_known), strict=True)
+    )
     return [tuple(SegmentEstimate(*each, next(estimates)) for each in segments) for _ in runs]
 
 

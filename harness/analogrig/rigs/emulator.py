@@ -390,13 +390,16 @@ class EmulatorRig(Rig):
                 taken.extend(self._repeated_blocks(prepared, play, scenario, seeds))
             yield taken[i][0]
 
+        def hindsight(i: int) -> Hindsight:
+            return Hindsight(prepared.segments, taken[i][1] if taken else {})
+
         return [
             Performance(
                 sample_period_s=1.0 / self._card.rate_hz,
                 time_scale=prepared.computer.scales.time,
                 channels=prepared.channels,
                 blocks=blocks(i),
-                hindsight=lambda i=i: Hindsight(prepared.segments, taken[i][1] if taken else {}),
+                hindsight=functools.partial(hindsight, i),
             )
             for i in range(len(seeds))
         ]
