@@ -132,8 +132,7 @@ def test_plays_of_one_scenario_are_each_those_of_a_rig_of_its_own(rig_name: str)
 def test_runs_played_and_judged_together_are_those_played_alone_to_the_bit(rig_name: str, *, alarms_only: bool) -> None:
     """The ranges of 0 to 10 V clip; with real components each seed has a machine of its own."""
     thesis = Scenario.load("thesis")
-    tweaks = tuple(dataclasses.replace(tweak, sample=150 + 100 * i) for i, tweak in enumerate(thesis.tweaks[:2]))
-    scenario = dataclasses.replace(thesis, samples=400, tweaks=tweaks)
+    scenario = dataclasses.replace(thesis, samples=1500, tweaks=thesis.tweaks[:2])
     bench = direct_bench(emulator(rig_name), describe("inproc"), alarms_only=alarms_only)
     together, alone = bench.play_all(scenario, range(5)), [bench.play(scenario, seed) for seed in range(5)]
     for one, other in zip(together, alone, strict=True):
@@ -153,7 +152,7 @@ def test_long_runs_are_played_one_by_one() -> None:
 
 def test_runs_of_several_kinds_are_judged_each_by_its_own_conditions() -> None:
     bench, thesis = direct_bench(emulator("emulator"), describe("inproc")), Scenario.load("thesis")
-    shorter = dataclasses.replace(thesis, samples=1100, tweaks=thesis.tweaks[:1])
+    shorter = dataclasses.replace(thesis, samples=1500, tweaks=thesis.tweaks[:2])
     runs = [bench.play(scenario, seed) for scenario in (thesis, shorter, thesis) for seed in (1, 2)]
     assert judge_all(runs) == [judge(run) for run in runs]
 
