@@ -605,6 +605,47 @@ def test_command_says_what_came_out_and_writes_the_page(
     assert Path(said["files"]["results"]).read_bytes() == before
 
 
+def test_parquet_file_has_a_row_for_each_trial_of_the_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is absent: pip install analogrig[parquet]")
+    spec, out, to = tmp_path / "spec.toml", tmp_path / "x.sqlite", tmp_path / "x.parquet"
+    spec.write_text(SPEC + "[stop]\nquantity = 'missed'\nrate = 0.5\n")
+    command = ["campaign", str(spec), "--out", str(out), "--workers", "1", "--parquet"]
+    assert main([*command, str(out)]) == 2
+    assert "is a file of --out" in capsys.readouterr().err
+    monkeypatch.setattr("analogrig.campaigns.parquet.GROUP_ROWS", 4)
+    main([*command, str(to)])
+    file = parquet.ParquetFile(to)
+    assert 1 < file.num_row_groups < 12
+    rows = file.read().to_pylist()
+    with Store.read(out) as store:
+        plan = store.plan()
+        parts = list(store.parts(plan))
+    assert [(row["cell"], row["seed"]) for row in rows] == [
+        (part.cell, seed) for part, _ in parts for seed in plan.seeds(part)
+    ]
+    trials = Trials.joined([trials for _, trials in parts])
+    assert [row["theta"] for row in rows] == trials.theta.tolist()
+    assert [row["latency_n"] for row in rows] == [
+        [None if n < 0 else n for n in latencies] for latencies in trials.latency_n.tolist()
+    ]
+    assert [row["error_K"] for row in rows] == trials.error[:, 2].tolist()
+    assert [row["damping_n_s_per_m"] for row in rows] == trials.drawn[:, 0].tolist()
+    assert {row["stiffness_factor"] for row in rows} == {0.8, 0.9}
+    assert {row["outcome"] for row in rows} <= {"passed", "failed"}
+
+
+def test_parquet_without_pyarrow_is_one_line_before_anything_is_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    out = tmp_path / "x.sqlite"
+    assert main(["campaign", "pot-plane", "--out", str(out), "--parquet", str(tmp_path / "x.parquet")]) == 2
+    assert capsys.readouterr().err.endswith("--parquet needs pyarrow: pip install 'analogrig[parquet]'\n")
+    assert not out.exists()
+
+
 def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ports = ("/dev/absent", "/dev/lacking")
     planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent', 'serial:/dev/lacking']\n", ports)
