@@ -21,7 +21,6 @@ from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import EmulatorError, Sampler
 
-
 SHORT = dataclasses.replace(Scenario.load("healthy"), samples=500)
 
 

@@ -83,8 +83,9 @@ def _run(arguments: argparse.Namespace) -> int:
     plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.sqlite"
     summary, page = places_of(out)
-    if arguments.parquet is not None and arguments.parquet.resolve() in {each.resolve() for each in (out, summary, page)}:
-        raise ConfigurationError(f"--parquet {arguments.parquet}: is a file of --out; choose another")
+    parquet = arguments.parquet
+    if parquet is not None and parquet.resolve() in {each.resolve() for each in (out, summary, page)}:
+        raise ConfigurationError(f"--parquet {parquet}: is a file of --out; choose another")
     results = ended_results(plan, out)
     if results is None:
         move_aside(summary)
@@ -106,9 +107,9 @@ def _run(arguments: argparse.Namespace) -> int:
             return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
     write_json(results, summary)
     write_page(results, page)
-    if arguments.parquet is not None:
-        move_aside(arguments.parquet)
-        write_parquet(out, arguments.parquet)
+    if parquet is not None:
+        move_aside(parquet)
+        write_parquet(out, parquet)
     if arguments.json:
         places = {"trials": str(out), "results": str(summary), "page": str(page)}
         played_by = [each.as_table() for each in results.played_by]

@@ -107,7 +107,7 @@ def exposures(runs: Sequence[Run]) -> list[Exposure]:
 
 def record_exposure(record: ObservedRecord, sheet: Datasheet, noise_lsb: float) -> Exposure:
     """Exposure of one record; ``noise_lsb`` is the noise of the force channel, rms in LSB."""
-    force, flags, are_finite = (each[None] for each in (record.force, record.flags, record.are_finite))
+    force, flags, are_finite = record.force[None], record.flags[None], record.are_finite[None]
     counts = _count(force, flags, are_finite, [record.alarms], sheet, noise_lsb)
     armed, unexcited, non_finite = counts[:, 0].tolist()
     return Exposure(len(record.force), armed, unexcited, non_finite, sheet)
