@@ -93,7 +93,6 @@ class RunBuilder:
 
     def build(self, conditions: Conditions) -> Run:
         """Run of the samples so far."""
-        alarms, diagnoses, misfits = self._alarms, self._diagnoses, self._misfits
         return Run(
             conditions=conditions,
             codes=self._codes[: self.samples],
@@ -102,18 +101,34 @@ class RunBuilder:
             innovation=self._innovation[: self.samples],
             statistic=self._statistic[: self.samples],
             flags=self._flags[: self.samples],
-            alarm_index=np.array([alarm.index for alarm in alarms], dtype=np.int64),
-            alarm_kind=np.array([alarm.kind for alarm in alarms], dtype=np.uint8),
-            alarm_statistic=np.array([alarm.statistic for alarm in alarms], dtype=np.float32),
-            diagnosis_index=np.array([diagnosis.index for diagnosis in diagnoses], dtype=np.int64),
-            diagnosis_change=np.array([diagnosis.change for diagnosis in diagnoses], dtype=np.uint8),
-            diagnosis_onset=np.array([diagnosis.onset for diagnosis in diagnoses], dtype=np.int64),
-            diagnosis_extent=np.array([diagnosis.extent for diagnosis in diagnoses], dtype=np.float32),
-            misfit_index=np.array([misfit.index for misfit in misfits], dtype=np.int64),
-            misfit_cause=np.array([misfit.cause for misfit in misfits], dtype=np.uint8),
-            misfit_frequency=np.array([misfit.frequency for misfit in misfits], dtype=np.float32),
-            misfit_strength=np.array([misfit.strength for misfit in misfits], dtype=np.float32),
+            **_reports(self._alarms, self._diagnoses, self._misfits),
         )
+
+
+def _reports(
+    alarms: Sequence[RaisedAlarm], diagnoses: Sequence[ReportedDiagnosis], misfits: Sequence[ReportedMisfit]
+) -> dict[str, Any]:
+    """Fields of a run that hold the alarms, diagnoses and misfits; those of nothing have a default."""
+    found = {
+        "alarm_index": np.array([alarm.index for alarm in alarms], dtype=np.int64),
+        "alarm_kind": np.array([alarm.kind for alarm in alarms], dtype=np.uint8),
+        "alarm_statistic": np.array([alarm.statistic for alarm in alarms], dtype=np.float32),
+    }
+    if diagnoses:
+        found |= {
+            "diagnosis_index": np.array([diagnosis.index for diagnosis in diagnoses], dtype=np.int64),
+            "diagnosis_change": np.array([diagnosis.change for diagnosis in diagnoses], dtype=np.uint8),
+            "diagnosis_onset": np.array([diagnosis.onset for diagnosis in diagnoses], dtype=np.int64),
+            "diagnosis_extent": np.array([diagnosis.extent for diagnosis in diagnoses], dtype=np.float32),
+        }
+    if misfits:
+        found |= {
+            "misfit_index": np.array([misfit.index for misfit in misfits], dtype=np.int64),
+            "misfit_cause": np.array([misfit.cause for misfit in misfits], dtype=np.uint8),
+            "misfit_frequency": np.array([misfit.frequency for misfit in misfits], dtype=np.float32),
+            "misfit_strength": np.array([misfit.strength for misfit in misfits], dtype=np.float32),
+        }
+    return found
 
 
 def was_interrupted(run: Run) -> bool:
@@ -275,7 +290,7 @@ class Bench:
             },
             segments=known.segments,
             faults=(*faults, *known.caveats),
-            overloads={amplifier: sample for amplifier, sample in known.lamps.items() if sample < builder.samples},
+            overloads=_overloads(known, builder.samples),
             records=tuple(builder.records) or (0,),
             line_s=builder.line_s,
             counters=builder.counters,
@@ -340,28 +355,57 @@ class DirectBench(Bench):
         performances = self.rig.perform_all(scenario, seeds)
         self.dut.prepare(performances[0].channels, performances[0].sample_period_s)
         blocks = [next(each.blocks) for each in performances]
-        answered = self.dut.play_records([block.samples() for block in blocks])
+        played = list(zip(blocks, self.dut.play_records([block.samples() for block in blocks]), strict=True))
+        common = self._common_conditions(performances[0], scenario, seeds[0], played[0])
         return [
-            self._run_of(performance, scenario, seed, block, *each)
-            for seed, performance, block, each in zip(seeds, performances, blocks, answered, strict=True)
+            _run_of_block(
+                dataclasses.replace(
+                    common,
+                    seed=seed,
+                    overloads=_overloads(performance.hindsight(), scenario.samples),
+                    counters=counters,
+                ),
+                block,
+                answers,
+            )
+            for seed, performance, (block, (answers, counters)) in zip(seeds, performances, played, strict=True)
         ]
 
-    def _run_of(
-        self,
-        performance: Performance,
-        scenario: Scenario,
-        seed: int,
-        block: Block,
-        answers: Answers,
-        counters: Mapping[str, int],
-    ) -> Run:
-        """Run of one block."""
-        initial = self._initial_conditions(performance, scenario, seed)
+    def _common_conditions(
+        self, performance: Performance, scenario: Scenario, seed: int, played: _Played
+    ) -> Conditions:
+        """Conditions of runs that are played together, with the seed, overloads and counters of one of them."""
+        block, (answers, counters) = played
         builder = RunBuilder(scenario.samples, self.dut.datasheet)
         builder.begin_record()
         builder.add(block, answers)
         builder.end_record(self.dut.line_s, counters)
-        return builder.build(self._final_conditions(initial, performance.hindsight(), scenario.caveats, builder))
+        initial = self._initial_conditions(performance, scenario, seed)
+        return self._final_conditions(initial, performance.hindsight(), scenario.caveats, builder)
+
+
+_Played = tuple[Block, tuple[Answers, Mapping[str, int]]]
+"""Block that is a whole run, with the answers to it and the counters of its record."""
+
+
+def _run_of_block(conditions: Conditions, block: Block, answers: Answers) -> Run:
+    """Run of one block."""
+    n = len(block.codes)
+    return Run(
+        conditions=conditions,
+        codes=block.codes,
+        clipped=block.clipped,
+        theta=np.array(np.empty((n, 0)) if answers.theta is None else answers.theta, np.float32),
+        innovation=np.array(np.zeros(n) if answers.innovation is None else answers.innovation, np.float32),
+        statistic=np.array(np.zeros(n) if answers.statistic is None else answers.statistic, np.float32),
+        flags=answers.flags,
+        **_reports(answers.alarms, answers.diagnoses, answers.misfits),
+    )
+
+
+def _overloads(known: Hindsight, samples: int) -> dict[str, int]:
+    """First sample with a lit overload lamp, by amplifier, in a run of so many samples."""
+    return {amplifier: sample for amplifier, sample in known.lamps.items() if sample < samples}
 
 
 def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bool = False) -> DirectBench:
