@@ -205,6 +205,14 @@ def test_division_into_parts_changes_nothing(tmp_path: Path, reference: Path, co
     assert exported(conduct(plan, ThisProcess(), out)) == exported(reference)
 
 
+def test_trials_played_together_are_those_played_alone_in_any_order(tmp_path: Path) -> None:
+    """Without drawn values the trials of a cell differ in the seed alone, and are played and judged together."""
+    text = planned(tmp_path, SPEC.partition("[draw]")[0]).as_json()
+    for cell in (1, 0):
+        alone = {place: play_part(text, Part(cell, place, 1)) for place in (3, 5, 0, 4, 2, 1)}
+        assert play_part(text, Part(cell, 0, 6)) == [row for place in range(6) for row in alone[place]]
+
+
 @pytest.mark.parametrize("parts", [[], [Part(0, 0, 6)], [Part(1, 2, 3)], [Part(0, 1, 2), Part(0, 4, 2), Part(1, 0, 5)]])
 def test_campaign_goes_on_from_any_parts(tmp_path: Path, reference: Path, parts: list[Part]) -> None:
     plan, out = planned(tmp_path), tmp_path / "out.sqlite"
