@@ -62,10 +62,11 @@ COPIED = 200
 """Trials of each cell that are played for ``--stored``."""
 
 NOTE = f"""\
-`--trials` are played by {WORKERS} workers in {CELLS} cells, 300 samples each; again on a Dask cluster of {WORKERS}
-workers on this machine; and again with {KILLS} kills of the command by SIGKILL. The time of a worker is that of one
-process without a command. `--stored` are copies of played trials, which go through the same store, tally, page and
-comparison. Memory is the largest resident set of the command and of any of its workers."""
+Played trials have 300 samples, in {CELLS} cells. {WORKERS} local workers play them; a Dask cluster of {WORKERS}
+workers on this machine plays them again; a third time SIGKILL ends the command {KILLS} times. The time
+of a worker is that of one process without a command. Stored trials are copies of played ones, which
+go through the same store, tally, page and comparison. Memory is the largest resident set of the
+command and of any of its workers."""
 
 
 def figures(*options: str) -> Iterator[Figure]:
