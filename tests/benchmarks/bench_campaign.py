@@ -62,8 +62,8 @@ COPIED = 200
 """Trials of each cell that are played for ``--stored``."""
 
 NOTE = f"""\
-Played trials have 300 samples, in {CELLS} cells. {WORKERS} local workers play them; a Dask cluster of {WORKERS}
-workers on this machine plays them again; a third time SIGKILL ends the command {KILLS} times. The time
+Played trials have 300 samples, in {CELLS} cells. {WORKERS} local workers play them. A Dask cluster of {WORKERS}
+workers on this machine plays them again. A third time, SIGKILL ends the command {KILLS} times. The time
 of a worker is that of one process without a command. Stored trials are copies of played ones, which
 go through the same store, tally, page and comparison. Memory is the largest resident set of the
 command and of any of its workers."""
