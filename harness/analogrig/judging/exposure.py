@@ -136,7 +136,8 @@ def _count(
     for i, raised in enumerate(alarms):
         armed[i, raised] = True
         non_finite[i, raised] = False  # an alarm is the required response to a non-finite estimate
-    return np.array([np.count_nonzero(each, axis=1) for each in (armed, ~excited, non_finite)])
+    # Row by row: along an axis it takes ten times as long.
+    return np.array([[np.count_nonzero(row) for row in each] for each in (armed, ~excited, non_finite)])
 
 
 def _least_edge(sheet: Datasheet, noise_lsb: float) -> float:
