@@ -27,8 +27,8 @@ PAINTED = "() => new Promise((done) => requestAnimationFrame(() => requestAnimat
 class Watched:
     """A page of the browser, with everything it complained of and asked for."""
 
-    def __init__(self, browser: Browser, path: Path) -> None:
-        """Open a file."""
+    def __init__(self, browser: Browser, place: Path | str) -> None:
+        """Open a file or an address."""
         self.page: Page = browser.new_page(viewport={"width": 1200, "height": 1000})
         self.complaints: list[str] = []
         self.requests: list[str] = []
@@ -36,7 +36,7 @@ class Watched:
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("requestfailed", lambda request: self.complaints.append(request.url))
         self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(path.as_uri())
+        self.page.goto(place if isinstance(place, str) else place.as_uri())
 
     def faults(self) -> list[str]:
         """Complaints, what is wider than the window, and what axe-core finds: light and dark, wide and narrow."""

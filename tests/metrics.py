@@ -41,7 +41,19 @@ CONCRETE = re.compile(
 """Classes of rigs and devices that have an interface."""
 
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("errors", "config", "wording", "catalogue", "_catalogue", "estimator_config", "storage", "plant", "lazy", "pages"),
+    (
+        "errors",
+        "config",
+        "wording",
+        "catalogue",
+        "_catalogue",
+        "estimator_config",
+        "storage",
+        "program",
+        "plant",
+        "lazy",
+        "pages",
+    ),
     ("run", "scenario", "header", "trust", "identity", "signals", "output"),
     ("links",),
     ("protocol",),
@@ -49,6 +61,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("bench",),
     ("recordings",),
     ("campaigns", "testing", "hardware", "reporting", "analogrig"),
+    ("live",),
     ("cli", "device_program"),
 )
 """Modules and folders of ``analogrig``, lowest level first. An import to a higher level runs upwards."""

@@ -20,6 +20,7 @@ from analogrig.devices.registry import from_table
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.hardware.simulator.served import ServedDescription
 from analogrig.hardware.wiring import RealDescription
+from analogrig.recordings.imported import ImportDescription
 from analogrig.rigs.description import describe
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario
@@ -109,6 +110,9 @@ def test_every_toml_file_of_a_page_is_accepted(page: Path, tmp_path: Path) -> No
             describe(str(path))
         elif "equations" in table:
             load_program(path)
+            path.rename(tmp_path / f"{table['name']}.toml")  # for the scenarios of the page
+        elif "input" in table:
+            config.build(ImportDescription, table, "example")
         elif "trials" in table:
             CampaignSpec.load(str(path))
         elif "kind" in table:

@@ -27,6 +27,15 @@ GUEST_LINUX = ROOT / "build" / "can_guest" / "linux"
 FIRMWARE = Path(os.environ.get("ANALOGRIG_FIRMWARE", ROOT / "build" / "firmware"))
 APT_GET = "apt-get install --no-install-recommends"
 
+SILVERBOX_SETTING, SILVERBOX_FOLDER, SILVERBOX_NAME = "ANALOGRIG_SILVERBOX", "../shared/data/silverbox", "SNLS80mV.csv"
+"""Environment variable, its default, and the file in that folder: measured data that is not part of the repository."""
+
+
+def silverbox_file() -> Path:
+    """File of the Silverbox, which may be absent."""
+    return Path(os.environ.get(SILVERBOX_SETTING, SILVERBOX_FOLDER)) / SILVERBOX_NAME
+
+
 PACKAGES = {
     "gcc": "gcc",
     "gcov": "gcc",

@@ -5,6 +5,7 @@ Start with SuspensionComputer, Excitation and Sampler.
 
 from analogrig_emulator.card.acquisition import acquired, ahead_ticks, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.circuit import (
     Capacitor,
@@ -37,7 +38,6 @@ from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn
 from analogrig_emulator.circuit.spice import Deck, to_spice
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.response import sampled_response
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
 from analogrig_emulator.errors import (
     CircuitError,
@@ -49,10 +49,21 @@ from analogrig_emulator.errors import (
     ProgramError,
     SamplerError,
 )
-from analogrig_emulator.machine.compiler import PatchedProgram, load_program
+from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
+from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
-from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
+from analogrig_emulator.machine.program import (
+    CHANNELS,
+    SOURCE,
+    ForceLaw,
+    Mass,
+    Parameter,
+    ProgramCircuit,
+    Scale,
+    Scales,
+)
+from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, BumpStop, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
@@ -85,6 +96,8 @@ __all__ = [
     "CircuitError",
     "CircuitNoise",
     "Components",
+    "Course",
+    "Courses",
     "CurrentSource",
     "Deck",
     "Dielectric",
@@ -94,6 +107,7 @@ __all__ = [
     "EmulatorError",
     "Engine",
     "EngineError",
+    "Equations",
     "Excitation",
     "ExcitationError",
     "ForceLaw",
@@ -102,6 +116,7 @@ __all__ = [
     "Mass",
     "Mode",
     "ModeError",
+    "Moment",
     "Multiplier",
     "MultiplierGrade",
     "MultiplierModel",
@@ -117,8 +132,10 @@ __all__ = [
     "PotGrade",
     "PotModel",
     "PotTurn",
-    "Program",
+    "ProgramCircuit",
     "ProgramError",
+    "ProgramParameter",
+    "RecordedExcitation",
     "Repeat",
     "RepeatedPlay",
     "Resistor",
@@ -134,15 +151,18 @@ __all__ = [
     "TwoMassPlant",
     "TwoMassProgram",
     "VoltageSource",
+    "WideProgram",
+    "Wired",
     "acquired",
     "ahead_ticks",
     "drawn_levels",
     "drawn_offsets_v",
+    "equations_of",
     "is_repeatable",
     "load_program",
     "piecewise_linear",
     "preset",
     "probes_per_sample",
-    "sampled_response",
     "to_spice",
+    "wired",
 ]

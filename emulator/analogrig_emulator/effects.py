@@ -30,7 +30,7 @@ from analogrig_emulator.circuit.components import (
 from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
 from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.machine.noise import NoisySuspension
-from analogrig_emulator.machine.program import CHANNELS, Program
+from analogrig_emulator.machine.program import CHANNELS, ProgramCircuit
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
 
@@ -54,10 +54,10 @@ class Effect:
 
 
 _FRONT_CHANGES: Sequence[PotTurn] = (
-    PotTurn(200, {"K_n_per_m": 18000.0}),
-    PotTurn(400, {"B_n_s_per_m": 3453.0}),
-    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotTurn(600, {"M_kg": 30.0}),
+    PotTurn(200, {"K": 18000.0}),
+    PotTurn(400, {"B": 3453.0}),
+    PotTurn(500, {"B": 2123.0, "K": 20000.0}),
+    PotTurn(600, {"M": 30.0}),
 )
 
 
@@ -74,7 +74,7 @@ _SLOW_CHANGE_N = 100
 """Samples of the ramp of K to four fifths, for effects of a turning pot."""
 
 _Operator = Callable[[SuspensionComputer, Mapping[str, float], np.random.Generator], Mapping[str, float]]
-"""Operator: maps wanted values of M_kg, B_n_s_per_m, K_n_per_m to the settings made."""
+"""Operator: maps wanted values of M, B, K to the settings made."""
 
 
 def _set_exactly(
@@ -114,7 +114,7 @@ class _Setup:
     quantised: bool = False
     turning: bool = False
 
-    def figure_lsb(self, program: Program, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
+    def figure_lsb(self, program: ProgramCircuit, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
         """Largest difference of the displacement from the ideal machine's, or from that without the effect."""
         reference_lsb = ideal_lsb
         if self.turning:
@@ -123,7 +123,7 @@ class _Setup:
             reference_lsb = dataclasses.replace(self, noise=None).displacement_lsb(program, seed)
         return float(np.abs(self.displacement_lsb(program, seed) - reference_lsb).max())
 
-    def displacement_lsb(self, program: Program, seed: int) -> NDArray[np.float64]:
+    def displacement_lsb(self, program: ProgramCircuit, seed: int) -> NDArray[np.float64]:
         """Converter input or code of the displacement at every sample: (SAMPLES,), LSB."""
         rate_hz = self.card.true_rate_hz * probes_per_sample(self.card)
         components = dataclasses.replace(self.components, seed=seed)
@@ -137,9 +137,9 @@ class _Setup:
         seen_lsb = sampler.seen_lsb(volts)
         return (sampler.convert(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
 
-    def _changes(self, program: Program) -> Sequence[PotTurn]:
+    def _changes(self, program: ProgramCircuit) -> Sequence[PotTurn]:
         if self.turning:
-            return [PotTurn(200, {"K_n_per_m": 0.8 * program.values["K_n_per_m"]}, _SLOW_CHANGE_N)]
+            return [PotTurn(200, {"K": 0.8 * program.values["K"]}, _SLOW_CHANGE_N)]
         return _CHANGES[program.name]
 
 

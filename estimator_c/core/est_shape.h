@@ -88,8 +88,8 @@ EST_SHARED float* append(float* const out, const float* const from, const uint_f
 }
 
 /// Set n values to zero.
-EST_ROBUST_SHARED void clear(float* const out, const uint_fast8_t n) {
-    for (uint_fast8_t i = 0U; i < n; i++) {
+EST_ROBUST_SHARED void clear(float* const out, const uint_fast16_t n) {
+    for (uint_fast16_t i = 0U; i < n; i++) {
         out[i] = 0.0F;
     }
 }

@@ -20,7 +20,7 @@ their documented members. Everything else in the packages ``analogrig``, ``analo
 
 =============  =========================================================================================
 play           ``open_rig``, ``open_dut``, ``Bench``; their types ``Rig``, ``Device``, ``EstimatorConfig``
-describe       ``Scenario``, ``Excitation``, ``Plant``, ``PlantChoice``, ``PotChange``, ``Expectations``
+describe       ``Scenario``, ``Excitation``, ``Program``, ``Plant``, ``PotChange``, ``Expectations``
 judge          ``Run``, ``Conditions``, ``judge``, ``Verdict``, ``ChangeVerdict``, ``detectable``, ``write_report``
 test           ``Play``, ``Played``, ``Finding``, ``rate_below``, ``with_some_seed``, ``strategies``
 errors         ``AnalogrigError`` and its kinds; ``EmulatorError``
@@ -53,11 +53,12 @@ if TYPE_CHECKING:
     from analogrig.judging.information import detectable
     from analogrig.judging.verdict import ChangeVerdict, Verdict, judge
     from analogrig.plant import Plant
+    from analogrig.program import Program
     from analogrig.reporting.page import write_report
     from analogrig.rigs.description import open_rig
     from analogrig.rigs.rig import Rig
     from analogrig.run import Conditions, Run
-    from analogrig.scenario import Expectations, PlantChoice, PotChange, Scenario
+    from analogrig.scenario import Expectations, PotChange, Scenario
     from analogrig.testing import strategies
     from analogrig.testing.played import Played, rate_below
     from analogrig.testing.statement import Finding, Play, with_some_seed
@@ -77,13 +78,14 @@ else:
         "analogrig.judging.information": "detectable",
         "analogrig.judging.verdict": "ChangeVerdict Verdict judge",
         "analogrig.plant": "Plant",
+        "analogrig.program": "Program",
         "analogrig.devices.device": "Device",
         "analogrig.devices.opening": "open_dut",
         "analogrig.reporting.page": "write_report",
         "analogrig.rigs.description": "open_rig",
         "analogrig.rigs.rig": "Rig",
         "analogrig.run": "Conditions Run",
-        "analogrig.scenario": "Expectations PlantChoice Scenario PotChange",
+        "analogrig.scenario": "Expectations Scenario PotChange",
         "analogrig.testing.played": "Played rate_below",
         "analogrig.testing.statement": "Finding Play with_some_seed",
         "analogrig_emulator": "EmulatorError Excitation",
@@ -122,10 +124,10 @@ __all__ = [
     "LinkError",
     "LinkTimeout",
     "Plant",
-    "PlantChoice",
     "Play",
     "Played",
     "PotChange",
+    "Program",
     "RecordingError",
     "Rig",
     "RigError",

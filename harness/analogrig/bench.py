@@ -23,7 +23,7 @@ from analogrig.links.wire import Clock
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Conditions, Run
+from analogrig.run import Conditions, Run
 from analogrig.scenario import Scenario
 
 Progress = Callable[[int, int], None]
@@ -45,10 +45,10 @@ class RunBuilder:
     The arrays are allocated for all samples asked. The operating system provides only the pages that are written.
     """
 
-    def __init__(self, samples_asked: int, sheet: Datasheet) -> None:
+    def __init__(self, samples_asked: int, channels: int, sheet: Datasheet) -> None:
         n = samples_asked
-        self._codes = np.empty((n, len(CHANNELS)), np.uint16)
-        self._clipped = np.empty((n, len(CHANNELS)), np.bool_)
+        self._codes = np.empty((n, channels), np.uint16)
+        self._clipped = np.empty((n, channels), np.bool_)
         self._theta = np.empty((n, sheet.theta_n), np.float32)
         self._innovation = np.empty(n, np.float32) if sheet.innovation else np.zeros(n, np.float32)
         self._statistic = np.empty(n, np.float32) if sheet.statistic else np.zeros(n, np.float32)
@@ -176,8 +176,12 @@ class Bench:
         real_time: float | None = None,
         time_limit_s: float | None = None,
         clock: Clock = time.monotonic,
+        builder: Callable[[int, int, Datasheet], RunBuilder] | None = None,
     ) -> None:
         """Join ``rig`` and ``dut``.
+
+        ``builder`` makes the collector of each run, by default a ``RunBuilder``; one that overrides ``add`` watches
+        the run being played.
 
         ``time_limit_s`` is the longest duration of one play, on ``clock``. It bounds every wait for the device. The
         rig is not interrupted: the limit is checked after each of its blocks.
@@ -188,6 +192,7 @@ class Bench:
         self._real_time = real_time
         self._time_limit_s = math.inf if time_limit_s is None else time_limit_s
         self._clock = clock
+        self._builder = builder or RunBuilder
         self._scenario: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def play(self, scenario: Scenario, seed: int) -> Run:
@@ -205,11 +210,11 @@ class Bench:
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._pace_blocks(performance)
-        self.dut.prepare(performance.channels, performance.sample_period_s)
+        self.dut.prepare(performance.of_device, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
-        builder = RunBuilder(scenario.samples, self.dut.datasheet)
-        faults = (*scenario.caveats, *self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
+        builder = self._builder(scenario.samples, len(scenario.program.channels), self.dut.datasheet)
+        faults = tuple(self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
         conditions = self._final_conditions(initial, performance.hindsight(), faults, builder)
         return builder.build(conditions)
 
@@ -230,6 +235,7 @@ class Bench:
             link=self.dut.link_name,
             line=self.dut.line,
             real_time=self._real_time or 0.0,
+            program=scenario.program,
         )
 
     def _collect_samples(
@@ -353,7 +359,7 @@ class DirectBench(Bench):
         if scenario.samples > DIRECT_BLOCK_SAMPLES:
             return [self.play(scenario, seed) for seed in seeds]
         performances = self.rig.perform_all(scenario, seeds)
-        self.dut.prepare(performances[0].channels, performances[0].sample_period_s)
+        self.dut.prepare(performances[0].of_device, performances[0].sample_period_s)
         blocks = [next(each.blocks) for each in performances]
         played = list(zip(blocks, self.dut.play_records([block.samples() for block in blocks]), strict=True))
         common = self._common_conditions(performances[0], scenario, seeds[0], played[0])
@@ -376,12 +382,12 @@ class DirectBench(Bench):
     ) -> Conditions:
         """Conditions of runs that are played together, with the seed, overloads and counters of one of them."""
         block, (answers, counters) = played
-        builder = RunBuilder(scenario.samples, self.dut.datasheet)
+        builder = RunBuilder(scenario.samples, len(scenario.program.channels), self.dut.datasheet)
         builder.begin_record()
         builder.add(block, answers)
         builder.end_record(self.dut.line_s, counters)
         initial = self._initial_conditions(performance, scenario, seed)
-        return self._final_conditions(initial, performance.hindsight(), scenario.caveats, builder)
+        return self._final_conditions(initial, performance.hindsight(), (), builder)
 
 
 _Played = tuple[Block, tuple[Answers, Mapping[str, int]]]

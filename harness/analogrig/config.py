@@ -200,12 +200,18 @@ def _toml_key(key: str) -> str:
     return key if key and all(c.isascii() and (c.isalnum() or c in "_-") for c in key) else json.dumps(key)
 
 
+_NOT_IN_LINES = {*map(chr, range(32)), "\x7f", '"', "\\"} - {"\n", "\t"}
+"""Characters that keep a text from being written as lines between triple quotes."""
+
+
 def _toml_value(value: Any) -> str:
     """TOML of strings, numbers, booleans and arrays of them, for which JSON text is valid TOML."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_toml_value, value))}]"
     if isinstance(value, float) and not math.isfinite(value):
         return "nan" if math.isnan(value) else "inf" if value > 0.0 else "-inf"
+    if isinstance(value, str) and "\n" in value and value.isascii() and not _NOT_IN_LINES & {*value}:
+        return f'"""\n{value}"""'
     return json.dumps(value)
 
 
@@ -213,6 +219,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     """``table`` as an instance of the dataclass ``cls``; ``where`` (file and table) leads every error.
 
     Field types may be bool, int, float, str, Literal, a dataclass, Mapping[str, X], tuple[X, ...], and unions of these.
+    The value of a dataclass may be an instance of it.
 
     :raises ConfigurationError: unknown or lacking key, wrong type, or a value that ``cls`` refuses by ValueError.
     """
@@ -251,7 +258,8 @@ def convert(hint: Any, value: Any, where: str) -> Any:
             return value
         raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_quote(value)}")
     if dataclasses.is_dataclass(hint):
-        return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
+        cls = typing.cast(Any, hint)
+        return value if isinstance(value, cls) else build(cls, _expect(dict, value, "a table", where), where)
     if origin is tuple:
         return _convert_tuple(arguments, value, where)
     if origin in (Mapping, dict):

@@ -58,7 +58,7 @@ class Datasheet:
     theta_n: int = 0
     """Number of elements of theta; 0: the device reports no estimate."""
     model: ModelOrders | None = None
-    """Meaning of theta. Without it, theta is recorded and compared, and not turned into M, B, K."""
+    """Meaning of theta. Without it, theta is recorded and compared, and not turned into parameters."""
     innovation: bool = False
     """True if the device reports its innovation, in codes."""
     statistic: bool = False

@@ -155,6 +155,28 @@ class EstimatorConfig:
         if self.ceiling is not None and not 0.0 < self.ceiling <= MOST_CEILING:
             raise ValueError(f"ceiling must be more than 0 and at most {MOST_CEILING:g}, not {self.ceiling:g}")
 
+    @classmethod
+    def of_order(cls, order: int) -> Self:
+        """Configuration for a plant of this order, such as the number of a program's integrators.
+
+        Up to order 2 the default has the right orders. Beyond it C stays at (1 - 0.8 z^-1)^order: C from so many
+        estimated coefficients would raise false alarms. Their estimate takes a longer memory, too. Isolation and the
+        watch of the fit are for order 2.
+
+        :raises ValueError: the catalogue has no such order.
+        """
+        if order <= cls.na:
+            return cls()
+        return cls(
+            na=order,
+            nb=order + 1,
+            c=tuple(np.poly([0.8] * order)[1:].tolist()),
+            refresh_n=0,
+            forgetting=0.998,
+            isolation=False,
+            misfit=False,
+        )
+
     @property
     def parameters(self) -> int:
         """Number of elements of theta."""

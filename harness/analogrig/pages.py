@@ -17,16 +17,27 @@ TABLES = FOLDER / "tables.js"
 """Script of every page with tables that can be sorted."""
 
 
-def assemble_page(template: Path, scripts: Sequence[Path] = (), *, title: str, **texts: str) -> str:
+def assemble_page(
+    template: Path,
+    scripts: Sequence[Path] = (),
+    *,
+    title: str,
+    more_styles: Sequence[Path] = (),
+    connect: str = "",
+    **texts: str,
+) -> str:
     """Self-contained page: ``template`` with the one style sheet, its scripts and texts. ``title`` must be escaped.
 
+    :param more_styles: style sheets of this page alone.
+    :param connect: source of the content security policy that the page may connect to; empty: none.
     :raises RecordingError: a file is missing, such as uPlot before the build.
     """
     has_plots = set(PLOTS) <= set(scripts)
-    styles = (*((FOLDER / "uPlot.min.css",) if has_plots else ()), FOLDER / "page.css")
+    styles = (*((FOLDER / "uPlot.min.css",) if has_plots else ()), FOLDER / "page.css", *more_styles)
     style, script = ([_part(path) for path in paths] for paths in (styles, scripts))
     elements = [_part(FOLDER / "licence.html").rstrip("\n")] if has_plots else []
     sources = [f"script-src {_hashes(script)}"] if script else []
+    sources += [f"connect-src {connect}"] if connect else []
     return Template(_part(FOLDER / "frame.html")).substitute(
         title=title,
         policy="; ".join(["default-src 'none'", f"style-src {_hashes(style)}", *sources]),

@@ -1,24 +1,23 @@
-"""Plant model: a mass, a damper and a spring, in continuous time and discretised.
+"""Plant: a program with values of its parameters, and its exact discretisation where it is linear.
 
-The harness uses this model for the information bounds and to convert estimates to physical units. It never produces
-the samples of a run.
+The harness uses this model for the information bounds and to convert estimates to parameters. It never produces the
+samples of a run.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.config import suggest
 from analogrig.datasheet import ModelOrders
-
-PARAMETERS = ("M", "B", "K")
-"""Names of the physical parameters, in the order of every array of them."""
+from analogrig.program import Program
 
 MAX_SAMPLES = 10_000_000
 """Largest number of samples. A run is kept in memory; tests/harness/test_long_runs.py bounds its size."""
@@ -26,52 +25,87 @@ MAX_SAMPLES = 10_000_000
 MAX_CHANGES = 1_000
 """Largest number of changes, and of records, in a run. The bounds of each take milliseconds to compute."""
 
-UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
-
 LEAST_PARAMETER, MOST_PARAMETER = 1e-12, 1e12
 """Limits of each parameter in its unit, exclusive."""
+
+BLOCK_SAMPLES = 64
+"""Samples that one product of matrices computes."""
 
 
 @dataclass(frozen=True)
 class Plant:
-    """Mass in kg, damping in N s/m and stiffness in N/m of M x'' + B x' + K x = F (thesis Equ 2.3).
+    """Program with values of its parameters, in their order.
 
-    ValueError: a parameter is not positive, or 1e12 or more.
+    ValueError: a value is not positive, or 1e12 or more.
     """
 
-    mass_kg: float
-    damping_n_s_per_m: float
-    stiffness_n_per_m: float
+    program: Program
+    values: tuple[float, ...]
 
     def __post_init__(self) -> None:
         for name, value in self.parameters().items():
-            if not LEAST_PARAMETER < value < MOST_PARAMETER:
-                limits = f"more than {LEAST_PARAMETER:g} and less than {MOST_PARAMETER:g}"
-                raise ValueError(f"{name} must be {limits}, not {value:g}")
+            check_parameter(name, value)
+
+    @classmethod
+    def of(cls, program: Program, changed: Mapping[str, float] | None = None) -> Plant:
+        """Plant with the values of the program, but for the ``changed`` ones."""
+        return cls(program, tuple(row.value for row in program.parameters.values())).changed(changed or {})
 
     def parameters(self) -> dict[str, float]:
-        """Values by their short names ``M``, ``B``, ``K``."""
-        return dict(zip(PARAMETERS, (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m), strict=True))
+        """Values by name."""
+        return dict(zip(self.program.parameters, self.values, strict=True))
+
+    @property
+    def overrides(self) -> dict[str, float]:
+        """Values that differ from the program's, by name."""
+        rows = self.program.parameters.items()
+        return {name: value for (name, row), value in zip(rows, self.values, strict=True) if value != row.value}
+
+    def changed(self, values: Mapping[str, float]) -> Plant:
+        """The same plant with other values of some parameters, by a name or alias of each.
+
+        :raises ValueError: a parameter is unknown, or a value is out of range.
+        """
+        names = self.program.names
+        for name in values:
+            if name not in names:
+                known = ", ".join(self.program.parameters)
+                raise ValueError(
+                    f"program {self.program.name}: unknown parameter {name!r}{suggest(name, names)} (known: {known})"
+                )
+        return Plant(
+            self.program, tuple((self.parameters() | {names[name]: each for name, each in values.items()}).values())
+        )
 
     def scaled(self, name: str, factor: float) -> Plant:
-        """The same plant with parameter ``name`` (``M``, ``B`` or ``K``) multiplied by ``factor``."""
-        values = self.parameters()
-        return Plant(*(value * factor if name == each else value for each, value in values.items()))
+        """The same plant with the parameter ``name`` multiplied by ``factor``."""
+        return self.changed({name: self.parameters()[name] * factor})
 
     def interpolate(self, other: Plant, part: float) -> Plant:
-        """Plant at the fraction ``part`` (0..1) of a ramp to ``other``: linear in 1/M, B and K, as the pots set them.
+        """Plant at the fraction ``part`` (0..1) of a ramp to ``other``, linear in the pots.
 
         The load of the pots is neglected: it moves a coefficient by at most 2 % if the dials turn linearly.
         """
-        mass_kg = 1.0 / ((1.0 - part) / self.mass_kg + part / other.mass_kg)
-        damping = self.damping_n_s_per_m + part * (other.damping_n_s_per_m - self.damping_n_s_per_m)
-        stiffness = self.stiffness_n_per_m + part * (other.stiffness_n_per_m - self.stiffness_n_per_m)
-        return Plant(mass_kg, damping, stiffness)
+        inverse = self.program.inverse
+        return Plant(
+            self.program,
+            tuple(
+                1.0 / ((1.0 - part) / before + part / after) if name in inverse else before + part * (after - before)
+                for name, before, after in zip(self.program.parameters, self.values, other.values, strict=True)
+            ),
+        )
 
     def changes_to(self, other: Plant) -> dict[str, tuple[float, float]]:
         """Parameters in which ``other`` differs, as ``{name: (before, after)}``."""
-        pairs = zip(PARAMETERS, self.parameters().values(), other.parameters().values(), strict=True)
+        pairs = zip(self.program.parameters, self.values, other.values, strict=True)
         return {name: (before, after) for name, before, after in pairs if before != after}
+
+
+def check_parameter(name: str, value: float) -> None:
+    """:raises ValueError: the value of a parameter is not positive, or 1e12 or more."""
+    if not LEAST_PARAMETER < value < MOST_PARAMETER:
+        limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"
+        raise ValueError(f"{name} must be {limit if value > 0.0 else 'more than 0'}, not {value:g}")
 
 
 @dataclass(frozen=True)
@@ -113,23 +147,20 @@ class Segment:
         return self.start_low is None and self.start_high is None and self.end_low is None and self.end_high is None
 
 
-State = tuple[float, float]
-"""Displacement [m] and velocity [m/s]."""
-
-AT_REST: State = (0.0, 0.0)
+State = tuple[float, ...]
+"""Values of the states of a program, in their order."""
 
 
 @dataclass(frozen=True)
 class SampledPlant:
-    """Plant discretised by an exact zero-order hold of the force.
+    """Linear plant discretised by an exact zero-order hold of its input."""
 
-    Plain floats: numpy takes ten times as long for a 2 x 2 product.
-    """
-
-    transition: tuple[float, float, float, float]
-    """Transition matrix of (x, v), row by row."""
-    response: tuple[float, float]
-    """Change of x and v per newton."""
+    transition: tuple[State, ...]
+    """Transition matrix of the states, row by row."""
+    response: State
+    """Change of each state per unit of the input."""
+    readout: State
+    """Factors of the states in the output."""
 
     @classmethod
     def from_plant(cls, plant: Plant, period_s: float) -> SampledPlant:
@@ -138,24 +169,61 @@ class SampledPlant:
 
     @classmethod
     def from_plants(cls, plants: Sequence[Plant], period_s: float) -> list[SampledPlant]:
-        """Discretise many plants at once; equal to ``from_plant`` to the bit."""
-        parameters = np.array([(each.mass_kg, each.damping_n_s_per_m, each.stiffness_n_per_m) for each in plants])
+        """Discretise many plants of one program at once; equal to ``from_plant`` to the bit."""
+        if not plants:
+            return []
+        sampled = discretise(plants[0].program, np.array([plant.values for plant in plants]), period_s)
+        readouts = plants[0].program.generators(np.array([plant.values for plant in plants]))[:, -1, :-1]
         return [
-            cls(transition=(xx, xv, vx, vv), response=(xf, vf))
-            for (xx, xv, xf), (vx, vv, vf) in discretise(parameters.reshape(-1, 3), period_s).tolist()
+            cls(tuple(tuple(row[:-1]) for row in rows), tuple(row[-1] for row in rows), tuple(readout))
+            for rows, readout in zip(sampled.tolist(), readouts.tolist(), strict=True)
         ]
 
-    @functools.cached_property
-    def matrices(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Transition (2, 2) and response (2,)."""
-        return np.array(self.transition).reshape(2, 2), np.array(self.response)
+    @property
+    def at_rest(self) -> State:
+        """State at the start of a record."""
+        return (0.0,) * len(self.response)
 
-    def next(self, state: State, force_n: float) -> State:
-        """State one sample later."""
-        x, v = state
-        xx, xv, vx, vv = self.transition
-        xf, vf = self.response
-        return (xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n)
+    def next(self, state: State, driven: float) -> State:
+        """State one sample later, with the input ``driven``, in plain floats: numpy takes longer for so few."""
+        rows = zip(self.transition, self.response, strict=True)
+        return tuple(_product(row, state) + gain * driven for row, gain in rows)
+
+    def output(self, state: State) -> float:
+        """Output in a state."""
+        return _product(self.readout, state)
+
+    def play(self, state: State, driven: NDArray[np.float64]) -> tuple[NDArray[np.float64], State]:
+        """Outputs after each of n inputs, and the state after the last one."""
+        out, now = np.empty(len(driven)), np.array(state)
+        outputs, states = self._blocks
+        for first in range(0, len(driven), BLOCK_SAMPLES):
+            inputs = driven[first : first + BLOCK_SAMPLES]
+            n = len(inputs)
+            known = np.concatenate([now, inputs])
+            out[first : first + n] = outputs[:n, : len(known)] @ known
+            now = states[n - 1][:, : len(known)] @ known
+        return out, tuple(now.tolist())
+
+    @functools.cached_property
+    def _blocks(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Outputs (block, n + block) and states (block, n, n + block) after each input, from state and inputs."""
+        transition, n = np.array(self.transition), len(self.response)
+        states = np.zeros((BLOCK_SAMPLES, n, n + BLOCK_SAMPLES))
+        now = np.eye(n, n + BLOCK_SAMPLES)
+        for k in range(BLOCK_SAMPLES):
+            now = transition @ now
+            now[:, n + k] = self.response
+            states[k] = now
+        return np.array(self.readout) @ states, states
+
+
+def _product(row: State, state: State) -> float:
+    """Scalar product, added from the left: ``sum`` compensates rounding in some versions of Python."""
+    total = 0.0
+    for factor, value in zip(row, state, strict=True):
+        total += factor * value
+    return total
 
 
 @functools.lru_cache(maxsize=64)
@@ -164,13 +232,11 @@ def _sampled(plant: Plant, period_s: float) -> SampledPlant:
     return SampledPlant.from_plants([plant], period_s)[0]
 
 
-def discretise(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
-    """Discretise plants (n, 3) of M, B, K: (n, 2, 3), the rows of x and v from x, v and force."""
-    m, b, k = parameters.T
-    generators = np.zeros((len(parameters), 3, 3))
-    generators[:, 0, 1] = 1.0
-    generators[:, 1] = np.stack([-k / m, -b / m, 1.0 / m], axis=1)
-    return _exponentials(generators * period_s)[:, :2]
+def discretise(program: Program, parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
+    """Discretise plants of a linear program, (p, m) parameters: (p, n, n + 1), the states from states and input."""
+    generators = program.generators(parameters)
+    generators[:, -1] = 0.0
+    return _exponentials(generators * period_s)[:, :-1]
 
 
 def _exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -196,29 +262,47 @@ def _exponential(matrices: NDArray[np.float64], squarings: int) -> NDArray[np.fl
     return np.asarray(result)
 
 
-def physical_parameters(
-    theta: NDArray[np.floating], model: ModelOrders, n_per_code: float, m_per_code: float, period_s: float
+def estimated_parameters(
+    program: Program,
+    theta: NDArray[np.floating],
+    model: ModelOrders,
+    input_per_code: float,
+    output_per_code: float,
+    period_s: float,
 ) -> NDArray[np.float64]:
-    """M, B, K (n, 3) of estimates theta (n, p) in codes; NaN if a row describes no mass, damper and spring.
+    """Parameters ``program.estimates`` (n, m) of estimates theta (n, p) in codes; NaN if a row describes no such plant.
 
-    The poles of A give B/M and K/M, the static gain gives K. Neither depends on the instant of an edge within a sample.
+    The poles of A give the denominator of the response, the static gain its gain. Neither depends on the instant of an
+    edge within a sample. The program states which parameters follow from them.
 
-    :param model: meaning of theta; all NaN unless its ``na`` is 2.
-    :param n_per_code: newtons per code of force.
-    :param m_per_code: metres per code of displacement.
+    :param model: meaning of theta; all NaN unless its ``na`` is the number of the program's states.
+    :param input_per_code: units of the input per code; likewise for the output.
     :param period_s: problem time between samples.
     """
-    if model.na != 2:
-        return np.full((len(theta), 3), np.nan)
-    a1, a2 = (theta[:, i].astype(np.float64) for i in range(2))
+    order, names = len(program.equations.states), program.estimates
+    if model.na != order or not names:
+        return np.full((len(theta), len(names)), np.nan)
+    a = theta[:, :order].astype(np.float64)
     with np.errstate(all="ignore"):
-        gain = theta[:, 2 : 2 + model.nb].sum(axis=1, dtype=np.float64) / (1.0 + a1 + a2)
-        stiffness = n_per_code / (gain * m_per_code)
-        poles = np.sqrt((a1 * a1 - 4.0 * a2).astype(np.complex128))
-        logs = [np.log((-a1 + sign * poles) / 2.0) / period_s for sign in (1.0, -1.0)]
-        stiffness_over_mass = (logs[0] * logs[1]).real
-        damping_over_mass = -(logs[0] + logs[1]).real
-        mass = stiffness / stiffness_over_mass
-        out = np.stack([mass, damping_over_mass * mass, stiffness], axis=1)
+        static = theta[:, order : order + model.nb].sum(axis=1, dtype=np.float64) / (1.0 + a.sum(axis=1))
+        values = {"gain": static * output_per_code / input_per_code}
+        denominator = np.ones((len(theta), 1), np.complex128)
+        for root in (np.log(_poles(a)) / period_s).T:
+            denominator = np.pad(denominator, ((0, 0), (0, 1))) - np.pad(denominator, ((0, 0), (1, 0))) * root[:, None]
+        values |= {f"s{i}": denominator[:, order - i].real for i in range(order)}
+        for name, formula in program.equations.estimates.items():
+            values[name] = formula.law({})(values)
+        out = np.stack([values[name] for name in names], axis=1)
         out[~((out > LEAST_PARAMETER) & (out < MOST_PARAMETER)).all(axis=1)] = np.nan
     return out
+
+
+def _poles(a: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Roots (n, order) of z^order + a1 z^(order - 1) + ..., from (n, order)."""
+    n, order = a.shape
+    if order == 2:
+        root = np.sqrt((a[:, 0] ** 2 - 4.0 * a[:, 1]).astype(np.complex128))
+        return np.stack([(-a[:, 0] + sign * root) / 2.0 for sign in (1.0, -1.0)], axis=1)
+    companion = np.tile(np.eye(order, k=-1), (n, 1, 1))
+    companion[:, 0] = np.nan_to_num(-a)  # of a row that is not finite, the gain is NaN
+    return np.linalg.eigvals(companion).astype(np.complex128)

@@ -28,6 +28,8 @@ from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.header import check_tables
 from analogrig.identity import Identity
 from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment
+from analogrig.program import Program
+from analogrig.scenario import DEFAULT_PROGRAM, program_of
 from analogrig.storage import replace_file
 
 FORMAT = "analogrig-run"
@@ -41,11 +43,8 @@ MAX_CODES = 1 << 16
 _LEAST_MAGNITUDE, _MOST_MAGNITUDE = 1e-12, 1e9
 """Limits of every plausible unit, time or noise, exclusive."""
 
-CHANNELS = ("force", "displacement", "velocity", "net_force")
-"""Channels in the order of the columns of ``Run.codes`` and ``Run.clipped``."""
-
-MEASURED = ("force", "displacement")
-"""Channels that every rig measures and every device receives."""
+INPUT, OUTPUT = 0, 1
+"""Columns of the plant's input and output, which every rig measures and every device receives."""
 
 LOST = 0x20
 """Flag of a sample, beside SteppedFlag: lost on the way to the device."""
@@ -125,9 +124,8 @@ def stack(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def missing_samples(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(n,) bool from (n, 4) bool: samples whose force or displacement was clipped."""
-    force, displacement = (clipped[:, CHANNELS.index(name)] for name in MEASURED)
-    return np.asarray(force | displacement)
+    """(n,) bool from (n, c) bool: samples whose input or output was clipped."""
+    return np.asarray(clipped[:, INPUT] | clipped[:, OUTPUT])
 
 
 @dataclass(frozen=True)
@@ -171,11 +169,23 @@ class Conditions:
     """Speed and packing of the line (``Device.line``); empty if not recorded."""
     identity: Identity | None = None
     """Provenance; None if not recorded."""
+    program: Program = field(default_factory=lambda: Program.load(DEFAULT_PROGRAM))
+    """Program of the scenario; its channels are the columns of the samples."""
 
     @property
     def sample_period_problem_s(self) -> float:
         """Problem time between samples."""
         return self.sample_period_s * self.time_scale
+
+    @property
+    def input(self) -> Channel:
+        """Channel of the plant's input."""
+        return self.channels[self.program.channels[INPUT]]
+
+    @property
+    def output(self) -> Channel:
+        """Channel of the plant's output."""
+        return self.channels[self.program.channels[OUTPUT]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +197,9 @@ class Run:
 
     conditions: Conditions
     codes: NDArray[np.uint16]
-    """(n, 4), columns as ``CHANNELS``."""
+    """(n, c), columns as the channels of the program."""
     clipped: NDArray[np.bool_]
-    """(n, 4): the code is the limit of the range, not a measurement."""
+    """(n, c): the code is the limit of the range, not a measurement."""
     theta: NDArray[np.float32]
     """(n, p): the estimate after each sample, in codes per code; order of est.h. (n, 0) if it is not reported."""
     innovation: NDArray[np.float32]
@@ -241,7 +251,7 @@ class Run:
 
     def channel(self, name: str) -> NDArray[np.float64]:
         """Values of one channel in its physical unit, (n,) float64."""
-        return self.conditions.channels[name].physical(self.codes[:, CHANNELS.index(name)])
+        return self.conditions.channels[name].physical(self.codes[:, self.conditions.program.channels.index(name)])
 
     @functools.cached_property
     def segments(self) -> tuple[tuple[int, int, Plant], ...]:
@@ -370,8 +380,8 @@ class Run:
             and len(self.alarm_kind) == len(self.alarm_statistic) == alarms
             and all(len(getattr(self, name)) == diagnoses for name in _DIAGNOSIS_ARRAYS)
             and all(len(getattr(self, name)) == misfits for name in _MISFIT_ARRAYS),
-            "channels": set(MEASURED) <= set(conditions.channels) <= set(CHANNELS)
-            and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
+            "channels": set(conditions.program.measured) <= set(conditions.channels) <= set(conditions.program.channels)
+            and self.codes.shape[1] == self.clipped.shape[1] == len(conditions.program.channels),
             "sample times": all(
                 _LEAST_MAGNITUDE < each < _MOST_MAGNITUDE
                 for each in (conditions.sample_period_s, conditions.time_scale)
@@ -461,12 +471,12 @@ def _check_array(name: str, array: NDArray[Any]) -> NDArray[Any]:
 
 def _to_json(conditions: Conditions) -> dict[str, Any]:
     """Header of the file in plain JSON types."""
-    out = dict(vars(conditions))
+    out = {name: value for name, value in vars(conditions).items() if name != "program"}  # the scenario holds it
     if (identity := out.pop("identity")) is not None:
         out["identity"] = identity.as_table()
     out["channels"] = {name: vars(channel) for name, channel in conditions.channels.items()}
     out["segments"] = [
-        {**{key: value for key, value in vars(s).items() if value is not None}, "plant": vars(s.plant)}
+        {**{key: value for key, value in vars(s).items() if value is not None}, "plant": s.plant.parameters()}
         for s in conditions.segments
     ]
     return out
@@ -482,10 +492,30 @@ def _parse_conditions(header: Any, path: Path) -> Conditions:
     table = header.get("conditions")
     if not isinstance(table, dict):
         raise RecordingError(f"{path}: the header of the recording has no conditions")
+    where = f"{path}: the header of the recording"
     try:
-        return config.build(Conditions, table, f"{path}: the header of the recording")
+        program = program_of(table.get("scenario"), f"{where}: scenario")
+        table = {**table, "program": program}
+        if isinstance(segments := table.get("segments"), list):
+            named = ((each, f"{where}: segments[{i}]") for i, each in enumerate(segments))
+            table["segments"] = [_with_plant(each, program, place) for each, place in named]
+        return config.build(Conditions, table, where)
     except ConfigurationError as error:
         raise RecordingError(str(error)) from error
+
+
+def _with_plant(segment: Any, program: Program, where: str) -> Any:
+    """Segment of a header with its plant, which is there as values by name.
+
+    :raises ConfigurationError: the values are no plant of the program.
+    """
+    if not isinstance(segment, Mapping) or "plant" not in segment:
+        return segment
+    values = config.convert(Mapping[str, float], segment["plant"], f"{where}: plant")
+    try:
+        return {**segment, "plant": Plant.of(program, values)}
+    except ValueError as error:
+        raise ConfigurationError(f"{where}: plant: {error}") from error
 
 
 _datasheet: tuple[Mapping[str, Any], Datasheet] | None = None

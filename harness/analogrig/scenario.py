@@ -1,20 +1,22 @@
-"""Scenario: excitation, plant, pot changes and expectations of one play. The device never receives the pot changes."""
+"""Scenario: excitation, program, pot changes and expectations of one play. The device never receives the changes."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from analogrig import config
-from analogrig.plant import LEAST_PARAMETER, MAX_CHANGES, MAX_SAMPLES, MOST_PARAMETER, Plant, Segment
+from analogrig.errors import ConfigurationError
+from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment, check_parameter
+from analogrig.program import Program
 from analogrig.trust import FiledName, resolve_name
 from analogrig.wording import number_of
-from analogrig_emulator import PROGRAMS, Excitation
+from analogrig_emulator import Excitation
 
 MAX_RAMP_N = 100_000
 
@@ -24,11 +26,8 @@ MAX_TRIES = 1000
 DEFAULT_SEED = 1995
 """Random seed if neither the user nor the scenario sets one."""
 
-_MASS_DAMPER_SPRING = ("front", "shock")
-"""Programs that ``Plant`` describes. Bounds and estimates of others have no meaning."""
-
-PLANTS = {name: Plant(*list(program.values.values())[:3]) for name, program in PROGRAMS.items()}
-"""Initial parameters of each program of the computer."""
+DEFAULT_PROGRAM = "front"
+"""Program if the scenario names none."""
 
 MOST_SEED = 2**63
 
@@ -40,55 +39,26 @@ MISSING = "clipped and missing for the device"
 
 
 @dataclass(frozen=True)
-class PlantChoice:
-    """Program on the computer and initial settings of its pots: mass in kg, damping in N s/m, stiffness in N/m.
-
-    None: the value of the program. ValueError: a value is not positive.
-    """
-
-    set: Literal["front", "shock", "bump-stop", "two-mass"] = "front"
-    mass_kg: float | None = None
-    damping_n_s_per_m: float | None = None
-    stiffness_n_per_m: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_parameters(self)
-
-    def overrides(self) -> dict[str, float]:
-        """Parameters that differ from the program's, by their names in Plant."""
-        return _overrides(self)
-
-    def plant(self) -> Plant:
-        """Plant with the program's parameters and the overrides."""
-        return _apply_overrides(PLANTS[self.set], self)
-
-
-@dataclass(frozen=True)
 class PotChange:
-    """Change of pots at the instant of a sample: mass in kg, damping in N s/m, stiffness in N/m; None: unchanged.
+    """Change of pots at the instant of a sample: new values of parameters, by name.
 
     The next sample is the first one affected. With ``ramp_n`` the pots turn linearly from that instant and arrive
     ``ramp_n`` samples later. ValueError: nothing changes, or a value is out of range.
     """
 
     sample: int
-    mass_kg: float | None = None
-    damping_n_s_per_m: float | None = None
-    stiffness_n_per_m: float | None = None
+    set: Mapping[str, float]
     ramp_n: int = 0
 
     def __post_init__(self) -> None:
-        _check_parameters(self)
         if self.sample < 1:
             raise ValueError(f"sample must be at least 1, not {self.sample}")
         if not 0 <= self.ramp_n <= MAX_RAMP_N:
             raise ValueError(f"ramp_n must be in 0 .. {MAX_RAMP_N}, not {self.ramp_n}")
-        if not _overrides(self):
-            raise ValueError("a pot change must set mass_kg, damping_n_s_per_m or stiffness_n_per_m")
-
-    def overrides(self) -> dict[str, float]:
-        """Changed parameters, by their names in Plant."""
-        return _overrides(self)
+        if not self.set:
+            raise ValueError("a pot change must set a parameter of the program: set = { NAME = value }")
+        for name, value in self.set.items():
+            check_parameter(name, value)
 
 
 @dataclass(frozen=True)
@@ -147,7 +117,7 @@ class Statement:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Excitation, plant and changes of one play, in samples, and the expectations of the device.
+    """Excitation, program and changes of one play, in samples, and the expectations of the device.
 
     ``load`` reads a shipped scenario by name or a .toml file, and raises ConfigurationError. ValueError: a value is out
     of range.
@@ -155,7 +125,9 @@ class Scenario:
 
     samples: int
     excitation: Excitation
-    plant: PlantChoice = field(default_factory=PlantChoice)
+    program: Program = field(default_factory=lambda: Program.load(DEFAULT_PROGRAM))
+    set: Mapping[str, float] = field(default_factory=dict)
+    """Initial values of parameters that differ from the program's, by name."""
     tweaks: tuple[PotChange, ...] = ()
     expect: Expectations = field(default_factory=Expectations)
     random_phase: bool = False
@@ -190,6 +162,12 @@ class Scenario:
                     f"the tweak at sample {tweak.sample} lasts {number_of(tweak.ramp_n, 'sample')},"
                     f" beyond the next one at {following.sample}"
                 )
+        plant = self.plant
+        for i, tweak in enumerate(self.tweaks):
+            try:
+                plant = plant.changed(tweak.set)
+            except ValueError as error:
+                raise ValueError(f"tweaks[{i}]: {error}") from error
 
     @classmethod
     def load(cls, name: str) -> Scenario:
@@ -198,7 +176,10 @@ class Scenario:
         :raises ConfigurationError: absent, not TOML, or not a scenario; names the file and the key.
         """
         path = config.locate("scenarios", name)
-        scenario = cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
+        table = config.read_toml(path)
+        if isinstance(table.get("program"), str):
+            table["program"] = resolve_name(path, table["program"])
+        scenario = cls.from_table(table, str(path), default_name=path.stem)
         rig, dut = (resolve_name(path, each) for each in (scenario.rig, scenario.dut))
         return dataclasses.replace(scenario, rig=rig, dut=dut)
 
@@ -208,12 +189,13 @@ class Scenario:
 
         :raises ConfigurationError: not a scenario; names the key.
         """
-        scenario = config.build(cls, {"name": default_name, **table}, where)
+        scenario = config.build(cls, {"name": default_name, **_with_program(table, where)}, where)
         return dataclasses.replace(scenario, dut=FiledName(scenario.dut, where)) if scenario.dut else scenario
 
     def as_table(self) -> dict[str, Any]:
         """Plain TOML values, from which ``from_table`` builds an equal scenario."""
         table: dict[str, Any] = config.plain(dataclasses.asdict(self))
+        table["program"] = self.program.as_value()
         return table
 
     def draw_excitation(self, rng: np.random.Generator) -> Excitation:
@@ -225,37 +207,96 @@ class Scenario:
         """Phase of the excitation of one run: its own, or a random one if ``random_phase`` is set."""
         return float(rng.uniform()) if self.random_phase else self.excitation.phase
 
+    @classmethod
+    def of_program(cls, program: Program) -> Scenario:
+        """Scenario that changes the first parameter once, by a fifth as far as its range allows.
+
+        The excitation is a square wave between the levels of the program's trial play.
+        """
+        driven = program.channels[0]
+        volts = program.circuit.scales.volts(driven)
+        low_v, high_v = (level * volts for level in program.equations.inputs[driven].trial)
+        name, row = next(iter(program.parameters.items()))
+        goals = (max(0.8 * row.value, row.low), min(1.2 * row.value, row.high))
+        goal = max(goals, key=lambda value: abs(value / row.value - 1.0))
+        tweaks = (PotChange(1000, {name: goal}),) if goal != row.value else ()
+        excitation = Excitation(low_v=low_v, high_v=high_v)
+        return cls(1500, excitation, program, tweaks=tweaks, random_phase=True, name=program.name)
+
+    def on_program(self, program: Program) -> Scenario:
+        """The same scenario on another program; its parameters are those of the same name or alias.
+
+        :raises ConfigurationError: the program lacks a parameter of the scenario.
+        """
+
+        def renamed(values: Mapping[str, float]) -> dict[str, float]:
+            names = {name: program.names.get(self.program.parameters[name].alias, name) for name in values}
+            return {name if name in program.names else names[name]: value for name, value in values.items()}
+
+        tweaks = tuple(dataclasses.replace(tweak, set=renamed(tweak.set)) for tweak in self.tweaks)
+        try:
+            return dataclasses.replace(self, program=program, set=renamed(self.set), tweaks=tweaks)
+        except ValueError as error:
+            raise ConfigurationError(f"scenario {self.name}: {error}") from error
+
+    def with_plant(self, plant: Plant) -> Scenario:
+        """The same scenario with another plant before the first change."""
+        return dataclasses.replace(self, program=plant.program, set=plant.overrides)
+
     @property
-    def caveats(self) -> tuple[str, ...]:
-        """Reasons that runs are not judged; empty for the programs of a mass, a damper and a spring."""
-        program = self.plant.set
-        if program in _MASS_DAMPER_SPRING:
-            return ()
-        return (f"the program {program} is not a single mass, damper and spring, as bounds and estimates require",)
+    def plant(self) -> Plant:
+        """Plant before the first change."""
+        return Plant.of(self.program, self.set)
 
     def segments(self) -> tuple[Segment, ...]:
-        """True plant from the start and after each change; with two masses, that of the sprung mass."""
-        out = [Segment(0, self.plant.plant())]
-        for tweak in self.tweaks:
-            changed = _apply_overrides(out[-1].plant, tweak)
-            if changed == out[-1].plant:
-                continue  # a pot set to where it stood changes nothing, and nothing can be detected
-            out.append(Segment(tweak.sample, changed, tweak.ramp_n))
-        return tuple(out)
+        """True plant from the start and after each change."""
+        return segments_of(self.plant, self.tweaks)
 
 
-def _overrides(change: PlantChoice | PotChange) -> dict[str, float]:
-    values = {item.name: getattr(change, item.name) for item in dataclasses.fields(Plant)}
-    return {name: value for name, value in values.items() if value is not None}
+def segments_of(plant: Plant, tweaks: Iterable[PotChange]) -> tuple[Segment, ...]:
+    """True plant from the start and after each change."""
+    out = [Segment(0, plant)]
+    for tweak in tweaks:
+        changed = out[-1].plant.changed(tweak.set)
+        if changed == out[-1].plant:
+            continue  # a pot set to where it stood changes nothing, and nothing can be detected
+        out.append(Segment(tweak.sample, changed, tweak.ramp_n))
+    return tuple(out)
 
 
-def _apply_overrides(plant: Plant, change: PlantChoice | PotChange) -> Plant:
-    return dataclasses.replace(plant, **_overrides(change))
+def program_of(table: Any, where: str) -> Program:
+    """Program of the table of a scenario.
+
+    :raises ConfigurationError: it is none.
+    """
+    program: Program = _with_program(table if isinstance(table, Mapping) else {}, where)["program"]
+    return program
 
 
-def _check_parameters(change: PlantChoice | PotChange) -> None:
-    for name, value in _overrides(change).items():
-        if not LEAST_PARAMETER < value < MOST_PARAMETER:
-            limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"
-            limit = limit if value > 0.0 else "more than 0"
-            raise ValueError(f"{name} must be {limit}, not {value:g}")
+def _with_program(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The table of a scenario with its program loaded, and with every change of a parameter in ``set``.
+
+    A table ``plant`` is another form of the keys ``program`` and ``set``, with ``set`` as the name of the program and
+    parameters beside it. A parameter may stand beside the keys of a tweak by its alias.
+    """
+    out = dict(table)
+    if "plant" in out:
+        plant = out.pop("plant")
+        if not isinstance(plant, Mapping) or "program" in out or "set" in out:
+            raise ConfigurationError(f"{where}: plant: write program = ... and set = {{ ... }} instead")
+        out |= {"program": plant.get("set", DEFAULT_PROGRAM), "set": {k: v for k, v in plant.items() if k != "set"}}
+    program = out["program"] = Program.of(out.get("program", DEFAULT_PROGRAM), f"{where}: program")
+    if isinstance(out.get("set"), Mapping):
+        out["set"] = {program.names.get(name, name): value for name, value in out["set"].items()}
+    if isinstance(tweaks := out.get("tweaks"), list):
+        out["tweaks"] = [_with_set(tweak, program) for tweak in tweaks]
+    return out
+
+
+def _with_set(tweak: Any, program: Program) -> Any:
+    """A tweak with its aliases in ``set``."""
+    if not isinstance(tweak, Mapping) or not isinstance(tweak.get("set", {}), Mapping):
+        return tweak
+    beside = [key for key in tweak if key in program.names and key not in program.parameters]
+    rest = {key: value for key, value in tweak.items() if key not in beside}
+    return {**rest, "set": {**tweak.get("set", {}), **{program.names[key]: tweak[key] for key in beside}}}

@@ -75,7 +75,7 @@ SCHEMES = schemes(PLAIN, ERROR_CEILING, MEAN_CEILING)
 ENDS = [end - 1 for _, end, _ in stretches(PROFILE, PROFILE_N)]
 """Last samples of the stretches."""
 
-STEADY = (Segment(0, FRONT),)
+STEADY = (Segment(0, FRONT.plant),)
 """Front suspension without a change."""
 
 
@@ -115,7 +115,7 @@ def simulated_data(simulation: Simulation) -> dict[str, Signal]:
     shock, front = square(400, SHOCK_FORCE_N), square(400, FRONT_FORCE_N)
     return {
         "fig-4.1-u": shock,
-        "fig-4.1-y": time_varying(shock, [Segment(0, SHOCK)]),
+        "fig-4.1-y": time_varying(shock, [Segment(0, SHOCK.plant)]),
         "fig-4.3-u": front,
         "fig-4.3-y": time_varying(front, STEADY),
         "fig-4.5-u": simulation.u,
@@ -144,11 +144,11 @@ def _facts(simulation: Simulation, measured: Mapping[str, Facts]) -> dict[str, A
     damping = 2 * SHOCK_ZETA * math.sqrt(SHOCK.stiffness_n_per_m * SHOCK.mass_kg)
     return {
         "quality": simulation.qualities,
-        "shock": Arx.of(SHOCK),
-        "front": Arx.of(FRONT),
+        "shock": Arx.of(SHOCK.plant),
+        "front": Arx.of(FRONT.plant),
         "shock_damping": damping,
-        "shock_by_zeta": Arx.of(dataclasses.replace(SHOCK, damping_n_s_per_m=damping)),
-        "compliances": [1.0 / PRINTED_4_8.gain, 1.0 / Arx.of(FRONT).gain],
+        "shock_by_zeta": Arx.of(SHOCK._replace(damping_n_s_per_m=damping).plant),
+        "compliances": [1.0 / PRINTED_4_8.gain, 1.0 / Arx.of(FRONT.plant).gain],
         "zeta": [damping_ratio(segment.plant) for segment in PROFILE],
         "critical": 2 * 0.9 * math.sqrt(FRONT.stiffness_n_per_m * FRONT.mass_kg),
         "stroke_force": SHOCK.stiffness_n_per_m * 0.12,
@@ -195,7 +195,7 @@ def _drawings(simulation: Simulation, identified: Arx) -> dict[str, Drawing]:
 
     return {
         "4.1": Drawing([[data["fig-4.1-u"]], [data["fig-4.1-y"] * 1e3]]),
-        "4.2": _bode(Arx.of(SHOCK), identified),
+        "4.2": _bode(Arx.of(SHOCK.plant), identified),
         "4.3": Drawing([[data["fig-4.3-u"]], [data["fig-4.3-y"] * 1e3]]),
         "4.4": Drawing(_theta_panels(still.theta[:100], coefficients(STEADY, 100), SCALES["mm × 5"])),
         "4.7": watched(tracks[ERROR], tracks[ERROR].innovation, ERROR_CEILING, -ERROR_CEILING),
@@ -223,9 +223,9 @@ def _theta_panels(theta: Signal, known: Signal, scale: float) -> list[list[Signa
 def _measure_stationary(identified: Arx) -> dict[str, Facts]:
     """Values behind the claims of sections 4.3 and 4.4.1 about stationary plants, by identifier."""
     force, u = square(400, SHOCK_FORCE_N), square(400, FRONT_FORCE_N)
-    vague = _least_squares_with_prior(force, time_varying(force, [Segment(0, SHOCK)]), 1e6)
-    bandwidth_hz, error = _bandwidth_hz(SHOCK), _largest(np.array(vague) / Arx.of(SHOCK) - 1.0)
-    gains = _bode(Arx.of(SHOCK), identified).panels[0]
+    vague = _least_squares_with_prior(force, time_varying(force, [Segment(0, SHOCK.plant)]), 1e6)
+    bandwidth_hz, error = _bandwidth_hz(SHOCK.plant), _largest(np.array(vague) / Arx.of(SHOCK.plant) - 1.0)
+    gains = _bode(Arx.of(SHOCK.plant), identified).panels[0]
     tracks = {name: _track(PLAIN, u, time_varying(u, STEADY), SCALES[name]) for name in SCALES_OF_FRONT}
     return {
         "4.3-excitation": {"bandwidth_hz": bandwidth_hz, "criterion_hz": 0.16 * bandwidth_hz, "largest_error": error},
@@ -236,12 +236,12 @@ def _measure_stationary(identified: Arx) -> dict[str, Facts]:
         },
         "4.4-30-samples": {
             "within_5_percent_after_n": {
-                name: settling_n(relative_errors(each, FRONT)) for name, each in tracks.items()
+                name: settling_n(relative_errors(each, FRONT.plant)) for name, each in tracks.items()
             },
             "theta_within_5_percent_after_n": {
                 name: settling_n(_errors_of_theta(each, SCALES[name], STEADY)) for name, each in tracks.items()
             },
-            "largest_error": _largest(relative_errors(tracks["mm × 5"], FRONT)[-1]),
+            "largest_error": _largest(relative_errors(tracks["mm × 5"], FRONT.plant)[-1]),
         },
     }
 
@@ -250,14 +250,15 @@ def _bandwidth_hz(plant: Plant) -> float:
     """Frequency at which the gain of the continuous plant has fallen by 3 dB."""
     frequency_hz = np.geomspace(1e-2, 1e3, 200001)
     s = 2j * math.pi * frequency_hz
-    gain = np.abs(1.0 / (plant.mass_kg * s * s + plant.damping_n_s_per_m * s + plant.stiffness_n_per_m))
+    mass_kg, damping_n_s_per_m, stiffness_n_per_m = plant.values
+    gain = np.abs(1.0 / (mass_kg * s * s + damping_n_s_per_m * s + stiffness_n_per_m))
     return float(frequency_hz[np.argmax(gain < gain[0] / math.sqrt(2.0))])
 
 
 def _measure_error(simulation: Simulation) -> dict[str, Facts]:
     """Values behind the claims about plain RLS and the prediction error, by identifier."""
     quality = simulation.qualities[ERROR]
-    truth = np.array([list(segment.plant.parameters().values()) for segment in PROFILE])
+    truth = np.array([segment.plant.values for segment in PROFILE])
     pairs = zip(quality.reconverged_n, quality.latency_n, strict=True)
     return {
         "4.5-biased": {
@@ -278,7 +279,9 @@ def _measure_error(simulation: Simulation) -> dict[str, Facts]:
         },
         "4.6-theory": {
             "samples_from_the_alarm": [None if n is None or found is None else n - found for n, found in pairs],
-            "samples_from_the_start": settling_n(relative_errors(simulation.tracks[ERROR], FRONT, 0, PROFILE[1].start)),
+            "samples_from_the_start": settling_n(
+                relative_errors(simulation.tracks[ERROR], FRONT.plant, 0, PROFILE[1].start)
+            ),
         },
         "4.4-outliers": _robustness(simulation, ERROR),
     }
@@ -384,7 +387,7 @@ def _second_alarms(rate: int, ceiling: float) -> dict[str, int | None]:
     config = _scheme(MEAN, ceiling, warm_up_n=WARM_UP_N * rate)
     out: dict[str, int | None] = {}
     for apart in range(1, 13):
-        segments = [*STEADY, Segment(at, light), Segment(at + apart, FRONT)]
+        segments = [*STEADY, Segment(at, light), Segment(at + apart, FRONT.plant)]
         found = _track(config, u, time_varying(u, segments, PERIOD_S / rate)).alarms.tolist()
         alarms = [k for k in found if at < k < at + period_n // 2]
         out[str(apart)] = alarms[1] - alarms[0] if len(alarms) > 1 else None

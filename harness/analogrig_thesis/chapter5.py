@@ -16,11 +16,12 @@ from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.config import fixtures
 from analogrig.devices.host import HostDevice
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import AT_REST, Plant, SampledPlant, Segment
+from analogrig.plant import Plant, SampledPlant, Segment
+from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Rig
 from analogrig.run import Channel, Run
-from analogrig.scenario import PlantChoice, PotChange, Scenario
+from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import Excitation
 from analogrig_thesis.models import (
     DEFAULT,
@@ -36,6 +37,7 @@ from analogrig_thesis.models import (
     UNITS_PER_M,
     Arx,
     SignalPair,
+    Suspension,
     Track,
     TrackQuality,
     assess,
@@ -57,7 +59,7 @@ RECORDED = ("fig-5.4", "fig-5.5", "fig-5.7-quantised", "fig-5.7")
 QUANTISED, NOISY, SKEWED = "emulator-ideal", "emulator", "emulator-skewed"
 """Rigs: 12 bits alone; with offsets and 1 LSB of noise; and with the force converted before the displacement."""
 
-INFERRED = Plant(30.5, 1505.0, 24500.0)
+INFERRED = Suspension(30.5, 1505.0, 24500.0)
 """Plant that comes nearest to Equ 5.4 on the skewed card; the text does not name it."""
 
 CUTOFFS_HZ = (5.0, 10.0, 20.0)
@@ -72,11 +74,11 @@ MEAN_CEILING = 500.0
 """Section 5.5, in units of 0.1 um."""
 
 COMPARISON = Scenario(
-    name="fig-5.4", samples=400, excitation=Excitation(frequency_hz=200.0), plant=PlantChoice(set="shock")
+    name="fig-5.4", samples=400, excitation=Excitation(frequency_hz=200.0), program=Program.load("shock")
 )
 
 IDENTIFICATION = Scenario(
-    name="fig-5.5", samples=2000, excitation=Excitation(frequency_hz=100.0), plant=PlantChoice(**vars(INFERRED))
+    name="fig-5.5", samples=2000, excitation=Excitation(frequency_hz=100.0), set=INFERRED.plant.overrides
 )
 
 TRACKING = Scenario(
@@ -85,7 +87,7 @@ TRACKING = Scenario(
     excitation=Excitation(frequency_hz=100.0, phase=0.25),
     # Each change sets all pots, also those that stay.
     tweaks=tuple(
-        PotChange(start, **vars(segment.plant))
+        PotChange(start, segment.plant.parameters())
         for start, segment in zip((200, 400, 600, 800), PROFILE[1:], strict=True)
     ),
     description="the four changes of section 4.4.1, each while the force is on",
@@ -272,19 +274,19 @@ def reproduce_chapter(circuit: CircuitRuns) -> Chapter:
 def _facts(circuit: CircuitRuns, measured: Mapping[str, Facts]) -> dict[str, Any]:
     """Values for the texts beside those behind the claims."""
     conditions, estimate = circuit.identification.conditions, _identify(circuit.identification)
-    unskewed, variances = Arx.of(INFERRED), measured["5.4-variance"]["variances"]
+    unskewed, variances = Arx.of(INFERRED.plant), measured["5.4-variance"]["variances"]
     spread = measured["5.9-forgetting"]["spread_of_b_1e-6_m_per_N"]["noisy"]
     return {
         "estimate": estimate,
-        "shock": Arx.of(SHOCK),
-        "front": Arx.of(FRONT),
+        "shock": Arx.of(SHOCK.plant),
+        "front": Arx.of(FRONT.plant),
         "rate_hz": 1.0 / conditions.sample_period_s,
         "problem_rate_hz": 1.0 / conditions.sample_period_problem_s,
         "time_scale": conditions.time_scale,
         "printed_poles": PRINTED_5_4.poles,
         "a2_from_gain": (PRINTED_5_4.b0 + PRINTED_5_4.b1) * INFERRED.stiffness_n_per_m - 1.0 - PRINTED_5_4.a1,
         "inferred": INFERRED,
-        "inferred_zeta": damping_ratio(INFERRED),
+        "inferred_zeta": damping_ratio(INFERRED.plant),
         "moved_by_skew": [estimate.b0 / unskewed.b0 - 1.0, estimate.b1 / unskewed.b1 - 1.0],
         "moved_by_deviations": abs(estimate.b0 - unskewed.b0) * 1e5 / np.sqrt(variances[2]),
         "ceiling_lsb": MEAN_CEILING / UNITS_PER_M / circuit.noisy.codes.m_per_unit,
@@ -421,7 +423,7 @@ def _measure_identification(circuit: CircuitRuns) -> dict[str, Facts]:
 
 
 def _deviations_by_reading(circuit: CircuitRuns) -> Facts:
-    many = np.array([list(_deviations(_identify_on_card(SKEWED, INFERRED, seed)).values()) for seed in SEEDS])
+    many = np.array([list(_deviations(_identify_on_card(SKEWED, INFERRED.plant, seed)).values()) for seed in SEEDS])
     return {
         "deviations": _deviations(_identify(circuit.identification)),
         "seeds_within_3_percent": int((np.abs(many) <= 0.03).all(axis=1).sum()),
@@ -429,9 +431,9 @@ def _deviations_by_reading(circuit: CircuitRuns) -> Facts:
         "mean_deviations": many.mean(axis=0).tolist(),
         "deviations_with_an_early_edge": _deviations(_identify_with_early_edge()),
         "deviations_of_other_readings": {
-            "the inferred plant without the skew": _deviations(_identify_on_card(NOISY, INFERRED, SEED)),
-            "shock absorber of section 4.2": _deviations(Arx.of(SHOCK)),
-            "front suspension of section 4.4.1": _deviations(Arx.of(FRONT)),
+            "the inferred plant without the skew": _deviations(_identify_on_card(NOISY, INFERRED.plant, SEED)),
+            "shock absorber of section 4.2": _deviations(Arx.of(SHOCK.plant)),
+            "front suspension of section 4.4.1": _deviations(Arx.of(FRONT.plant)),
             "the last plant of section 4.4.1 (M = 30)": _deviations(Arx.of(PROFILE[-1].plant)),
         },
     }
@@ -444,16 +446,16 @@ def _deviations(arx: Arx) -> dict[str, float]:
 
 def _identify_on_card(rig: str, plant: Plant, seed: int) -> Arx:
     """Batch estimate of the first 1000 samples, in this process."""
-    choice = dataclasses.replace(IDENTIFICATION.plant, **vars(plant))
-    scenario = dataclasses.replace(IDENTIFICATION, samples=FIRST_N, plant=choice)
+    scenario = dataclasses.replace(IDENTIFICATION.with_plant(plant), samples=FIRST_N)
     codes = play_alone(rig, scenario, seed)
     return Arx.scaled(codes.track(BATCH).theta[-1], codes.b_scale)
 
 
 def _identify_with_early_edge() -> Arx:
     """Batch estimate if both channels are sampled at once and each edge of the force comes 10 us before."""
-    u, y, state = (square(FIRST_N, 1470.0, 200) + 1470.0), np.empty(FIRST_N), AT_REST
-    before, after = (SampledPlant.from_plant(INFERRED, part * PERIOD_S) for part in (1.0 - EARLY, EARLY))
+    u, y = (square(FIRST_N, 1470.0, 200) + 1470.0), np.empty(FIRST_N)
+    before, after = (SampledPlant.from_plant(INFERRED.plant, part * PERIOD_S) for part in (1.0 - EARLY, EARLY))
+    state = before.at_rest
     for k in range(FIRST_N):
         state = after.next(before.next(state, float(u[k - 1]) if k else 0.0), float(u[k]))
         y[k] = state[0]

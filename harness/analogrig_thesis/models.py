@@ -20,24 +20,41 @@ from analogrig.datasheet import ModelOrders
 from analogrig.devices.estimator import Estimator
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import trajectory
-from analogrig.plant import AT_REST, Plant, SampledPlant, Segment, physical_parameters
+from analogrig.plant import Plant, SampledPlant, Segment, estimated_parameters
+from analogrig.program import Program
 from analogrig.run import Run
 from analogrig_thesis.texts import Mark, Signal
 
 PERIOD_S = 0.01
 """Section 4.2: "The system sample rate was 100Hz"."""
 
-SHOCK = Plant(2.0, 900.0, 12250.0)
+
+class Suspension(NamedTuple):
+    """Mass, damper and spring of the thesis (Equ 2.3)."""
+
+    mass_kg: float
+    damping_n_s_per_m: float
+    stiffness_n_per_m: float
+
+    @property
+    def plant(self) -> Plant:
+        return Plant(PROGRAM, tuple(self))
+
+
+PROGRAM = Program.load("front")
+"""Program of the equation M x'' + B x' + K x = F."""
+
+SHOCK = Suspension(2.0, 900.0, 12250.0)
 """Shock absorber of section 4.2."""
-FRONT = Plant(115.0, 3021.0, 24500.0)
+FRONT = Suspension(115.0, 3021.0, 24500.0)
 """Front suspension of section 4.4.1."""
 
 PROFILE = (
-    Segment(0, FRONT),
-    Segment(200, Plant(115.0, 3021.0, 18000.0)),
-    Segment(400, Plant(115.0, 3453.0, 18000.0)),
-    Segment(500, Plant(115.0, 2123.0, 20000.0)),
-    Segment(600, Plant(30.0, 2123.0, 20000.0)),
+    Segment(0, FRONT.plant),
+    Segment(200, Suspension(115.0, 3021.0, 18000.0).plant),
+    Segment(400, Suspension(115.0, 3453.0, 18000.0).plant),
+    Segment(500, Suspension(115.0, 2123.0, 20000.0).plant),
+    Segment(600, Suspension(30.0, 2123.0, 20000.0).plant),
 )
 """Section 4.4.1. Printed with both ends: 0 <= t <= 200, 201 <= t <= 400, ..."""
 PROFILE_N = 800
@@ -64,8 +81,8 @@ class Arx(NamedTuple):
         response.
         """
         sampled = SampledPlant.from_plant(plant, PERIOD_S)
-        xx, xv, vx, vv = sampled.transition
-        first = sampled.next(AT_REST, 1.0)
+        (xx, xv), (vx, vv) = sampled.transition
+        first = sampled.next(sampled.at_rest, 1.0)
         second = sampled.next(first, 1.0)
         a1, a2 = -(xx + vv), xx * vv - xv * vx
         return cls(a1, a2, first[0], second[0] + a1 * first[0] - first[0])
@@ -99,7 +116,8 @@ class Arx(NamedTuple):
 
 def damping_ratio(plant: Plant) -> float:
     """B / (2 sqrt(K M))."""
-    return plant.damping_n_s_per_m / (2.0 * math.sqrt(plant.stiffness_n_per_m * plant.mass_kg))
+    mass_kg, damping_n_s_per_m, stiffness_n_per_m = plant.values
+    return damping_n_s_per_m / (2.0 * math.sqrt(stiffness_n_per_m * mass_kg))
 
 
 def square(n: int, amplitude: float, period_n: int = 100) -> Signal:
@@ -115,7 +133,7 @@ def stretches(segments: Sequence[Segment], n: int) -> list[tuple[int, int, Plant
 
 def time_varying(u: Signal, segments: Sequence[Segment] = PROFILE, period_s: float = PERIOD_S) -> Signal:
     """Displacement (n,) of a plant whose parameters jump; position and velocity are continuous."""
-    y, state = np.empty(len(u)), AT_REST
+    y, state = np.empty(len(u)), SampledPlant.from_plant(segments[0].plant, period_s).at_rest
     for start, end, plant in stretches(segments, len(u)):
         sampled = SampledPlant.from_plant(plant, period_s)
         for k in range(start, end):
@@ -266,7 +284,7 @@ class SignalPair:
         fitted = dataclasses.replace(config, p0=config.p0 / shrunk**2, ceiling=ceiling)
         steps = Estimator(fitted).run(self.u * shrunk, self.y * shrunk)
         theta, model = steps.theta.astype(np.float64), ModelOrders.of_estimator(config.as_table())
-        parameters = physical_parameters(theta, model, self.n_per_unit, self.m_per_unit, PERIOD_S)
+        parameters = estimated_parameters(PROGRAM, theta, model, self.n_per_unit, self.m_per_unit, PERIOD_S)
         return Track(theta, steps.innovation / shrunk, steps.statistic / unit, steps.alarms, parameters)
 
 

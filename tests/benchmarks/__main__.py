@@ -31,12 +31,15 @@ from . import (
     bench_fit,
     bench_isolation,
     bench_link,
+    bench_live,
     bench_onset,
     bench_properties,
     bench_reality,
     bench_self_test,
+    bench_silverbox,
     bench_statistics,
     bench_trials,
+    bench_two_mass,
     pages,
 )
 from .figure import Figure
@@ -46,12 +49,14 @@ RESULTS = Path("build/bench.json")
 BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "engine": bench_engine.figures,
     "link": bench_link.figures,
+    "live": bench_live.figures,
     "adapters": bench_adapters.figures,
     "detection": bench_detection.figures,
     "statistics": bench_statistics.figures,
     "isolation": bench_isolation.figures,
     "fit": bench_fit.figures,
     "trials": bench_trials.figures,
+    "two-mass": bench_two_mass.figures,
     "certificates": bench_certificates.figures,
     "calibration": bench_calibration.figures,
     "campaign": bench_campaign.figures,
@@ -60,9 +65,10 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "properties": bench_properties.figures,
     "detectors": bench_detectors.figures,
     "reality": bench_reality.figures_of,
+    "silverbox": bench_silverbox.figures,
 }
 
-OPTIONED = {"campaign", "reality", "statistics"}
+OPTIONED = {"campaign", "live", "reality", "statistics"}
 """Benchmarks that take options."""
 
 

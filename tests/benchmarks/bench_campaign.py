@@ -53,7 +53,7 @@ trials = {trials}
 name = "{name}"
 [grid]
 stiffness_factor = [0.7, 0.8, 0.9, 0.95, 0.98]
-damping_n_s_per_m = [2500.0, 2750.0, 3021.0, 3200.0, 3400.0]
+B = [2500.0, 2750.0, 3021.0, 3200.0, 3400.0]
 """
 
 WORKER_TASKS, WORKER_TRIALS = 8, 500

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analogrig.plant import PARAMETERS
+from tests.harness.plants import PROGRAM
 from tests.thesis.detection import detect
 
 from .figure import Figure
@@ -33,7 +33,9 @@ def figures(first_seed: int = DEFAULT_SEEDS[0], end_seed: int = DEFAULT_SEEDS[1]
         for what, ratio, error in zip(CHANGES, detection.ratios(), detection.ratio_errors(), strict=True):
             bounds = (float(ratio - 2 * error), float(ratio + 2 * error))
             yield Figure(f"{name}: mean latency, {what}", float(ratio), "mean bounds", bounds=bounds)
-        for parameter, error in zip(PARAMETERS, np.sqrt(np.nanmean(detection.errors**2, axis=(0, 1))), strict=True):
+        for parameter, error in zip(
+            PROGRAM.estimates, np.sqrt(np.nanmean(detection.errors**2, axis=(0, 1))), strict=True
+        ):
             yield Figure(f"{name}: rms error of {parameter} at the end of a stretch", 100.0 * float(error), "%")
 
 

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Samples
 from analogrig.bench import Bench, direct_bench
-from analogrig.judging.information import change_information, first_at_level
+from analogrig.judging.courses import first_at_level
+from analogrig.judging.information import change_information
 from analogrig.judging.statistics import lower_rate, upper_rate
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
@@ -226,7 +227,7 @@ def _play_change(bench: Bench, what: str, trial: int, effort: Effort) -> _Trial:
     """Play one change; the instants spread over a period of the excitation."""
     instant = FIRST_CHANGE_N + trial * 37 % INSTANTS_N
     plant = changed_plant(what, SIGNS[trial % len(SIGNS)])
-    change = PotChange(instant, plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m)
+    change = PotChange(instant, plant.parameters())
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=instant + AFTER_N, tweaks=(change,))
     seed = CHANGE_SEED + 1000 * list(CHANGES).index(what) + trial
     run = _sound(bench.play(scenario, seed))

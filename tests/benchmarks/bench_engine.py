@@ -56,10 +56,10 @@ from . import gnucap
 from .figure import Figure
 
 THESIS_TWEAKS: tuple[PotTurn, ...] = (
-    PotTurn(200, {"K_n_per_m": 18000.0}),
-    PotTurn(400, {"B_n_s_per_m": 3453.0}),
-    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotTurn(600, {"M_kg": 30.0}),
+    PotTurn(200, {"K": 18000.0}),
+    PotTurn(400, {"B": 3453.0}),
+    PotTurn(500, {"B": 2123.0, "K": 20000.0}),
+    PotTurn(600, {"M": 30.0}),
 )
 
 REPEATS = 5
@@ -157,7 +157,7 @@ def digitise(card: Card, samples: int, *, noisy: bool) -> None:
 def turn(computer: SuspensionComputer, count: int) -> None:
     next(computer.play(Excitation(), 100))
     for i in range(count):
-        computer.set(M_kg=100.0 + i)
+        computer.set(M=100.0 + i)
 
 
 def streams() -> Iterator[tuple[str, Excitation]]:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.estimator_config import DEFAULT_ARL0
-from analogrig.judging.information import first_at_level
+from analogrig.judging.courses import first_at_level
 
 from . import silverbox
 from .conditions import CONDITIONS, Condition

@@ -12,7 +12,7 @@ import numpy as np
 from analogrig.hardware.self_test import self_test
 from analogrig.judging.statistics import upper_rate
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from analogrig.run import CHANNELS
+from analogrig_emulator import CHANNELS
 
 from .figure import Figure
 

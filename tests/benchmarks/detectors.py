@@ -17,9 +17,10 @@ from analogrig.estimator_config import EstimatorConfig, TriggerName
 from analogrig.plant import Plant
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
-from analogrig.scenario import PLANTS, Scenario
+from analogrig.scenario import Scenario
+from tests.harness.plants import front
 
-PLANT = PLANTS["front"]
+PLANT = front()
 
 CHANGES: Mapping[str, Mapping[str, float]] = {
     "K": {"K": 0.2},

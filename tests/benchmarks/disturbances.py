@@ -106,7 +106,7 @@ def warming(part: float, within_n: int = 10_000, step_n: int = 100) -> Wander:
     """Stiffness that turns by this part of it within so many samples, in small steps, as with a warming machine."""
 
     def wander(samples: int) -> Sequence[PotTurn]:
-        stiffness = PROGRAMS["front"].values["K_n_per_m"]
-        return [PotTurn(k, {"K_n_per_m": stiffness * (1.0 + part * k / within_n)}) for k in range(0, samples, step_n)]
+        stiffness = PROGRAMS["front"].values["K"]
+        return [PotTurn(k, {"K": stiffness * (1.0 + part * k / within_n)}) for k in range(0, samples, step_n)]
 
     return wander

@@ -27,7 +27,6 @@ from .played import (
     CARD,
     DISPLACEMENT,
     FORCE,
-    PARAMETERS,
     Array,
     Change,
     Played,
@@ -99,7 +98,8 @@ class Emulated:
             sample_rate_hz=card.true_rate_hz * probes_per_sample(card),
         )
         if change is not None:
-            setting, value = list(machine.program.values.items())[PARAMETERS.index(change.parameter)]
+            values = machine.program.values.items()  # of the sprung mass first: M2 for M
+            setting, value = next((name, value) for name, value in values if name.startswith(change.parameter))
             turns = [*turns, PotTurn(change.sample, {setting: value * change.factor})]
         excitation = self.draw(Stream.EXCITATION.generator(seed), samples)
         jitter = Stream.APERTURE.generator(seed)

@@ -44,7 +44,7 @@ class KnownPlantsGlr:
         level: of the statistic that raises an alarm. window_n: number of instants among the hypotheses.
         """
         plants = [PLANT, *(changed_plant(what, sign) for what in CHANGES for sign in SIGNS)]
-        sampled = discretise(np.array([tuple(each.parameters().values()) for each in plants]), period_s)
+        sampled = discretise(PLANT.program, np.array([each.values for each in plants]), period_s)
         self._transitions = sampled[:, :, :2]
         self._responses = sampled[:, :, 2] * (n_per_code / m_per_code)
         variances = [each**2 + QUANTISATION_VARIANCE_LSB2 for each in (force_noise_codes, displacement_noise_codes)]

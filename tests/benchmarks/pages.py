@@ -6,19 +6,29 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from . import bench_campaign, bench_certificates, bench_detectors, bench_reality
+from . import (
+    bench_campaign,
+    bench_certificates,
+    bench_detectors,
+    bench_live,
+    bench_reality,
+    bench_silverbox,
+    bench_two_mass,
+)
 
 FOLDER = Path("harness/docs/evidence")
 
 TITLES: Mapping[str, str] = {
     "engine": "Speed of the engine, beside ngspice",
     "link": "Speed of the links",
+    "live": "The live bench in real time, and under hostile clients",
     "adapters": "Speed of the adapters",
     "detection": "Detection on the thesis's profile",
     "statistics": "Detection delay and false alarms of simulated plants",
     "isolation": "Isolation",
     "fit": "Watch of the fit",
     "trials": "Closed-loop trials and certificates",
+    "two-mass": "Two-mass quarter car",
     "certificates": "Error probabilities of certificates",
     "calibration": "Calibration of drawn rigs",
     "campaign": "Campaigns of many trials",
@@ -27,17 +37,21 @@ TITLES: Mapping[str, str] = {
     "properties": "False failures of the shipped properties",
     "detectors": "Detectors at the same measured ARL0",
     "reality": "The shipped device under the conditions that users meet",
+    "silverbox": "Twin of the Silverbox",
 }
 """Page titles by the name of the benchmark."""
 
-CROSSED = {"certificates", "detectors", "reality"}
+CROSSED = {"certificates", "detectors", "reality", "silverbox"}
 """Benchmarks whose figures are named ROW: COLUMN, and whose page is a table of these."""
 
 NOTES: Mapping[str, str] = {
     "campaign": bench_campaign.NOTE,
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
+    "live": bench_live.NOTE,
     "reality": bench_reality.NOTE,
+    "silverbox": bench_silverbox.NOTE,
+    "two-mass": bench_two_mass.NOTE,
 }
 """Paragraphs below the tables."""
 

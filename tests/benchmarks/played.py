@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.run import CHANNELS
-from analogrig_emulator import Card
+from analogrig_emulator import CHANNELS, Card
 
 Array = NDArray[np.float64]
 
@@ -31,7 +30,7 @@ class Change(NamedTuple):
     """Change of one parameter; the next sample is the first one affected."""
 
     parameter: str
-    """``M``, ``B`` or ``K``."""
+    """Name of its pot: ``M``, ``B`` or ``K``."""
     factor: float
     sample: int
 

@@ -35,7 +35,12 @@ class Misfit:
 
 def shipped() -> DirectDevice:
     """Device with its default settings."""
-    device = InprocDevice(name="shipped").direct(alarms_only=True)
+    return direct(InprocDevice(name="shipped"))
+
+
+def direct(description: InprocDevice) -> DirectDevice:
+    """Device without its line, prepared for the card."""
+    device = description.direct(alarms_only=True)
     assert isinstance(device, DirectDevice)
     _prepare(device)
     return device
@@ -43,7 +48,7 @@ def shipped() -> DirectDevice:
 
 def _prepare(device: Device) -> None:
     low_v, lsb_v = CARD.ranges_v[FORCE][0], float(CARD.lsb_v[FORCE])
-    device.prepare({"force": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
+    device.prepare({"u": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
 
 
 def settling_n(device: DirectDevice) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +15,15 @@ from typing import Self
 
 import numpy as np
 
+from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
+from analogrig.run import Run
+from tests import tools
+
 from .figure import Figure
 from .played import Array, Played
 from .shipped import answers_to, reported_misfits, settling_n, shipped
 
-FOLDER_SETTING, FOLDER, FILE = "ANALOGRIG_SILVERBOX", "../shared/data/silverbox", "SNLS80mV.csv"
-"""Environment variable, its default, and the file in that folder."""
+FOLDER_SETTING, FILE = tools.SILVERBOX_SETTING, tools.SILVERBOX_NAME
 
 ROW = "silverbox"
 
@@ -49,6 +51,23 @@ FACTORS = (1.2, 0.8)
 AT_REST = np.zeros(2)
 
 
+def find_file() -> Path:
+    """File of the record.
+
+    :raises FileNotFoundError: it is absent; the message names the setting.
+    """
+    path = tools.silverbox_file()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is absent: set {FOLDER_SETTING} to the folder of {FILE}")
+    return path
+
+
+def import_record(samples: int | None = None) -> Run:
+    """Record as ``analogrig import`` makes it, or its first samples; errors as find_file."""
+    described = ImportDescription(ImportedColumn("V1"), ImportedColumn("V2"), RATE_HZ, samples=samples)
+    return import_columns(find_file(), described, None)
+
+
 @dataclass(frozen=True, eq=False)
 class Record:
     """Volts of input and output, (n,) each."""
@@ -59,10 +78,7 @@ class Record:
     @classmethod
     def load(cls) -> Self:
         """:raises FileNotFoundError: the folder lacks the file; the message names the setting."""
-        path = Path(os.environ.get(FOLDER_SETTING, FOLDER)) / FILE
-        if not path.is_file():
-            raise FileNotFoundError(f"{path} is absent: set {FOLDER_SETTING} to the folder of {FILE}")
-        input_v, output_v = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1)).T
+        input_v, output_v = np.loadtxt(find_file(), delimiter=",", skiprows=1, usecols=(0, 1)).T
         return cls(input_v, output_v)
 
     def played(self, end: int | None = None) -> Played:

@@ -69,7 +69,7 @@ def test_at_rest_on_the_stop_both_springs_carry_the_force() -> None:
 def test_every_amplifier_agrees_with_ngspice_at_every_sample(ngspice: NgSpice) -> None:
     computer = SuspensionComputer("bump-stop", rng=np.random.default_rng(3), offset_v=3e-3)
     excitation = Excitation(low_v=-3.0, clock="free", phase=0.637)
-    deck = deck_of(computer, excitation, 300, **computer.dials_for(K_n_per_m=18000.0))
+    deck = deck_of(computer, excitation, 300, **computer.dials_for(K=18000.0))
     outputs = [amp.out for amp in deck.circuit.of(OpAmp)]
     reference = ngspice(deck.text(outputs), outputs, 300)
     error = np.abs(deck.volts(outputs) - reference)

@@ -89,7 +89,7 @@ def test_the_shock_absorbers_changes_are_those_of_the_study(name: str) -> None:
 
 def volts_of(components: Components) -> NDArray[np.float64]:
     machine = SuspensionComputer("front", opamp="ideal", components=components)
-    return np.concatenate(list(machine.play(Excitation(), 250, [PotTurn(100, {"K_n_per_m": 18000.0}, 40)])))
+    return np.concatenate(list(machine.play(Excitation(), 250, [PotTurn(100, {"K": 18000.0}, 40)])))
 
 
 AGEING = replace(REAL, resistors=replace(REAL.resistors, ageing=2e-3))

@@ -36,11 +36,11 @@ from analogrig_emulator.engine import engine as engine_module
 Volts = NDArray[np.float64]
 
 JUMPS = [
-    PotTurn(0, {"M_kg": 80.0}),
-    PotTurn(30, {"K_n_per_m": 18000.0}),
-    PotTurn(30, {"B_n_s_per_m": 3453.0}),
-    PotTurn(63, {"K_n_per_m": 24500.0}),
-    PotTurn(99, {"M_kg": 30.0}),
+    PotTurn(0, {"M": 80.0}),
+    PotTurn(30, {"K": 18000.0}),
+    PotTurn(30, {"B": 3453.0}),
+    PotTurn(63, {"K": 24500.0}),
+    PotTurn(99, {"M": 30.0}),
 ]
 LOUD = Excitation(low_v=-9.0, high_v=9.0, clock="free", phase=0.3, frequency_hz=900.0)
 
@@ -65,11 +65,11 @@ def turned_by_hand() -> Volts:
 def test_jumps_played_at_once_are_those_of_an_operator(block: int) -> None:
     computer = SuspensionComputer("front")
     assert played(computer, JUMPS, block).tobytes() == turned_by_hand().tobytes()
-    assert computer.dials == computer.dials_for(M_kg=30.0) | computer.dials_for(K_n_per_m=24500.0, B_n_s_per_m=3453.0)
+    assert computer.dials == computer.dials_for(M=30.0) | computer.dials_for(K=24500.0, B=3453.0)
 
 
 def test_a_ramp_before_a_jump_is_still_a_ramp() -> None:
-    changes = [PotTurn(10, {"K_n_per_m": 18000.0}, 20), PotTurn(15, {"M_kg": 60.0}), PotTurn(50, {"M_kg": 90.0})]
+    changes = [PotTurn(10, {"K": 18000.0}, 20), PotTurn(15, {"M": 60.0}), PotTurn(50, {"M": 90.0})]
     whole, apart = (played(SuspensionComputer("front"), changes, block) for block in (100, 1))
     assert whole.tobytes() == apart.tobytes()
     assert not np.array_equal(whole, played(SuspensionComputer("front"), changes[1:]))
@@ -78,10 +78,10 @@ def test_a_ramp_before_a_jump_is_still_a_ramp() -> None:
 def test_equal_machines_share_nothing_that_changes() -> None:
     one, other = SuspensionComputer("front"), SuspensionComputer("front")
     untouched = played(other)
-    one.set(M_kg=60.0)
+    one.set(M=60.0)
     one.machine.set_initial({"U3": 4.0})
     played(one, JUMPS)
-    assert other.program.values["M_kg"] == 115.0
+    assert other.program.values["M"] == 115.0
     assert played(other).tobytes() == untouched.tobytes()
     assert played(SuspensionComputer("front")).tobytes() == untouched.tobytes()
 

@@ -26,7 +26,7 @@ FINER = 64
 AHEAD_TICKS = TICKS_PER_SAMPLE // FINER
 SQUARE, FREE = Excitation(), Excitation(clock="free", phase=0.137, drift_ppm=20.0)
 PRBS = Excitation(shape="prbs", frequency_hz=10e3)
-CHANGES = (PotTurn(60, {"K_n_per_m": 18000.0}), PotTurn(99, {"M_kg": 30.0}, 20))
+CHANGES = (PotTurn(60, {"K": 18000.0}), PotTurn(99, {"M": 30.0}, 20))
 LSB_V = 10.0 / 4096
 
 

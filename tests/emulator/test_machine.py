@@ -469,7 +469,7 @@ def test_hold_droops_by_the_bias_current_of_the_amplifier() -> None:
 def test_pot_set_sets_coefficients_under_load() -> None:
     computer = SuspensionComputer("front", rng=np.random.default_rng(1))
     computer.machine.switch(POT_SET)
-    wanted = computer.dials_for(M_kg=30.0, B_n_s_per_m=3453.0, K_n_per_m=18000.0)
+    wanted = computer.dials_for(M=30.0, B=3453.0, K=18000.0)
     for pot, coefficient in (("M", 0.980), ("B", 0.77987), ("K", 0.60980)):
         computer.machine.set_coefficient(pot, coefficient)
         assert computer.machine.coefficient(pot) == pytest.approx(coefficient, abs=1e-9)

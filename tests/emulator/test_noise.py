@@ -97,7 +97,7 @@ def test_the_displacements_noise_is_that_of_its_covariance() -> None:
 
 
 def test_noise_adds_to_what_is_played_and_follows_its_pots() -> None:
-    tweaks = [PotTurn(30, {"K_n_per_m": 18000.0}), PotTurn(90, {"M_kg": 30.0})]
+    tweaks = [PotTurn(30, {"K": 18000.0}), PotTurn(90, {"M": 30.0})]
 
     def played(block_samples: int, seed: int = 1) -> np.ndarray:
         machine = NoisySuspension(SuspensionComputer("front"), np.random.default_rng(seed), op_amps=TL07X)

@@ -41,13 +41,13 @@ def test_nothing_overloads_at_the_programs_own_values(program: str) -> None:
         ("front", {"step_v": 13.5}, {"step_v": 16.0}, ("U1",)),
         ("shock", {"step_v": 16.0}, {"step_v": 20.0}, ("U2", "U4")),
         ("two-mass", {"step_v": 13.0}, {"step_v": 14.0}, ("U1",)),
-        ("front", {"K_n_per_m": 9.8e3}, {"K_n_per_m": 8.6e3}, ("U3",)),
-        ("shock", {"K_n_per_m": 6e3}, {"K_n_per_m": 4.9e3}, ("U3",)),
-        ("two-mass", {"K2_n_per_m": 12e3}, {"K2_n_per_m": 9.8e3}, ("U11",)),
-        ("shock", {"B_n_s_per_m": 540.0}, {"B_n_s_per_m": 450.0}, ("U2", "U4")),
-        ("front", {"B_n_s_per_m": 150.0}, QUIET, ()),
-        ("front", {"M_kg": 29.5}, QUIET, ()),
-        ("shock", {"M_kg": 1.5}, QUIET, ()),
+        ("front", {"K": 9.8e3}, {"K": 8.6e3}, ("U3",)),
+        ("shock", {"K": 6e3}, {"K": 4.9e3}, ("U3",)),
+        ("two-mass", {"K2": 12e3}, {"K2": 9.8e3}, ("U11",)),
+        ("shock", {"B": 540.0}, {"B": 450.0}, ("U2", "U4")),
+        ("front", {"B": 150.0}, QUIET, ()),
+        ("front", {"M": 29.5}, QUIET, ()),
+        ("shock", {"M": 1.5}, QUIET, ()),
     ],
     ids=str,
 )
@@ -64,7 +64,7 @@ def test_741s_slew_so_long_at_an_edge_that_the_summers_lamp_lights(program: str)
 def test_stiffness_back_as_the_force_falls_clamps_the_summer_too_shortly_for_its_lamp() -> None:
     """K x = 24500 N/m times 0.163 m are 13.6 V; at 1 MHz the swing of 13.5 V shows, less what Rout takes."""
     computer = SuspensionComputer("front", sample_rate_hz=1e6)
-    tweaks = [PotTurn(20, {"K_n_per_m": 18000.0}), PotTurn(7500, {"K_n_per_m": 24500.0})]
+    tweaks = [PotTurn(20, {"K": 18000.0}), PotTurn(7500, {"K": 24500.0})]
     volts = np.concatenate(list(computer.play(Excitation(frequency_hz=20e3 / 300), 7600, tweaks)))
     assert volts[7499, 1] * 24500.0 * 0.01996 / 294.0 == pytest.approx(13.6, abs=0.05)
     clamped = np.flatnonzero(volts[:, 3] < -13.34)
@@ -75,8 +75,8 @@ def test_stiffness_back_as_the_force_falls_clamps_the_summer_too_shortly_for_its
 @pytest.mark.parametrize(
     ("program", "limits"),
     [
-        ("front", {"M_kg": (29.5, 29.3), "B_n_s_per_m": (4427.0, 4429.0), "K_n_per_m": (29517.0, 29519.0)}),
-        ("shock", {"M_kg": (1.48, 1.46), "B_n_s_per_m": (2213.0, 2214.5), "K_n_per_m": (14758.0, 14760.0)}),
+        ("front", {"M": (29.5, 29.3), "B": (4427.0, 4429.0), "K": (29517.0, 29519.0)}),
+        ("shock", {"M": (1.48, 1.46), "B": (2213.0, 2214.5), "K": (14758.0, 14760.0)}),
     ],
 )
 def test_the_ends_of_the_pots(program: str, limits: dict[str, tuple[float, float]]) -> None:

@@ -34,7 +34,7 @@ Volts = NDArray[np.float64]
 LSB_V = 10.0 / 4096
 PERIOD_S = 50e-6
 BUSY = Excitation(low_v=1.0, high_v=9.0)
-K_RAMP: PotTurn = PotTurn(120, {"K_n_per_m": 18000.0}, 80)
+K_RAMP: PotTurn = PotTurn(120, {"K": 18000.0}, 80)
 
 
 def played(computer: SuspensionComputer, samples: int, tweaks: Sequence[PotTurn] = (), block: int = 4096) -> Volts:
@@ -75,7 +75,7 @@ def by_equation(goal_dials: dict[str, float], sample: int, ramp_n: int, samples:
 
 @pytest.mark.parametrize(
     ("settings", "ramp_n"),
-    [({"K_n_per_m": 18000.0}, 80), ({"M_kg": 60.0}, 37), ({"B_n_s_per_m": 2123.0, "M_kg": 90.0}, 3)],
+    [({"K": 18000.0}, 80), ({"M": 60.0}, 37), ({"B": 2123.0, "M": 90.0}, 3)],
     ids=str,
 )
 def test_a_turning_pot_is_an_equation_with_moving_coefficients(settings: dict[str, float], ramp_n: int) -> None:
@@ -92,21 +92,21 @@ def test_a_ramp_begins_at_its_sample_and_ends_with_the_pot_at_its_goal() -> None
     ramped = played(computer, 400, [K_RAMP])
     assert np.array_equal(ramped[:121], still[:121])
     assert not np.array_equal(ramped[121:125], still[121:125])
-    assert computer.dials == SuspensionComputer("front").dials | computer.dials_for(K_n_per_m=18000.0)
+    assert computer.dials == SuspensionComputer("front").dials | computer.dials_for(K=18000.0)
 
 
 def test_a_ramp_of_no_length_is_a_jump_and_one_to_the_same_value_is_nothing() -> None:
-    jumped = played(SuspensionComputer("front"), 300, [PotTurn(120, {"K_n_per_m": 18000.0}, 0)])
-    plain = np.concatenate(list(SuspensionComputer("front").play(BUSY, 300, [PotTurn(120, {"K_n_per_m": 18000.0})])))
+    jumped = played(SuspensionComputer("front"), 300, [PotTurn(120, {"K": 18000.0}, 0)])
+    plain = np.concatenate(list(SuspensionComputer("front").play(BUSY, 300, [PotTurn(120, {"K": 18000.0})])))
     assert np.array_equal(jumped, plain)
-    same = played(SuspensionComputer("front"), 300, [PotTurn(120, {"K_n_per_m": 24500.0}, 50)])
+    same = played(SuspensionComputer("front"), 300, [PotTurn(120, {"K": 24500.0}, 50)])
     assert np.array_equal(same, played(SuspensionComputer("front"), 300))
 
 
 @pytest.mark.parametrize("block", [1, 7, 150])
 def test_the_size_of_the_blocks_changes_no_bit_of_ramps_that_overlap(block: int) -> None:
     built = Components(pots=PotGrade(windings=1000, wiper_noise_ohm=100.0))
-    ramps: list[PotTurn] = [K_RAMP, PotTurn(150, {"M_kg": 60.0}, 100), PotTurn(180, {"K_n_per_m": 22000.0}, 0)]
+    ramps: list[PotTurn] = [K_RAMP, PotTurn(150, {"M": 60.0}, 100), PotTurn(180, {"K": 22000.0}, 0)]
     whole = played(SuspensionComputer("front", components=built), 300, ramps)
     assert np.array_equal(played(SuspensionComputer("front", components=built), 300, ramps, block), whole)
 

@@ -47,7 +47,7 @@ def test_the_readme_plays_and_samples_its_changes() -> None:
     assert names["codes"].dtype == np.uint16
     volts = names["card"].volts(names["codes"])[:600, 1]
     np.testing.assert_allclose(volts, displacement_m(600) / 0.1996 * 10.0, rtol=0, atol=10 * 12.0 / 4096)
-    coefficient = names["computer"].program.coefficient("M_kg", 30.0)
+    coefficient = names["computer"].program.coefficient("M", 30.0)
     assert names["computer"].coefficients["M"] == pytest.approx(coefficient)
 
 

@@ -24,9 +24,9 @@ from analogrig_emulator.circuit.opamp import PRESETS
 
 OFFSET_V, SAMPLES = 3e-3, 400
 JUMPS = [
-    PotTurn(150, {"K_n_per_m": 18000.0}),
-    PotTurn(151, {"B_n_s_per_m": 3453.0}),
-    PotTurn(SAMPLES - 1, {"K_n_per_m": 24500.0}),
+    PotTurn(150, {"K": 18000.0}),
+    PotTurn(151, {"B": 3453.0}),
+    PotTurn(SAMPLES - 1, {"K": 24500.0}),
 ]
 FULL = Excitation(low_v=0.1, high_v=9.9)
 NO_SLEW = replace(preset("tl07x"), slew_v_per_s=float("inf"))
@@ -56,9 +56,9 @@ def test_every_repeat_is_the_play_of_a_machine_of_its_own(model: OpAmpModel, pro
 
 
 def test_lamp_of_an_overload_is_lit_in_its_own_repeat_alone() -> None:
-    heavy = [PotTurn(100, {"K_n_per_m": 9000.0})]
+    heavy = [PotTurn(100, {"K": 9000.0})]
     computer = fresh(preset("tl07x"), "front", 0)
-    computer.set(K_n_per_m=18000.0)
+    computer.set(K=18000.0)
     repeated = RepeatedPlay(computer, SAMPLES, heavy)
     loud, quiet = replace(FULL, low_v=-40.0, high_v=40.0), replace(FULL, high_v=1.0)
     zero_v = np.zeros(computer.program.amplifiers)
@@ -68,7 +68,7 @@ def test_lamp_of_an_overload_is_lit_in_its_own_repeat_alone() -> None:
 
 def test_tweak_beyond_the_play_is_refused() -> None:
     with pytest.raises(PotError, match="at sample 400"):
-        RepeatedPlay(fresh(preset("tl07x"), "front", 0), SAMPLES, [PotTurn(SAMPLES, {"K_n_per_m": 18000.0})])
+        RepeatedPlay(fresh(preset("tl07x"), "front", 0), SAMPLES, [PotTurn(SAMPLES, {"K": 18000.0})])
 
 
 def test_play_that_fails_does_not_spoil_the_next() -> None:
@@ -84,7 +84,7 @@ def test_play_that_fails_does_not_spoil_the_next() -> None:
 def test_ramps_and_amplifiers_without_a_pole_are_not_repeatable() -> None:
     computer = fresh(preset("tl07x"), "front", 0)
     assert is_repeatable(computer, JUMPS)
-    assert not is_repeatable(computer, [PotTurn(10, {"K_n_per_m": 18000.0}, 5)])
+    assert not is_repeatable(computer, [PotTurn(10, {"K": 18000.0}, 5)])
     assert not is_repeatable(SuspensionComputer("front", opamp="ideal"), [])
     with pytest.raises(CircuitError, match="without a pole"):
         RepeatedPlay(SuspensionComputer("front", opamp="ideal"), SAMPLES)

@@ -93,7 +93,7 @@ def test_skewed_displacement_is_that_of_a_machine_sampled_faster(skew_us: float)
     count = round(50.0 / skew_us)
     card = Card(skew_s=(0.0, skew_us * 1e-6, 0.0, 0.0))
     assert probes_per_sample(card) == count
-    excitation, tweak = Excitation(clock="free", phase=0.3), {"K_n_per_m": 18000.0}
+    excitation, tweak = Excitation(clock="free", phase=0.3), {"K": 18000.0}
     machine = SuspensionComputer("front", sample_rate_hz=20e3 * count)
     rng = np.random.default_rng(1)
     volts = np.concatenate(list(acquired(machine, card, excitation, 150, [PotTurn(60, tweak)], rng=rng)))

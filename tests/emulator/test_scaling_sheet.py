@@ -40,11 +40,9 @@ def test_dials_of_the_sheet_are_those_of_the_machine() -> None:
 def test_drawing_shows_every_element_and_pot(stem: str) -> None:
     program = load_program(FOLDER / f"{stem}.toml")
     drawing = ET.fromstring(patch_drawing(program))  # noqa: S314 - our own
-    texts = " ".join(text.text or "" for text in drawing.iter(f"{SVG}text"))
-    for name in (*(element.name for element in program.patch), *program.inverters.values()):
-        assert f"{name}, " in texts
-    assert len(list(drawing.iter(f"{SVG}circle"))) == len(program.pots)
-    assert all(pot in texts for pot in program.pots)
+    words = " ".join(text.text or "" for text in drawing.iter(f"{SVG}text")).split()
+    names = (*(element.name for element in program.patch), *program.inverters.values(), *program.pots)
+    assert set(names) <= set(words)
 
 
 def test_sheet_and_drawing_depend_on_the_file_alone() -> None:

@@ -31,10 +31,10 @@ Volts = NDArray[np.float64]
 LSB_V = 10.0 / 4096
 SAMPLE_RATE_HZ = 20e3
 THESIS_TWEAKS = (
-    PotTurn(200, {"K_n_per_m": 18000.0}),
-    PotTurn(400, {"B_n_s_per_m": 3453.0}),
-    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotTurn(600, {"M_kg": 30.0}),
+    PotTurn(200, {"K": 18000.0}),
+    PotTurn(400, {"B": 3453.0}),
+    PotTurn(500, {"B": 2123.0, "K": 20000.0}),
+    PotTurn(600, {"M": 30.0}),
 )
 AMPLIFIERS = ("u1", "u2", "u3", "u4", "u5")
 

@@ -21,7 +21,7 @@ from analogrig_emulator import (
     OpAmpModel,
     PotError,
     PotTurn,
-    Program,
+    ProgramCircuit,
     SuspensionComputer,
 )
 
@@ -29,10 +29,10 @@ Volts = NDArray[np.float64]
 
 LSB_V = 10.0 / 4096
 THESIS_TWEAKS: tuple[PotTurn, ...] = (
-    PotTurn(200, {"K_n_per_m": 18000.0}),
-    PotTurn(400, {"B_n_s_per_m": 3453.0}),
-    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotTurn(600, {"M_kg": 30.0}),
+    PotTurn(200, {"K": 18000.0}),
+    PotTurn(400, {"B": 3453.0}),
+    PotTurn(500, {"B": 2123.0, "K": 20000.0}),
+    PotTurn(600, {"M": 30.0}),
 )
 
 
@@ -42,7 +42,7 @@ def played(
     return np.concatenate(list(computer.play(excitation or Excitation(), samples, tweaks)))
 
 
-def plant(program: Program, force_n: Volts, tweaks: Sequence[PotTurn] = ()) -> Volts:
+def plant(program: ProgramCircuit, force_n: Volts, tweaks: Sequence[PotTurn] = ()) -> Volts:
     """M x'' + B x' + K x = F with F held between samples, exactly, by scipy: x in m, v in m/s, (samples, 2)."""
     values = program.values
     turns = {change.sample: change.values for change in tweaks}
@@ -51,7 +51,7 @@ def plant(program: Program, force_n: Volts, tweaks: Sequence[PotTurn] = ()) -> V
     for k, force in enumerate(force_n):
         rows.append(x)
         values = {**values, **turns.get(k, {})}
-        mass, damping, stiffness = values["M_kg"], values["B_n_s_per_m"], values["K_n_per_m"]
+        mass, damping, stiffness = values["M"], values["B"], values["K"]
         a = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
         b = np.array([[0.0], [1.0 / mass]])
         step, drive, *_ = scipy.signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), 200 * 50e-6)
@@ -128,14 +128,14 @@ def test_all_programs_move_as_far_for_10_v(program: str) -> None:
 def test_a_tweak_at_k_shows_first_at_the_next_sample() -> None:
     computer = SuspensionComputer("front")
     plain = played(computer, 300)
-    tweaked = played(computer, 300, [PotTurn(130, {"K_n_per_m": 18000.0})])
+    tweaked = played(computer, 300, [PotTurn(130, {"K": 18000.0})])
     assert np.array_equal(tweaked[:131], plain[:131])
     assert abs(tweaked[131, 3] - plain[131, 3]) > 1.0
 
 
 def test_a_tweak_to_the_same_value_changes_no_bit() -> None:
     plain = played(SuspensionComputer("front"), 300)
-    same = played(SuspensionComputer("front"), 300, [PotTurn(123, {"M_kg": FRONT.M_kg, "K_n_per_m": FRONT.K_n_per_m})])
+    same = played(SuspensionComputer("front"), 300, [PotTurn(123, {"M": FRONT.M_kg, "K": FRONT.K_n_per_m})])
     assert np.array_equal(plain, same)
 
 
@@ -149,13 +149,13 @@ def test_the_size_of_the_blocks_changes_no_bit(block_samples: int) -> None:
 
 
 def test_setting_a_pot_between_blocks_is_a_tweak() -> None:
-    tweaked = played(SuspensionComputer("front"), 300, [PotTurn(199, {"M_kg": 30.0})])
+    tweaked = played(SuspensionComputer("front"), 300, [PotTurn(199, {"M": 30.0})])
     computer = SuspensionComputer("front")
     blocks = []
     for block in computer.play(Excitation(), 300, block_samples=100):
         blocks.append(block)
         if len(blocks) == 2:
-            computer.set(M_kg=30.0)
+            computer.set(M=30.0)
     assert np.array_equal(np.concatenate(blocks), tweaked)
 
 
@@ -163,8 +163,8 @@ def test_every_play_starts_from_rest_with_the_pots_where_they_were_left() -> Non
     computer = SuspensionComputer("front")
     first = played(computer, 100)
     assert np.array_equal(played(computer, 100), first)
-    played(computer, 100, [PotTurn(50, {"M_kg": 60.0})])
-    assert np.array_equal(played(computer, 100), played(_set(SuspensionComputer("front"), M_kg=60.0), 100))
+    played(computer, 100, [PotTurn(50, {"M": 60.0})])
+    assert np.array_equal(played(computer, 100), played(_set(SuspensionComputer("front"), M=60.0), 100))
 
 
 def _set(computer: SuspensionComputer, **settings: float) -> SuspensionComputer:
@@ -186,7 +186,7 @@ def test_a_dial_is_set_as_it_stands_and_a_coefficient_under_load() -> None:
     computer.set(K_dial=0.5)
     # 10 k in the middle, loaded by 49.9 k: 5 k against 5 k parallel to 49.9 k.
     assert computer.coefficients["K"] == pytest.approx(1 / (1 + 5e3 * (1 / 5e3 + 1 / 49.9e3)))
-    assert computer.dials_for(M_kg=30.0) == pytest.approx({"M": 0.9818}, abs=1e-4)
+    assert computer.dials_for(M=30.0) == pytest.approx({"M": 0.9818}, abs=1e-4)
     assert computer.circuit.with_dials({}) == computer.circuit
 
 
@@ -211,18 +211,18 @@ def test_parts_off_their_nominal_values_move_the_plant_and_not_the_pots() -> Non
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"M_kg": 29.0}, r"pot M: coefficient 1.01379 is beyond the track .*M_kg = 29 cannot be set on program front"),
-        ({"K_n_per_m": -1.0}, "pot K: K_n_per_m must be positive"),
+        ({"M": 29.0}, r"pot M: coefficient 1.01379 is beyond the track .*M = 29 cannot be set on program front"),
+        ({"K": -1.0}, "pot K: K must be positive"),
         ({"B_dial": 1.5}, "pot B: dial 1.5 is beyond the track"),
-        ({"M_kg": 50.0, "M_dial": 0.5}, "pot M: set twice"),
-        ({"mass": 50.0}, "unknown setting 'mass'; there are M_kg"),
+        ({"M": 50.0, "M_dial": 0.5}, "pot M: set twice"),
+        ({"mass": 50.0}, "unknown setting 'mass'; there are M,"),
     ],
 )
 def test_a_setting_that_cannot_be_is_refused_and_nothing_turns(settings: dict[str, float], message: str) -> None:
     computer = SuspensionComputer("front")
     before = computer.dials
     with pytest.raises(PotError, match=message):
-        computer.set(K_n_per_m=20000.0, **settings) if "K_n_per_m" not in settings else computer.set(**settings)
+        computer.set(K=20000.0, **settings) if "K" not in settings else computer.set(**settings)
     assert computer.dials == before
     with pytest.raises(PotError, match=message):
         computer.play(Excitation(), 100, [PotTurn(10, settings)])
@@ -230,13 +230,13 @@ def test_a_setting_that_cannot_be_is_refused_and_nothing_turns(settings: dict[st
 
 def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
     computer = SuspensionComputer("front")
-    with pytest.raises(PotError, match="change of M_kg at sample 100: the run has samples 0 to 99"):
-        computer.play(Excitation(), 100, [PotTurn(100, {"M_kg": 60.0})])
+    with pytest.raises(PotError, match="change of M at sample 100: the run has samples 0 to 99"):
+        computer.play(Excitation(), 100, [PotTurn(100, {"M": 60.0})])
     for sample in (5.0, 5.5, math.nan):
-        with pytest.raises(PotError, match="change of M_kg at sample .*: the run has samples 0 to 99"):
-            computer.play(Excitation(), 100, [PotTurn(sample, {"M_kg": 60.0})])  # type: ignore[arg-type]
-    with pytest.raises(PotError, match=r"pots M_kg: cannot turn in 2\.5 samples"):
-        computer.play(Excitation(), 100, [PotTurn(5, {"M_kg": 60.0}, 2.5)])  # type: ignore[arg-type]
+        with pytest.raises(PotError, match="change of M at sample .*: the run has samples 0 to 99"):
+            computer.play(Excitation(), 100, [PotTurn(sample, {"M": 60.0})])  # type: ignore[arg-type]
+    with pytest.raises(PotError, match=r"pots M: cannot turn in 2\.5 samples"):
+        computer.play(Excitation(), 100, [PotTurn(5, {"M": 60.0}, 2.5)])  # type: ignore[arg-type]
     with pytest.raises(ExcitationError, match="half the sample rate"):
         computer.play(Excitation(frequency_hz=15e3), 100)
     with pytest.raises(EngineError, match="-1 samples"):

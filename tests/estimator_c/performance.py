@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from analogrig.datasheet import ModelOrders
 from analogrig.judging.bursts import upper_count
-from analogrig.plant import physical_parameters
+from analogrig.plant import estimated_parameters
 from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, Estimator
 from tests.estimator_c.plants import (
     CODES,
@@ -22,6 +22,7 @@ from tests.estimator_c.plants import (
     cramer_rao,
     simulate,
 )
+from tests.harness.plants import PROGRAM
 
 Settings = Mapping[str, float | tuple[float, float]]
 
@@ -139,7 +140,7 @@ def accuracy(estimator: Estimator, settings: Settings, trials: int, samples: int
     _, theta = estimator.watch(played.u, played.y)
     model = ModelOrders(int(str(settings["na"])), int(str(settings["nb"])))
     n_per_code, m_per_code = FRONT.force_range_n / CODES, DISPLACEMENT_RANGE_M / CODES
-    found = physical_parameters(theta, model, n_per_code, m_per_code, PERIOD_S)
+    found = estimated_parameters(PROGRAM, theta, model, n_per_code, m_per_code, PERIOD_S)
     truth = np.array([FRONT.mass_kg, FRONT.damping_n_s_per_m, FRONT.stiffness_n_per_m])
     rms = np.sqrt(np.mean((found / truth - 1.0) ** 2, axis=0))
     return Accuracy(rms=rms, bounds=cramer_rao(FRONT, FULL, samples, seed=300, trials=trials))

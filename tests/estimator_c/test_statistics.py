@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 
-from analogrig.plant import Plant, SampledPlant
+from analogrig.plant import SampledPlant
 from tests.estimator_c import performance
 from tests.estimator_c.est_driver import Estimator
 from tests.estimator_c.performance import (
@@ -35,6 +35,7 @@ from tests.estimator_c.plants import (
     simulate,
 )
 from tests.estimator_c.test_est_trigger import suspension
+from tests.harness.plants import front
 
 SHARED = [(FULL, "K", 1.05), (FULL, "B", 0.95), (FULL, "M", 0.8), (QUARTER, "M", 1.1), (QUARTER, "K", 0.9)]
 FREE = [(FULL_FREE, "B", 0.95), (FULL_FREE, "M", 0.95), (QUARTER_FREE, "M", 1.1)]
@@ -109,8 +110,8 @@ def test_information_is_that_of_the_two_plants_from_one_state() -> None:
     played = simulate((FRONT, FRONT.scaled("M", 1.2)), np.array([onset]), excitation, samples, seed=5)
     first = excitation.first_edges(np.random.default_rng(5), 1)[0]
     force = [2940.0 * ((k - first) // 60.0 % 2.0 == 0.0) * (k >= first) for k in range(samples)]
-    before, after = (SampledPlant.from_plant(Plant(mass, 3021.0, 24500.0), 0.01) for mass in (115.0, 138.0))
-    state = (0.0, 0.0)
+    before, after = (SampledPlant.from_plant(front(mass), 0.01) for mass in (115.0, 138.0))
+    state = before.at_rest
     for k in range(onset):
         state = before.next(state, force[k])
     unchanged = changed = state

@@ -18,10 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analogrig.hardware.calibration.averages import DISPLACEMENT, Program, record, scenarios
+from analogrig.hardware.calibration.averages import DISPLACEMENT, ProgramName, record, scenarios
 from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate, noise_free_lsb
+from analogrig.program import Program
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from analogrig.scenario import PlantChoice, PotChange, Scenario
+from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
 
 _LOADS = {"M": "R1", "B": "RB", "K": "RK"}
@@ -35,7 +36,7 @@ class DrawnRig:
     """Random rig and the program wired on it."""
 
     description: EmulatorDescription
-    program: Program
+    program: ProgramName
 
     @property
     def stock(self) -> Stock:
@@ -117,34 +118,34 @@ def rms_lsb(rig: DrawnRig, twin: EmulatorDescription, scenario: Scenario) -> flo
     return float(np.sqrt(np.mean(difference[:, DISPLACEMENT] ** 2)))
 
 
-def thesis_profile(program: Program) -> Scenario:
+def thesis_profile(program: ProgramName) -> Scenario:
     """Scenario of the thesis; for the shock absorber the same relative changes, but for M, which exceeds its pot."""
     thesis = Scenario.load("thesis")
     if program == "front":
         return thesis
     front, shock = PROGRAMS["front"].values, PROGRAMS["shock"].values
-    b = shock["B_n_s_per_m"] / front["B_n_s_per_m"]
-    k = shock["K_n_per_m"] / front["K_n_per_m"]
+    b = shock["B"] / front["B"]
+    k = shock["K"] / front["K"]
     return Scenario(
         samples=thesis.samples,
         excitation=thesis.excitation,
-        plant=PlantChoice("shock"),
+        program=Program.load("shock"),
         tweaks=(
-            PotChange(1200, stiffness_n_per_m=18000.0 * k),
-            PotChange(1400, damping_n_s_per_m=3453.0 * b),
-            PotChange(1500, damping_n_s_per_m=2123.0 * b, stiffness_n_per_m=20000.0 * k),
+            PotChange(1200, {"K": 18000.0 * k}),
+            PotChange(1400, {"B": 3453.0 * b}),
+            PotChange(1500, {"B": 2123.0 * b, "K": 20000.0 * k}),
         ),
         name="thesis, shock",
     )
 
 
-def _values(description: EmulatorDescription, program: Program) -> dict[str, float]:
+def _values(description: EmulatorDescription, program: ProgramName) -> dict[str, float]:
     """Values of the rig's machine by name, in ohm, F, V, Hz, V/s, and its dials."""
-    scenario = Scenario(samples=1, excitation=Scenario.load("thesis").excitation, plant=PlantChoice(program))
+    scenario = Scenario(samples=1, excitation=Scenario.load("thesis").excitation, program=Program.load(program))
     return _read(EmulatorRig(description).set_up(scenario, 0).computer)
 
 
-def _nominal(program: Program) -> dict[str, float]:
+def _nominal(program: ProgramName) -> dict[str, float]:
     return _read(SuspensionComputer(program, components=Components()))
 
 

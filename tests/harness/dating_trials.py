@@ -16,16 +16,18 @@ from analogrig import config
 from analogrig.hardware.by_hand import PlannedChange
 from analogrig.hardware.dating.instants import Instant, NoInstant, TurnInstants, date_jump, date_turn
 from analogrig.hardware.dating.two_filter import Signals
-from analogrig.judging import information
-from analogrig.plant import PARAMETERS, Plant, SampledPlant
+from analogrig.judging.isolation import ISOLATION_INFORMATION
+from analogrig.plant import Plant, SampledPlant
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
-from analogrig.scenario import PLANTS, PotChange, Scenario
+from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import Excitation
 
-FRONT = PLANTS["front"]
+from .plants import front
 
-FIELDS = dict(zip(PARAMETERS, (field.name for field in dataclasses.fields(Plant)), strict=True))
+FRONT = front()
+
+PARAMETERS = tuple(FRONT.parameters())
 
 Clock = Literal["card", "free"]
 
@@ -67,9 +69,7 @@ def square(clock: Clock, frequency_hz: float, high_v: float) -> Excitation:
 
 
 def tweak_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> PotChange:
-    return PotChange(
-        sample, ramp_n=ramp_n, **{FIELDS[name]: new for name, (_, new) in before.changes_to(after).items()}
-    )
+    return PotChange(sample, {name: new for name, (_, new) in before.changes_to(after).items()}, ramp_n)
 
 
 def change_front(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:
@@ -126,14 +126,14 @@ class Trial:
     def width_bound(self) -> int:
         """Number of instants that no method separates from the true one with 95 % confidence.
 
-        The information between the courses of the displacement is below ln 20, as in analogrig.judging.information.
+        The information between the courses of the displacement is below ln 20, as in analogrig.judging.isolation.
         """
         first = max(0, self.sample - 400)
         samples = np.arange(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
         courses_m = self._courses(first, samples)
         true_m = courses_m[samples == self.sample]
         gathered = ((courses_m - true_m) ** 2).sum(axis=1) / (2.0 * self.signals.noise_m**2)
-        return int((gathered < information.ISOLATION_INFORMATION).sum())
+        return int((gathered < ISOLATION_INFORMATION).sum())
 
     def _courses(self, first: int, samples: NDArray[np.int64]) -> NDArray[np.float64]:
         """(m, 800) displacement in metres from sample ``first`` on, for a change at each of ``samples`` (m,)."""
@@ -166,7 +166,7 @@ class Several:
         plants = [FRONT, *(plant for each in away for plant in (each, FRONT))]
         instants = 600 + np.append(0, np.cumsum(rng.integers(150, 600, size=8)))
         pairs = list(zip(instants.tolist(), plants, plants[1:], strict=False))
-        softest = min(1.0, *(plant.stiffness_n_per_m / FRONT.stiffness_n_per_m for plant in away))
+        softest = min(1.0, *(plant.parameters()["K"] / FRONT.parameters()["K"] for plant in away))
         scenario = Scenario(
             samples=int(instants[-1]),
             excitation=square(clock, float(rng.choice([100.0, 200.0])), 9.0 * softest),
@@ -187,7 +187,7 @@ def _next(
     plant: SampledPlant, x: NDArray[np.float64], v: NDArray[np.float64], force_n: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return SampledPlant.next for many states."""
-    xx, xv, vx, vv = plant.transition
+    (xx, xv), (vx, vv) = plant.transition
     xf, vf = plant.response
     return xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n
 

@@ -39,9 +39,9 @@ from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
 from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Channel, Run
+from analogrig.run import Channel, Run
 from analogrig.scenario import Scenario
-from analogrig_emulator import Excitation
+from analogrig_emulator import CHANNELS, Excitation
 from tests.harness.fed import Fed, fed
 
 N = 60
@@ -108,7 +108,9 @@ class SignalsRig(Rig):
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:  # noqa: ARG002
         channels = {name: Channel(0.0, 1.0, "code", 1.0, 1.0) for name in CHANNELS}
-        return Performance(5e-5, 200.0, channels, self._blocks(scenario.samples), lambda: Hindsight(()))
+        return Performance(
+            5e-5, 200.0, channels, self._blocks(scenario.samples), lambda: Hindsight(scenario.segments())
+        )
 
     def _blocks(self, n: int) -> Iterator[Block]:
         for first in range(0, n, RIG_BLOCK):
@@ -206,7 +208,7 @@ def _play(link: Link, description: InprocDevice, case: Case) -> Played:
     except AnalogrigError as error:
         return Played(type(error).__name__, str(error))
     verdict = judge(run)
-    if not verdict.valid:
+    if verdict.outcome == "inconclusive":
         return Played("inconclusive", "; ".join(verdict.reasons), run)
     return Played("lost" if run.lost.any() else "as without", "", run)
 

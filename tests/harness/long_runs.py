@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.reported import reported_run
 from tests.harness.runs import made_run
 
-FIRM, SOFT = Plant(115.0, 3021.0, 24500.0), Plant(115.0, 3021.0, 18000.0)
+from .plants import front
+
+FIRM, SOFT = front(115.0, 3021.0, 24500.0), front(115.0, 3021.0, 18000.0)
 SETTLED = 1100
 """A sample of ``reported_run`` whose estimate is the plant FIRM."""
 

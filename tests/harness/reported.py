@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict
-from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.runs import M_PER_CODE, N_PER_CODE, made_run
+
+from .plants import front
 
 SAMPLES = 1800
 PERIOD_S = 0.01
 PLANTS = (
-    (0, Plant(115.0, 3021.0, 24500.0)),
-    (1200, Plant(115.0, 3021.0, 18000.0)),
-    (1500, Plant(30.0, 3021.0, 18000.0)),
+    (0, front(115.0, 3021.0, 24500.0)),
+    (1200, front(115.0, 3021.0, 18000.0)),
+    (1500, front(30.0, 3021.0, 18000.0)),
 )
 NOTICED, FALSE_ALARM = 1203, 700
 CLIPPED = slice(300, 320)
@@ -156,7 +157,7 @@ def _theta() -> NDArray[np.float64]:
     theta = np.zeros((SAMPLES, 6))
     for start, plant in PLANTS:
         numerator, denominator, _ = signal.cont2discrete(
-            ([1.0], [plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m]), PERIOD_S
+            ([1.0], [plant.parameters()["M"], plant.parameters()["B"], plant.parameters()["K"]]), PERIOD_S
         )
         theta[start:, :2] = denominator[1:]
         theta[start:, 2:5] = numerator[0] * N_PER_CODE / M_PER_CODE
@@ -167,6 +168,6 @@ def _theta() -> NDArray[np.float64]:
 
 def _displacement_m(force_n: NDArray[np.float64]) -> NDArray[np.float64]:
     plant = PLANTS[0][1]
-    system = signal.lti([1.0], [plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m])
+    system = signal.lti([1.0], [plant.parameters()["M"], plant.parameters()["B"], plant.parameters()["K"]])
     _, x_m, _ = signal.lsim(system, force_n, np.arange(len(force_n)) * PERIOD_S, interp=False)
     return np.asarray(x_m)

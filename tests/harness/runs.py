@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from analogrig.catalogue import Cause, Change
 from analogrig.plant import Plant, Segment
-from analogrig.run import CHANNELS, Channel, Conditions, Run
+from analogrig.run import Channel, Conditions, Run
+from analogrig_emulator import CHANNELS
 
 N_PER_CODE, M_PER_CODE = 2940.0 / 4096, 0.1996 / 4096
 

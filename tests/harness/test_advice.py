@@ -11,12 +11,13 @@ import pytest
 from analogrig.catalogue import Change
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import judge
-from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.runs import ESTIMATOR, made_run
 
-FRONT = Plant(115.0, 3021.0, 24500.0)
-SOFT = Plant(115.0, 3021.0, 18000.0)
+from .plants import front
+
+FRONT = front(115.0, 3021.0, 24500.0)
+SOFT = front(115.0, 3021.0, 18000.0)
 LOADED = np.full(800, 2900.0)
 GOOD_THETA = np.tile([-1.7503, 0.769, 0.0, 0.0575, 0.0527, 0.0], (800, 1))
 """Thesis Equ 4.8, in codes of the runs made by hand, nearly."""
@@ -83,7 +84,7 @@ def test_undetectable_change_is_named() -> None:
 
 
 def test_implausible_estimate_is_named() -> None:
-    assert "samples 0-799 describes no mass" in advised(made_run(LOADED, [(0, FRONT)]))
+    assert "samples 0-799 describes no plant" in advised(made_run(LOADED, [(0, FRONT)]))
 
 
 @pytest.mark.parametrize(("frequency_hz", "told"), [(20.0, True), (200.0, False)])

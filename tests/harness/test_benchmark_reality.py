@@ -48,7 +48,7 @@ def test_a_row_plays_a_healthy_and_a_changed_run(name: str) -> None:
 def test_the_nominal_row_is_the_shipped_rig() -> None:
     """Same codes and alarms; the harness's bounds follow the measured force instead of the noise-free displacement."""
     (played,) = CONDITIONS["nominal"].play([5], SAMPLES, [CHANGE])
-    run = _shipped_rig_run(PotChange(CHANGE.sample, stiffness_n_per_m=CHANGE.factor * 24500.0))
+    run = _shipped_rig_run(PotChange(CHANGE.sample, {"K": CHANGE.factor * 24500.0}))
     assert np.array_equal(run.codes[:, :2], np.stack([played.u, played.y], axis=1))
     assert [alarm.index for alarm in answers_to(shipped(), played).alarms] == run.alarm_index.tolist()
     (gathered,) = change_information(run)

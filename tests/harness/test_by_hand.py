@@ -51,7 +51,7 @@ def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) 
 
 def test_jump_between_request_and_answer_is_dated() -> None:
     soft = FRONT.scaled("K", 0.7)
-    signals = taken(4000, PotChange(1630, stiffness_n_per_m=soft.stiffness_n_per_m))
+    signals = taken(4000, PotChange(1630, {"K": soft.parameters()["K"]}))
     (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).date(signals, first=5000)
     assert segment.plant == soft and not segment.unseen
     assert segment.start_low is not None and segment.start_high is not None
@@ -64,8 +64,8 @@ def test_two_pots_that_are_set_one_after_the_other_are_a_turn_from_the_first_to_
     dials = {"K": 0.6, "B": 0.5}  # in this order
     signals = taken(
         4000,
-        PotChange(1630, stiffness_n_per_m=after.stiffness_n_per_m),
-        PotChange(1700, damping_n_s_per_m=after.damping_n_s_per_m),
+        PotChange(1630, {"K": after.parameters()["K"]}),
+        PotChange(1700, {"B": after.parameters()["B"]}),
     )
     (segment,) = turned([asked(1500, dials, FRONT, after)], takes_s=0.02).date(signals, first=0)
     assert not segment.unseen, segment.unseen
@@ -76,7 +76,7 @@ def test_two_pots_that_are_set_one_after_the_other_are_a_turn_from_the_first_to_
 
 def test_slow_hand_is_dated_from_begin_to_end() -> None:
     soft = FRONT.scaled("K", 0.6)
-    change = PotChange(1700, stiffness_n_per_m=soft.stiffness_n_per_m, ramp_n=400)
+    change = PotChange(1700, {"K": soft.parameters()["K"]}, ramp_n=400)
     (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.04, slow=True).date(taken(5000, change), 0)
     assert not segment.unseen, segment.unseen
     earliest, latest = segment.earliest(), segment.latest()
@@ -91,8 +91,8 @@ def test_two_changes_of_a_record_are_dated_separately() -> None:
     light = soft.scaled("M", 0.6)
     signals = taken(
         6000,
-        PotChange(1630, stiffness_n_per_m=soft.stiffness_n_per_m),
-        PotChange(3250, mass_kg=light.mass_kg),
+        PotChange(1630, {"K": soft.parameters()["K"]}),
+        PotChange(3250, {"M": light.parameters()["M"]}),
     )
     tweaks = [asked(1500, {"K": 0.6}, FRONT, soft), asked(3200, {"M": 0.5}, soft, light)]
     first, second = turned(tweaks, takes_s=0.01).date(signals, first=0)
@@ -120,7 +120,7 @@ def test_plant_between_two_jumps_has_the_first_change() -> None:
     assert asked(0, {"K": 0.6, "B": 0.5}, FRONT, after).middle == FRONT.scaled("K", 0.75)
     assert asked(0, {"B": 0.5, "K": 0.6}, FRONT, after).middle == FRONT.scaled("B", 0.7)
     assert asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).middle is None
-    assert np.isclose(asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).after.stiffness_n_per_m, 18375.0)
+    assert np.isclose(asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).after.parameters()["K"], 18375.0)
 
 
 def test_two_changes_after_the_end_of_the_record_are_one() -> None:
@@ -147,7 +147,7 @@ def test_wrong_instant_is_contradicted_for_any_displacement(error_n: int) -> Non
     stiff = FRONT.scaled("K", 0.8)
     quiet = taken(4000)
     moving = 2004 + int(np.flatnonzero(np.abs(np.diff(quiet.force_n[2000:])) > 1000.0)[0])
-    signals = taken(4000, PotChange(moving, stiffness_n_per_m=stiff.stiffness_n_per_m))
+    signals = taken(4000, PotChange(moving, {"K": stiff.parameters()["K"]}))
     (said,) = contradictions(signals, [asked(moving + error_n, {}, FRONT, stiff)], first=5000)
     assert said == (
         f"the pot scheduled for sample {5000 + moving + error_n} (K 19600) moved at {5000 + moving}"

@@ -37,13 +37,15 @@ from analogrig.hardware.calibration.fit import (
     _late_displacement,
     calibrate,
 )
+from analogrig.hardware.instrument import MEASURED
+from analogrig.plant import Plant
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, MEASURED, Channel
-from analogrig.scenario import PlantChoice
-from analogrig_emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
+from analogrig.run import Channel
+from analogrig_emulator import CHANNELS, Card, Excitation, SuspensionComputer, acquired, probes_per_sample
 from tests.harness.calibration_rigs import calibrate_rig, draw_rig, rms_lsb, thesis_profile, truth
+from tests.harness.plants import front
 
 LSB_V = 20.0 / 4096
 
@@ -134,16 +136,16 @@ def test_late_displacement_is_that_of_a_card_with_skew() -> None:
 @pytest.mark.parametrize(
     ("pot", "elsewhere"),
     [
-        (0, PlantChoice("front", 115.0 / 1.001, 3021.0, 24500.0)),
-        (1, PlantChoice("front", 115.0, 3021.0 * 1.001, 24500.0)),
-        (2, PlantChoice("front", 115.0, 3021.0, 24500.0 * 1.001)),
+        (0, front(115.0 / 1.001, 3021.0, 24500.0)),
+        (1, front(115.0, 3021.0 * 1.001, 24500.0)),
+        (2, front(115.0, 3021.0, 24500.0 * 1.001)),
     ],
     ids="MBK",
 )
-def test_pot_that_misses_its_setting_equals_a_pot_set_elsewhere(pot: int, elsewhere: PlantChoice) -> None:
+def test_pot_that_misses_its_setting_equals_a_pot_set_elsewhere(pot: int, elsewhere: Plant) -> None:
     """Error of a thousandth of the coefficient (1 / M, B, K), visible and reproduced to a hundredth of its effect."""
     there = recording_of(np.zeros(1400))
-    other = dataclasses.replace(there, scenario=dataclasses.replace(there.scenario, plant=elsewhere))
+    other = dataclasses.replace(there, scenario=there.scenario.with_plant(elsewhere))
     model = EmulatorModel([there, other], ComputerDescription(), 1.0)
     at_rest = np.zeros(len(model.known_to))
     missed = at_rest.copy()

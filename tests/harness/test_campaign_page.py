@@ -13,7 +13,7 @@ from playwright.sync_api import Browser
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import Row
-from analogrig.campaigns.spec import CampaignSpec, Draw, Grid
+from analogrig.campaigns.spec import Axes, CampaignSpec
 from analogrig.campaigns.summary import CONFIDENCE, RATES, Aggregate, Distribution
 from analogrig.campaigns.trials import Trials
 from analogrig.reporting.campaign_page import render, write_page
@@ -22,14 +22,14 @@ from tests.browser import Watched
 
 def results(name: str = "made") -> Results:
     """Three stiffnesses by two factors: latencies 1 to 6, and every second change of the last cell missed."""
-    grid = Grid(stiffness_n_per_m=(20000.0, 22000.0, 24500.0), stiffness_factor=(0.8, 0.9))
+    grid = {"K": (20000.0, 22000.0, 24500.0), "K_factor": (0.8, 0.9)}
     plan = Plan.of(CampaignSpec(trials=2, samples=1100, grid=grid, name=name))
     return counted(plan, [Trials.of([row(seed, cell) for seed in range(2)]) for cell in range(6)])
 
 
 def counted(plan: Plan, cells: Sequence[Trials]) -> Results:
     """Results of these trials of each cell."""
-    aggregates, distribution = [], Distribution(plan.spec.draw.axes())
+    aggregates, distribution = [], Distribution(plan.spec.draw)
     for trials in cells:
         aggregates.append(Aggregate())
         aggregates[-1].add(trials, 0)
@@ -54,7 +54,7 @@ def test_browser_draws_the_maps_and_asks_for_nothing(browser: Browser, tmp_path:
     assert watched.page.locator("#spread + .maps svg").count() == 4  # of delays and of three errors
     maps = watched.page.locator("#maps ~ .maps svg").all()
     lines = [each.locator("text").all_text_contents() for each in maps]
-    axes = ["20000", "22000", "24500", "0.8", "0.9", "stiffness [N/m]", "stiffness factor"]
+    axes = ["20000", "22000", "24500", "0.8", "0.9", "K [N/m]", "K factor"]
     assert [each[:7] for each in lines] == [axes, axes]
     latencies = ["1.0", "2.0", "3.0", "4.0", "5.0", "6.0"]
     assert lines[0][7:] == [text for latency in latencies for text in (latency, "bound 2.0")]
@@ -69,7 +69,7 @@ def test_browser_draws_the_maps_and_asks_for_nothing(browser: Browser, tmp_path:
 def test_all_panels_share_one_scale_that_the_legend_shows() -> None:
     """Two panels of one quantity, the second with half the latencies of the first."""
     made = results()
-    grid = Grid(stiffness_n_per_m=(20000.0, 24500.0), stiffness_factor=(0.8, 0.9), noise_lsb=(0.5, 1.0))
+    grid = {"K": (20000.0, 24500.0), "K_factor": (0.8, 0.9), "noise_lsb": (0.5, 1.0)}
     plan = Plan.of(CampaignSpec(trials=2, samples=1100, grid=grid, name="made"))
     cells = [Trials.of([row(seed, i // 2 if i % 2 else i) for seed in range(2)]) for i in range(8)]
     page = render(counted(plan, cells))
@@ -98,8 +98,8 @@ def test_same_results_give_the_same_page_and_names_are_escaped() -> None:
     assert "&lt;script&gt;" in page
 
 
-@pytest.mark.parametrize("grid", [Grid(), Grid(noise_lsb=(1.0,))])
-def test_campaign_without_a_plane_has_no_map(grid: Grid) -> None:
+@pytest.mark.parametrize("grid", [{}, {"noise_lsb": (1.0,)}])
+def test_campaign_without_a_plane_has_no_map(grid: Axes) -> None:
     made = results()
     spec = dataclasses.replace(made.plan.spec, grid=grid)
     page = render(Results(dataclasses.replace(made.plan, spec=spec), made.aggregates[:1], made.distribution))
@@ -110,9 +110,7 @@ def test_page_of_many_cells_is_bounded(browser: Browser, tmp_path: Path) -> None
     """Beyond 2,000 cells the table ends, and beyond 2,000 squares of a map have no numbers."""
     factors = tuple(round(0.5 + 0.006 * i, 4) for i in range(50))
     dampings = tuple(2500.0 + 10.0 * i for i in range(50))
-    spec = CampaignSpec(
-        trials=100, samples=1100, grid=Grid(damping_n_s_per_m=dampings, stiffness_factor=factors), name="many"
-    )
+    spec = CampaignSpec(trials=100, samples=1100, grid={"B": dampings, "K_factor": factors}, name="many")
     made = results()
     plan = dataclasses.replace(made.plan, spec=dataclasses.replace(spec, scenario=made.plan.spec.scenario))
     path = tmp_path / "many.html"
@@ -127,11 +125,11 @@ def test_page_of_many_cells_is_bounded(browser: Browser, tmp_path: Path) -> None
 
 def drawn_results() -> Results:
     """Eight trials at the low end of the range, missed, and eight at the high end, detected."""
-    spec = CampaignSpec(trials=16, samples=1100, draw=Draw(stiffness_factor=(0.5, 0.9)), name="drawn")
+    spec = CampaignSpec(trials=16, samples=1100, draw={"K_factor": (0.5, 0.9)}, name="drawn")
     plan = dataclasses.replace(results().plan, spec=spec)
     rows = [row(seed, 5) | {"changes": [[None if seed < 8 else 3, 2, seed < 8, False]]} for seed in range(16)]
-    drawn = [each | {"drawn": {"stiffness_factor": 0.5 if i < 8 else 0.9}} for i, each in enumerate(rows)]
-    return counted(plan, [Trials.of(drawn, ["stiffness_factor"])])
+    drawn = [each | {"drawn": {"K_factor": 0.5 if i < 8 else 0.9}} for i, each in enumerate(rows)]
+    return counted(plan, [Trials.of(drawn, ["K_factor"])])
 
 
 def test_drawn_values_have_maps() -> None:
@@ -151,9 +149,7 @@ def test_bound_stands_beside_a_rate_of_zero_and_a_square_leads_to_its_trials(bro
     assert first.locator("text").all_text_contents() == ["0.0%", f"≤ {100 * bound:.2g}%"]
     title = last.locator("title").text_content()
     assert title is not None
-    assert title.startswith(
-        "stiffness 24500 N/m, stiffness factor 0.9: latency 6.0 samples (bound 2.0), 1 of 2 changes"
-    )
+    assert title.startswith("K 24500 N/m, K factor 0.9: latency 6.0 samples (bound 2.0), 1 of 2 changes")
     last.focus()
     watched.page.keyboard.press("Enter")
     cell = watched.page.locator("tr:target")

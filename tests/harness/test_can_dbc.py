@@ -613,7 +613,7 @@ def test_units_of_the_channel_are_checked_against_the_rig(file: Path) -> None:
         open_dut(str(file)) as dut,
         pytest.raises(ConfigurationError, match="8 bits hold"),
     ):
-        dut.prepare(rig.perform(SHORT, SEED).channels, 5e-5)
+        dut.prepare(rig.perform(SHORT, SEED).of_device, 5e-5)
 
 
 def test_frame_of_can_fd_carries_all_in_one(tmp_path: Path) -> None:

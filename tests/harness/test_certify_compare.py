@@ -333,14 +333,16 @@ def test_build_that_loses_its_estimates_is_worse() -> None:
     good, bad = ([observed(seed, 5) for seed in range(20)] for _ in "ab")
     for _, trial in bad:
         trial["errors"] = []
-    words = {each.quantity: each.word for each in compare(good, bad).differences}
+    words = {each.quantity: each.word for each in compare(good, bad, estimates="MBK").differences}
     assert {words[f"error of {name}"] for name in "MBK"} == {"worse"}
 
 
 def test_fewest_seeds_are_those_with_which_something_could_be_called_worse() -> None:
     """Every seed worse in latency, in nothing else: 2 of 2^k ways, times the number of quantities."""
     for seeds, worse in ((10, False), (11, True)):
-        found = compare([observed(seed, 4) for seed in range(seeds)], [observed(seed, 9) for seed in range(seeds)])
+        found = compare(
+            [observed(seed, 4) for seed in range(seeds)], [observed(seed, 9) for seed in range(seeds)], estimates="MBK"
+        )
         assert len(found.differences) == 6
         assert (found.least_seeds, found.worse) == (11, worse)
 
@@ -377,7 +379,7 @@ def test_recordings_of_one_name_that_played_something_else_are_not_paired(tmp_pa
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=700, name="drawn")
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for factor in (0.7, 0.9):
-            drawn = dataclasses.replace(scenario, tweaks=(PotChange(400, stiffness_n_per_m=24500.0 * factor),))
+            drawn = dataclasses.replace(scenario, tweaks=(PotChange(400, {"K": 24500.0 * factor}),))
             Bench(rig, dut).play(drawn, 0).save(tmp_path / "both" / str(factor) / "run.npz")
     assert len(dict(recorded(tmp_path / "both"))) == 2
     found = compare(recorded(tmp_path / "both" / "0.7"), recorded(tmp_path / "both" / "0.9"))
@@ -462,7 +464,7 @@ def own_devices(tmp_path: Path) -> list[str]:
             ("trials = 12", "trials = 12\nrigs = ['emulator-skewed']"),
             "rigs[0].card.model is 'ideal' in A and 'skewed' in B",
         ),
-        (("stiffness_factor", "noise_lsb = [1.5]\nstiffness_factor"), "grid.noise_lsb is [] in A and [1.5] in B"),
+        (("stiffness_factor", "noise_lsb = [1.5]\nstiffness_factor"), "grid.noise_lsb is absent in A and [1.5] in B"),
     ],
 )
 def test_campaigns_that_played_something_else_are_not_compared(
@@ -502,7 +504,7 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
 
 def test_too_few_seeds_to_show_anything_are_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     healthy = Scenario.load("healthy")
-    scenario = dataclasses.replace(healthy, samples=700, tweaks=(PotChange(400, stiffness_n_per_m=20000.0),))
+    scenario = dataclasses.replace(healthy, samples=700, tweaks=(PotChange(400, {"K": 20000.0}),))
     with open_rig("emulator") as rig:
         for name, dut in (("a", "inproc"), ("b", "mean-between-faults")):
             with open_dut(dut, exchange="block") as device:

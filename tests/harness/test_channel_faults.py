@@ -8,7 +8,6 @@ import pytest
 from analogrig.catalogue import Change
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import CHANNEL_FAULTS, DIAGNOSABLE, FAULT_CURES, ChannelFault, as_json, judge
-from analogrig.plant import Plant
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
 from analogrig.run import Run
@@ -16,7 +15,9 @@ from analogrig.testing.played import Played
 from analogrig.testing.plugin.junit import play_properties
 from tests.harness.runs import made_run
 
-FRONT = Plant(115.0, 3021.0, 24500.0)
+from .plants import front
+
+FRONT = front(115.0, 3021.0, 24500.0)
 
 SEVERAL_FAULTS = [
     (30, Change.FORCE_GAIN, 20, 1.25),

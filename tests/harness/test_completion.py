@@ -51,7 +51,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("analogrig ca", {"calibrate", "campaign"}),
         ("analogrig run --re", {"--real-time", "--report-interval"}),
         ("analogrig run --scenario the", {"thesis", "thesis-free-running"}),
-        ("analogrig run --rig emulator-s", {"emulator-skewed"}),
+        ("analogrig run --rig emulator-s", {"emulator-skewed", "emulator-slow"}),
         ("analogrig replay run.npz --dut qemu-", {"qemu-m3", "qemu-m4", "qemu-m7", "qemu-f405"}),
         ("analogrig certify --dut me", {"mean-between-faults"}),
         ("analogrig campaign p", {"pot-plane"}),

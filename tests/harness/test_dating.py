@@ -34,6 +34,8 @@ from analogrig.plant import Plant, SampledPlant
 from analogrig_emulator import COMPONENTS, Excitation, PotTurn, SuspensionComputer
 from tests.harness.dating_trials import FRONT, Trial, play, scenario_of, still
 
+from .plants import front
+
 N_PER_LSB, M_PER_LSB, PERIOD_S = 2940.0 / 4096, 0.1996 / 4096, 0.01
 NOISE_LSB = (1.0 + 1.0 / 12.0) ** 0.5
 
@@ -50,7 +52,7 @@ def simulate(
     """
     rng = np.random.default_rng(seed)
     force_n = np.where((np.arange(samples + 1) + rng.integers(100)) // half_n % 2, 2910.0, 30.0)
-    state, displacement_m = (0.0, 0.0), np.empty(samples)
+    state, displacement_m = SampledPlant.from_plant(FRONT, PERIOD_S).at_rest, np.empty(samples)
     for k in range(samples):
         displacement_m[k] = state[0]
         plant = [each for start, each in plants if start <= k][-1]
@@ -120,7 +122,7 @@ def test_interval_of_a_change_at_rest_reaches_to_the_next_edge() -> None:
 
 
 def test_deviation_of_some_per_cent_from_nominal_values_leaves_the_date() -> None:
-    deviating = Plant(115.0 * 1.08, 3021.0 * 0.94, 24500.0 * 1.07)
+    deviating = front(115.0 * 1.08, 3021.0 * 0.94, 24500.0 * 1.07)
     signals = simulate([(0, deviating), (600, deviating.scaled("K", 0.72))], 1200, seed=7, place=0.4)
     assert jump_instant(signals, SOFT, range(400, 800)) == jump_instant(signals, None, range(400, 800))
     assert jump_instant(signals, SOFT, range(400, 800)).sample == 600
@@ -161,7 +163,7 @@ def test_interval_on_a_finer_card_allows_for_real_components() -> None:
         sample, lsb_v = 1500 + 17 * seed, 20.0 / 65536
         drawn = dataclasses.replace(COMPONENTS["polyester"], seed=seed)
         computer = SuspensionComputer("front", rng=np.random.default_rng(seed), components=drawn)
-        turned = [PotTurn(sample, {"B_n_s_per_m": 2123.0}), PotTurn(sample + 112, {"K_n_per_m": 20000.0})]
+        turned = [PotTurn(sample, {"B": 2123.0}), PotTurn(sample + 112, {"K": 20000.0})]
         blocks = list(computer.play(Excitation(low_v=0.1, high_v=9.9), 3500, turned))
         volts = np.concatenate(blocks)[:, :2]
         volts = lsb_v * np.rint(volts / lsb_v + np.random.default_rng(seed).normal(size=volts.shape))
@@ -335,7 +337,8 @@ def simulate_path(plants: Sequence[tuple[int, Plant]], samples: int) -> Signals:
     starts = dict(plants)
     signals = simulate([(0, FRONT)], samples, seed=23)
     level_n = np.where(signals.force_n > 1500.0, 2910.0, 30.0)
-    state, out, plant = (0.0, 0.0), np.empty(samples), SampledPlant.from_plant(FRONT, PERIOD_S)
+    out, plant = np.empty(samples), SampledPlant.from_plant(FRONT, PERIOD_S)
+    state = plant.at_rest
     for k in range(samples):
         out[k] = state[0]
         if k in starts:

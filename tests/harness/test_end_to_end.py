@@ -21,11 +21,12 @@ import pytest
 from analogrig.cli import main
 from analogrig.config import locate
 from analogrig.devices.host import HOST_PROGRAM
-from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.firmware import CORES, needs_firmware
 from tests.harness.processes import LONG_S, descendants
 from tests.harness.runs import made_run
+
+from .plants import front
 
 ENVIRONMENT = {key: value for key, value in os.environ.items() if not key.startswith("ANALOGRIG_")}
 
@@ -208,7 +209,7 @@ def refusal_here(arguments: Sequence[str], capsys: pytest.CaptureFixture[str]) -
         ("rigs", "0.003", "-1.0", "mine.toml"),
         ("rigs", "[-10.0, 10.0]", "[1e308, -1e308]", "mine.toml"),
         ("scenarios", "random_phase", "randam_phase", "mine.toml: unknown key 'randam_phase'"),
-        ("scenarios", "mass_kg = 30.0", "mass_kg = 20.0", "pot M: .* 20 "),
+        ("scenarios", "M = 30.0", "M = 20.0", "pot M: .* 20 "),
         ("scenarios", "frequency_hz = 200.0", "frequency_hz = 1e-12", "mine.toml"),
         pytest.param("scenarios", "samples = 1800", f"samples = {10**400}", "mine.toml", id="samples"),
         ("devices", "forgetting", "forgeting", "mine.toml: estimator: unknown key 'forgeting'"),
@@ -386,7 +387,7 @@ def test_run_whose_output_nobody_hears_is_kept_and_judged(tmp_path: Path) -> Non
 
 
 def test_recording_without_a_sample_is_named(tmp_path: Path) -> None:
-    made_run(np.zeros(0), [(0, Plant(115.0, 3021.0, 24500.0))], samples_asked=10).save(tmp_path / "none.npz")
+    made_run(np.zeros(0), [(0, front(115.0, 3021.0, 24500.0))], samples_asked=10).save(tmp_path / "none.npz")
     assert "holds no samples" in refusal("replay", "none.npz", cwd=tmp_path)
 
 

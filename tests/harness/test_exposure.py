@@ -13,15 +13,17 @@ from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import judge
-from analogrig.plant import Plant
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
-from analogrig.run import CHANNELS, Run
+from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played, rate_below
+from analogrig_emulator import CHANNELS
 from tests.harness.runs import ESTIMATOR, made_run
 
-FRONT = Plant(294.0, 3021.0, 24500.0)
+from .plants import front
+
+FRONT = front(294.0, 3021.0, 24500.0)
 
 SQUARE_N = np.where(np.arange(600) // 50 % 2, 2000.0, 200.0)
 

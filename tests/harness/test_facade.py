@@ -16,7 +16,7 @@ import analogrig
 
 PUBLIC = """
     AnalogrigError Bench ChangeVerdict Conditions ConfigurationError Device DeviceError EmulatorError EstimatorConfig
-    Excitation Expectations Finding LinkError LinkTimeout Plant PlantChoice Play Played PotChange RecordingError Rig
+    Excitation Expectations Finding LinkError LinkTimeout Plant Play Played PotChange Program RecordingError Rig
     RigError Run Scenario Verdict __version__ detectable judge open_dut open_rig rate_below strategies with_some_seed
     write_report
 """.split()
@@ -26,7 +26,7 @@ DEVICES = """
     LinkClosed ModelOrders RaisedAlarm ReportedDiagnosis ReportedMisfit Samples SteppedFlag Thing TimeLimitReached
 """.split()
 RIGS = """
-    CAPABILITIES CHANNELS Block Channel Hindsight Performance Rig RigClosed RigDescription RigRefused RigTimeout Segment
+    CAPABILITIES Block Channel Hindsight Performance Rig RigClosed RigDescription RigRefused RigTimeout Segment
     Thing
 """.split()
 

@@ -13,32 +13,35 @@ from scipy.signal import cont2discrete
 
 from analogrig.datasheet import ModelOrders
 from analogrig.judging import information
-from analogrig.plant import AT_REST, Plant, SampledPlant, physical_parameters
+from analogrig.judging.courses import first_at_level
+from analogrig.plant import Plant, SampledPlant, estimated_parameters
 from tests.harness.runs import made_run
 
-FRONT = Plant(115.0, 3021.0, 24500.0)
-SOFT = Plant(115.0, 3021.0, 18000.0)
+from .plants import PROGRAM, front
+
+FRONT = front(115.0, 3021.0, 24500.0)
+SOFT = front(115.0, 3021.0, 18000.0)
 
 
-@pytest.mark.parametrize("plant", [FRONT, Plant(2.0, 900.0, 12250.0), Plant(30.0, 2123.0, 20000.0)], ids=str)
+@pytest.mark.parametrize("plant", [FRONT, front(2.0, 900.0, 12250.0), front(30.0, 2123.0, 20000.0)], ids=str)
 def test_sampled_plant_is_the_exact_zero_order_hold(plant: Plant) -> None:
-    m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
+    m, b, k = plant.parameters()["M"], plant.parameters()["B"], plant.parameters()["K"]
     exact = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * 0.01)
     sampled = SampledPlant.from_plant(plant, 0.01)
     assert np.reshape(sampled.transition, (2, 2)) == pytest.approx(exact[:2, :2], rel=1e-12)
     assert np.array(sampled.response) == pytest.approx(exact[:2, 2], rel=1e-12)
-    assert sampled.next(AT_REST, 100.0) == pytest.approx(tuple(100.0 * exact[:2, 2]), rel=1e-12)
+    assert sampled.next(sampled.at_rest, 100.0) == pytest.approx(tuple(100.0 * exact[:2, 2]), rel=1e-12)
 
 
-@pytest.mark.parametrize("plant", [FRONT, Plant(2.0, 900.0, 12250.0), Plant(30.0, 2123.0, 20000.0)], ids=str)
+@pytest.mark.parametrize("plant", [FRONT, front(2.0, 900.0, 12250.0), front(30.0, 2123.0, 20000.0)], ids=str)
 def test_theta_of_the_exact_discretisation_gives_the_plant(plant: Plant) -> None:
     """Discretise with scipy and convert back; thesis Equ 4.3, 4.8 as recomputed."""
-    m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
+    m, b, k = plant.parameters()["M"], plant.parameters()["B"], plant.parameters()["K"]
     (numerator,), denominator, _ = cont2discrete(([1.0], [m, b, k]), 0.01, "zoh")
     n_per_code, m_per_code = 0.7, 5e-5
     gains = numerator * n_per_code / m_per_code
     theta = np.array([[*denominator[1:], *gains, 3.0]], dtype=np.float64)
-    read = physical_parameters(theta, ModelOrders(2, 3), n_per_code, m_per_code, 0.01)
+    read = estimated_parameters(PROGRAM, theta, ModelOrders(2, 3), n_per_code, m_per_code, 0.01)
     assert read[0] == pytest.approx([m, b, k], rel=1e-6)
 
 
@@ -48,7 +51,9 @@ def test_theta_of_the_exact_discretisation_gives_the_plant(plant: Plant) -> None
     ids=["zero", "unstable", "negative gain", "nan"],
 )
 def test_implausible_theta_gives_nan(theta: list[float]) -> None:
-    assert np.isnan(physical_parameters(np.array([theta], np.float32), ModelOrders(2, 3), 1.0, 1e-4, 0.01)).all()
+    assert np.isnan(
+        estimated_parameters(PROGRAM, np.array([theta], np.float32), ModelOrders(2, 3), 1.0, 1e-4, 0.01)
+    ).all()
 
 
 def test_information_of_a_stiffness_change_under_a_settled_load() -> None:
@@ -58,10 +63,10 @@ def test_information_of_a_stiffness_change_under_a_settled_load() -> None:
     run = made_run(force_n=np.full(600, force_n), plants=[(0, FRONT), (400, SOFT)], noise_lsb=noise_lsb)
     (gathered,) = information.change_information(run)
     lsb_m = run.conditions.channels["displacement"].lsb
-    s = SOFT.damping_n_s_per_m / (2.0 * SOFT.mass_kg)
-    r = math.sqrt(s * s - SOFT.stiffness_n_per_m / SOFT.mass_kg)
+    s = SOFT.parameters()["B"] / (2.0 * SOFT.parameters()["M"])
+    r = math.sqrt(s * s - SOFT.parameters()["K"] / SOFT.parameters()["M"])
     t = 0.01 * np.arange(1, 51)
-    amplitude = force_n / SOFT.stiffness_n_per_m - force_n / FRONT.stiffness_n_per_m
+    amplitude = force_n / SOFT.parameters()["K"] - force_n / FRONT.parameters()["K"]
     step = 1.0 - np.exp(-s * t) * (np.cosh(r * t) + s / r * np.sinh(r * t))
     expected = np.cumsum((amplitude * step / lsb_m) ** 2) / (2.0 * (noise_lsb**2 + 1.0 / 12.0))
     assert gathered[:50] == pytest.approx(expected, rel=1e-3)
@@ -81,17 +86,17 @@ def test_clipped_samples_carry_no_information() -> None:
 def test_change_of_an_unloaded_suspension_is_not_detectable() -> None:
     run = made_run(force_n=np.zeros(600), plants=[(0, FRONT), (400, SOFT)])
     (gathered,) = information.change_information(run)
-    assert information.first_at_level(gathered, math.log(1e5)) is None
+    assert first_at_level(gathered, math.log(1e5)) is None
 
 
 def test_first_reaching_counts_from_one() -> None:
-    assert information.first_at_level([0.0, 5.0, 5.0, 12.0], 5.0) == 2
-    assert information.first_at_level([6.0], 5.0) == 1
-    assert information.first_at_level([], 5.0) is None
+    assert first_at_level([0.0, 5.0, 5.0, 12.0], 5.0) == 2
+    assert first_at_level([6.0], 5.0) == 1
+    assert first_at_level([], 5.0) is None
 
 
 @pytest.mark.parametrize(
-    "after", [SOFT, Plant(92.0, 3021.0, 24500.0), Plant(115.0, 2400.0, 24500.0), Plant(115.0, 2400.0, 20000.0)], ids=str
+    "after", [SOFT, front(92.0, 3021.0, 24500.0), front(115.0, 2400.0, 24500.0), front(115.0, 2400.0, 20000.0)], ids=str
 )
 def test_isolation_bound_is_the_sample_with_ln_20_against_the_best_rival(after: Plant) -> None:
     """Compare with scipy: plants by expm, the best factor of each rival by a numerical search."""
@@ -103,7 +108,7 @@ def test_isolation_bound_is_the_sample_with_ln_20_against_the_best_rival(after: 
     lsb_m = run.conditions.channels["displacement"].lsb
 
     def course(plant: Plant, state: NDArray[np.float64], forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
+        m, b, k = plant.parameters()["M"], plant.parameters()["B"], plant.parameters()["K"]
         step = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * 0.01)[:2]
         out = [state]
         for each in forces:

@@ -299,7 +299,7 @@ def test_model_in_volts_is_converted_to_codes() -> None:
         Channel(low_v=low, lsb_v=lsb, unit="", unit_per_v=1.0, noise_lsb=0.0) for low, lsb in ((-5, 0.5), (-2, 0.1))
     )
     with description.connect() as device:
-        device.prepare({"force": u, "displacement": y}, 1.0)
+        device.prepare({"u": u, "y": y}, 1.0)
         device.start()
         zero = np.zeros(1, np.uint16)
         (answers,) = device.play([Samples(0, zero, zero, np.ones(1, np.bool_))])

@@ -11,8 +11,6 @@ import pytest
 
 from analogrig.cli import main
 from analogrig.cli.listing import KINDS
-from analogrig.cli.options import PROGRAMS
-from analogrig_emulator import PROGRAMS as EMULATED_PROGRAMS
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"
 FILES = sorted(FIXTURES.glob("*/*.toml"))
@@ -36,7 +34,7 @@ def test_every_shipped_file_describes_itself_in_one_line(path: Path) -> None:
     assert description.isprintable() and 10 <= len(description) <= 90
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "programs"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_shipped_file_is_listed_with_its_description(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     files = [path for path in FILES if path.parent.name == kind]
     rows = {row["name"]: row["description"] for row in listed(capsys, kind)[kind]}
@@ -50,10 +48,6 @@ def test_kinds_of_devices_are_listed_as_they_are_spelt(capsys: pytest.CaptureFix
     names = {row["name"] for row in rows}
     assert names >= {"inproc[:LIBRARY]", "qemu-m4[:ELF]", "serial:URL", "can:INTERFACE[/CHANNEL][?KEY=VALUE&...]"}
     assert all(row["description"] for row in rows)
-
-
-def test_programs_are_those_of_the_emulator(capsys: pytest.CaptureFixture[str]) -> None:
-    assert {row["name"] for row in listed(capsys, "programs")["programs"]} == set(EMULATED_PROGRAMS) == set(PROGRAMS)
 
 
 def test_rigs_of_a_rigs_file_come_first_and_replace_shipped_ones(

@@ -13,11 +13,12 @@ import pytest
 
 from analogrig.config import locate
 from analogrig.judging.verdict import judge
-from analogrig.plant import Plant, Segment
+from analogrig.plant import Segment
 from analogrig.reporting import render
 from analogrig.reporting.payload import MOST_POINTS, Piece, condense, pieces
 from analogrig.run import Run
 from tests.harness.long_runs import FIRM, long_run
+from tests.harness.plants import front
 from tests.harness.reported import Page
 
 MOST_BYTES_A_SAMPLE = 100
@@ -125,7 +126,7 @@ def test_spike_of_a_single_sample_is_in_the_page_of_a_long_run(name: str) -> Non
     elif name == "statistic":
         assert np.nanmax(shown) == 9e3
     else:
-        assert np.nanmax(np.abs(shown - FIRM.mass_kg)) > 5.0  # noise alone: less than 2 kg
+        assert np.nanmax(np.abs(shown - FIRM.parameters()["M"])) > 5.0  # noise alone: less than 2 kg
     assert len(shown) < 0.4 * samples
 
 
@@ -190,7 +191,7 @@ def test_points_of_a_piece_are_counted_as_they_are_made() -> None:
 def test_ramp_of_a_long_run_is_shown_in_bounded_steps() -> None:
     samples, ramp_n = 300_000, 200_000
     run = long_run(samples, changes=0)
-    segments = (Segment(0, FIRM), Segment(50_000, Plant(115.0, 3021.0, 18000.0), ramp_n))
+    segments = (Segment(0, FIRM), Segment(50_000, front(115.0, 3021.0, 18000.0), ramp_n))
     data = Page(render(replace(run, conditions=replace(run.conditions, segments=segments)), judge(run))).data()
     assert len(data["segments"]) < 5_000
     stiffness = [segment["K"] for segment in data["segments"]]

@@ -15,21 +15,23 @@ from analogrig.catalogue import Cause
 from analogrig.devices.opening import open_dut
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import CURES, MisfitPeriod, as_json, judge, misfit_periods
-from analogrig.plant import Plant
 from analogrig.recordings import CanLog, import_run
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
-from analogrig.run import CHANNELS, Run
+from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_emulator import CHANNELS
 from tests.harness.runs import ESTIMATOR, made_run
+
+from .plants import front
 
 HUM_HZ = 50.0
 SAMPLES = 2500
 SCENARIO = dataclasses.replace(Scenario.load("healthy"), samples=SAMPLES)
 WATCHING = {**ESTIMATOR, "misfit": True}
-FRONT = Plant(115.0, 3021.0, 24500.0)
+FRONT = front(115.0, 3021.0, 24500.0)
 
 
 @pytest.fixture(scope="module")

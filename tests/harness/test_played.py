@@ -9,11 +9,12 @@ import pytest
 
 from analogrig.catalogue import Cause
 from analogrig.judging.verdict import CURES
-from analogrig.plant import Plant
 from analogrig.testing.played import Played, rate_below
 from tests.harness.runs import ESTIMATOR, made_run
 
-FRONT = Plant(294.0, 3021.0, 24500.0)
+from .plants import front
+
+FRONT = front(294.0, 3021.0, 24500.0)
 
 
 @pytest.mark.parametrize("samples", [0, 400])

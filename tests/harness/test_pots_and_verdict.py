@@ -118,7 +118,7 @@ def played(program: Path, tweak: Asked) -> Run:
 
 
 def test_instant_of_a_command_is_dated_and_the_device_is_judged_by_it(program: Path) -> None:
-    run = played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0))
+    run = played(program, Asked(ASKED_AT, {"K": 18000.0}))
     (tweak,) = judge(run).tweaks
     assert tweak.between[0] <= INSTANTS[0] <= tweak.between[1]
     assert tweak.between[1] - tweak.between[0] < 60
@@ -126,7 +126,7 @@ def test_instant_of_a_command_is_dated_and_the_device_is_judged_by_it(program: P
 
 
 def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(program: Path) -> None:
-    run = played(program, Asked(ASKED_AT, damping_n_s_per_m=2123.0, stiffness_n_per_m=20000.0))
+    run = played(program, Asked(ASKED_AT, {"B": 2123.0, "K": 20000.0}))
     (_, segment) = run.conditions.segments
     assert not segment.unseen, segment.unseen
     earliest, latest = segment.earliest(), segment.latest()
@@ -137,7 +137,7 @@ def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(progr
 
 def test_change_that_a_command_did_not_make_is_not_judged(program: Path) -> None:
     program.write_text("#!/bin/sh\nexit 0\n")
-    verdict = judge(played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0)))
+    verdict = judge(played(program, Asked(ASKED_AT, {"K": 18000.0})))
     assert verdict.tweaks[0].result == "not judged"
     assert verdict.outcome != "passed"
     assert "shows that the plant has changed" in verdict.reasons[-1]
@@ -145,7 +145,7 @@ def test_change_that_a_command_did_not_make_is_not_judged(program: Path) -> None
 
 def test_command_that_fails_makes_the_run_inconclusive(program: Path) -> None:
     program.write_text("#!/bin/sh\necho no box at this address\nexit 1\n")
-    verdict = judge(played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0)))
+    verdict = judge(played(program, Asked(ASKED_AT, {"K": 18000.0})))
     assert verdict.outcome == "inconclusive"
     assert "ended with status 1, output: no box at this address" in verdict.reasons[0]
 
@@ -168,7 +168,7 @@ with socket.create_connection((host, int(port))) as connection:
 
 
 def test_instants_of_a_users_command_are_dated_in_real_time(tmp_path: Path) -> None:
-    tweaks = (Asked(4000, stiffness_n_per_m=18000.0), Asked(11_000, damping_n_s_per_m=2200.0))
+    tweaks = (Asked(4000, {"K": 18000.0}), Asked(11_000, {"B": 2200.0}))
     scenario = Scenario.load("thesis")
     expect = dataclasses.replace(scenario.expect, false_alarms=1)  # at the ARL0 of the device one run of six has one
     scenario = dataclasses.replace(scenario, samples=16_000, tweaks=tweaks, expect=expect)

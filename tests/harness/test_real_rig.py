@@ -24,10 +24,11 @@ from analogrig.hardware.real import LEAD_N, RealRig, split_records
 from analogrig.hardware.red_pitaya import RedPitaya
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.verdict import judge
+from analogrig.program import Program
 from analogrig.rigs.description import describe, open_rig
 from analogrig.rigs.rig import Performance
 from analogrig.run import Run
-from analogrig.scenario import PlantChoice, PotChange, Scenario
+from analogrig.scenario import PotChange, Scenario
 from analogrig.signals import ENDING
 from analogrig_emulator import Excitation
 from tests.harness.allowed import open_allowed
@@ -94,7 +95,7 @@ def test_each_play_begins_with_the_pots_of_its_scenario(ideal: Served, tmp_path:
 
 
 def test_scenario_longer_than_a_record_is_played_in_several(bench: str) -> None:
-    tweaks = (PotChange(5000, stiffness_n_per_m=18000.0), PotChange(16_500, damping_n_s_per_m=3453.0))
+    tweaks = (PotChange(5000, {"K": 18000.0}), PotChange(16_500, {"B": 3453.0}))
     run = played(bench, dataclasses.replace(THESIS, samples=20_000, tweaks=tweaks), 1)
     assert run.conditions.records == (0, 16_384 - (16_384 - (16_500 - LEAD_N)))
     assert run.samples == 20_000
@@ -393,8 +394,8 @@ def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_pa
             "whole samples apart, not 62.5 and 62.5",
         ),
         (dataclasses.replace(SHORT, excitation=Excitation("pulse", 0.1, 9.0, 100.0, duty=0.123)), "24.6 and 175.4"),
-        (dataclasses.replace(SHORT, plant=PlantChoice(set="shock")), "program 'shock'"),
-        (dataclasses.replace(SHORT, tweaks=(PotChange(100, mass_kg=50.0, ramp_n=20),)), "ramp_n"),
+        (dataclasses.replace(SHORT, program=Program.load("shock")), "program 'shock'"),
+        (dataclasses.replace(SHORT, tweaks=(PotChange(100, {"M": 50.0}, ramp_n=20),)), "ramp_n"),
         (dataclasses.replace(SHORT, excitation=Excitation(low_v=0.1, high_v=10.5)), "1.05 V"),
     ],
 )

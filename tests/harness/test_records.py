@@ -53,7 +53,7 @@ class Recorder(Rig):
 
 
 SCENARIO = dataclasses.replace(
-    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(PotChange(sample=CHANGE_AT, stiffness_n_per_m=16000.0),)
+    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(PotChange(sample=CHANGE_AT, set={"K": 16000.0}),)
 )
 
 

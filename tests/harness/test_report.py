@@ -65,9 +65,9 @@ def test_estimates_in_the_page_are_those_of_the_run(read: Page) -> None:
     columns = read.columns()
     for start, plant in PLANTS:
         k = start + 100
-        assert columns["M"][k] == pytest.approx(plant.mass_kg, rel=1e-3)
-        assert columns["B"][k] == pytest.approx(plant.damping_n_s_per_m, rel=1e-3)
-        assert columns["K"][k] == pytest.approx(plant.stiffness_n_per_m, rel=1e-3)
+        assert columns["M"][k] == pytest.approx(plant.parameters()["M"], rel=1e-3)
+        assert columns["B"][k] == pytest.approx(plant.parameters()["B"], rel=1e-3)
+        assert columns["K"][k] == pytest.approx(plant.parameters()["K"], rel=1e-3)
 
 
 def test_statistic_in_the_page_is_that_of_the_run(run: Run, read: Page) -> None:

@@ -14,9 +14,8 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Block, Rig
-from analogrig.run import CHANNELS
 from analogrig.scenario import PotChange, Scenario
-from analogrig_emulator import Capacitor, OpAmp, Resistor
+from analogrig_emulator import CHANNELS, Capacitor, OpAmp, Resistor
 
 NEEDED = "[card.range_v]"
 
@@ -84,15 +83,15 @@ def test_segments_tell_the_truth_after_each_tweak() -> None:
 
 
 def test_tweak_to_the_same_value_is_no_change() -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, mass_kg=115.0),))
+    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, set={"M": 115.0}),))
     assert len(scenario.segments()) == 1
 
 
 def test_pot_beyond_its_track_is_refused_before_the_run() -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, mass_kg=20.0),))
+    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, set={"M": 20.0}),))
     with (
         open_rig("emulator") as rig,
-        pytest.raises(ConfigurationError, match=r"healthy: tweaks\[0\] at sample 50: pot M: .*M_kg = 20"),
+        pytest.raises(ConfigurationError, match=r"healthy: tweaks\[0\] at sample 50: pot M: .*M = 20"),
     ):
         rig.perform(scenario, 1)
 
@@ -243,7 +242,7 @@ def test_a_pot_set_by_its_dial_passes_what_track_and_load_make_of_it(
     """Pot K at 24500 and 18000 N/m (facts 1: coefficients .8300 and .6098, dials .8511 and .6380) with a track of 15k
     into 49.9k: .8511 / (1 + .8511 x .1489 x 15 / 49.9) = .8199, likewise .5966."""
     rig = own(tmp_path, f'pots = "{pots}"\nvalues = {{ deviation = {{ K = 0.5 }} }}')
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(100, stiffness_n_per_m=18000.0),))
+    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(100, {"K": 18000.0}),))
     with open_rig(rig) as opened:
         assert isinstance(opened, EmulatorRig)
         computer, _, tweaks = opened.set_up(scenario, 1)

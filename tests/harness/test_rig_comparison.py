@@ -15,15 +15,17 @@ from analogrig.cli import main
 from analogrig.devices.opening import open_dut
 from analogrig.hardware.rig_comparison import RigComparison, compare_rigs, signal_difference
 from analogrig.judging.statistics import mean_interval
-from analogrig.plant import Plant
 from analogrig.rigs.emulator import CardDescription, EmulatorDescription, EmulatorRig
-from analogrig.run import CHANNELS, Run
+from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_emulator import CHANNELS
 from tests.harness.runs import made_run
+
+from .plants import front
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 DISPLACEMENT = CHANNELS.index("displacement")
-FRONT = Plant(115.0, 3021.0, 24500.0)
+FRONT = front(115.0, 3021.0, 24500.0)
 
 
 def rig(noise_lsb: float = 1.0, **faults: object) -> EmulatorRig:

@@ -10,11 +10,12 @@ import pytest
 
 from analogrig.catalogue import Cause, Change
 from analogrig.errors import RecordingError
-from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.runs import made_run
 
-FRONT = Plant(115.0, 3021.0, 24500.0)
+from .plants import front
+
+FRONT = front(115.0, 3021.0, 24500.0)
 SAID = [(30, Change.STIFFNESS, 11, 0.75), (320, Change.SEVERAL, 300, 1.0)]
 DIAGNOSIS = ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")
 FOUND = [(100, Cause.HUM, 0.0025, 3.5), (400, Cause.NONE, 0.0, 0.0)]
@@ -91,8 +92,8 @@ def rewritten(path: Path, header: object, **arrays: np.ndarray) -> None:
         (("channels",), []),
         (("scenario",), "x"),
         (("dut",), {}),
-        (("segments", 0, "plant", "mass_kg"), "heavy"),
-        (("segments", 0, "plant", "mass_kg"), 0.0),
+        (("segments", 0, "plant", "M"), "heavy"),
+        (("segments", 0, "plant", "M"), 0.0),
         (("segments", 0, "start"), 250),
         (("sample_period_s",), float("nan")),
         (("sample_period_s",), -1.0),

@@ -22,8 +22,8 @@ from analogrig.hardware.square_wave import EdgeTimes, SquareWave, step_response
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Block, Performance, Rig
-from analogrig.run import CHANNELS
 from analogrig.scenario import Scenario
+from analogrig_emulator import CHANNELS
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))
@@ -149,8 +149,8 @@ def soak(codes: Codes) -> Codes:
     return codes
 
 
-def pots(**settings: Any) -> Callable[[Scenario], Scenario]:
-    return lambda played: dataclasses.replace(played, plant=dataclasses.replace(played.plant, **settings))
+def pots(**settings: float) -> Callable[[Scenario], Scenario]:
+    return lambda played: dataclasses.replace(played, set=settings)
 
 
 def ranges(**changed: tuple[float, float]) -> dict[str, tuple[float, float]]:
@@ -199,9 +199,9 @@ FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
     ),
     "card fast": (lambda: emulate(clock_drift_ppm=100.0), ["clock ratio"]),
     "card slow": (lambda: emulate(clock_drift_ppm=-100.0), ["clock ratio"]),
-    "pot of M": (lambda: Altered(emulate(), play=pots(mass_kg=115.0 * 1.6)), ["mass"]),
+    "pot of M": (lambda: Altered(emulate(), play=pots(M=115.0 * 1.6)), ["mass"]),
     "pot of B": (
-        lambda: Altered(emulate(), play=pots(damping_n_s_per_m=3021.0 * 0.7)),
+        lambda: Altered(emulate(), play=pots(B=3021.0 * 0.7)),
         ["damping"],
     ),
     "a dielectric that soaks": (lambda: Altered(emulate(), soak), ["shape of displacement"]),
@@ -223,7 +223,7 @@ def test_half_of_each_limit_is_well() -> None:
         clock_drift_ppm=25.0,
         noise_lsb=0.001 * SWING_LSB[1],
     )
-    turned = Altered(rig, play=pots(mass_kg=115.0 * 1.15, damping_n_s_per_m=3021.0 * 0.925))
+    turned = Altered(rig, play=pots(M=115.0 * 1.15, B=3021.0 * 0.925))
     assert self_test(turned, 1).reasons == ()
 
 

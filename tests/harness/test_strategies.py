@@ -18,7 +18,7 @@ from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
-from analogrig.scenario import PLANTS, PlantChoice, PotChange, Scenario
+from analogrig.scenario import PotChange, Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.strategies import (
     DAMPING_RATIO,
@@ -32,6 +32,7 @@ from analogrig.testing.strategies import (
     seeds,
 )
 from analogrig_emulator import Excitation
+from tests.harness.plants import front
 from tests.harness.runs import made_run
 
 quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -74,9 +75,8 @@ def test_drawn_faults_are_such_that_a_line_has() -> None:
 
 
 def test_random_plants_are_those_that_the_device_is_held_to() -> None:
-    for choice in random_suspensions(200, seed=3):
-        plant = choice.plant()
-        ratio = plant.damping_n_s_per_m / (2.0 * (plant.stiffness_n_per_m * plant.mass_kg) ** 0.5)
+    for plant in random_suspensions(200, seed=3):
+        ratio = plant.parameters()["B"] / (2.0 * (plant.parameters()["K"] * plant.parameters()["M"]) ** 0.5)
         assert DAMPING_RATIO[0] - 1e-4 <= ratio <= DAMPING_RATIO[1] + 1e-4
         for name, (low, high) in REACH.items():
             assert low <= plant.parameters()[name] <= high
@@ -87,21 +87,21 @@ def test_random_plants_are_those_that_the_device_is_held_to() -> None:
     [
         (lambda _: True, {"samples": WARM_UP_N + SETTLING_N, "tweaks": 1}),
         (lambda scenario: len(scenario.tweaks) == 2, {"tweaks": 2}),
-        (lambda scenario: any("mass_kg" in tweak.overrides() for tweak in scenario.tweaks), {"tweaks": 1}),
+        (lambda scenario: any("M" in tweak.set for tweak in scenario.tweaks), {"tweaks": 1}),
     ],
 )
 def test_failing_scenario_shrinks_to_the_usual_in_all_that_does_not_matter(
     fails: Callable[[Scenario], bool], expected: dict[str, int]
 ) -> None:
     found = hypothesis.find(scenarios(), fails, settings=settings(quick, max_examples=200, phases=list(Phase)))
-    assert found.plant.plant() == PLANTS["front"]
+    assert found.plant == front()
     assert found.excitation == Excitation(low_v=0.1, high_v=9.9)
     assert len(found.tweaks) == expected["tweaks"]
     assert found.samples == expected.get("samples", found.samples)
 
 
 HALF = Excitation(low_v=0.1, high_v=9.9)
-FALLS = Scenario(1000, HALF, tweaks=(PotChange(600, stiffness_n_per_m=18000.0),))
+FALLS = Scenario(1000, HALF, tweaks=(PotChange(600, {"K": 18000.0}),))
 
 
 def test_change_of_nothing_that_shows_is_not_detectable() -> None:
@@ -140,5 +140,5 @@ def test_estimate_follows_itself_within_a_tube_and_not_what_comes_later(bench: B
 
 
 def test_alarms_without_a_change_are_counted() -> None:
-    finding = Played(made_run(np.zeros(100), [(0, PlantChoice().plant())], alarms=[7, 50])).stays_quiet()
+    finding = Played(made_run(np.zeros(100), [(0, front())], alarms=[7, 50])).stays_quiet()
     assert not finding and finding.why == "2 false alarms in 100 samples: 7, 50"

@@ -17,9 +17,11 @@ from analogrig.config import read_toml
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.qemu import QemuF405
 from analogrig.devices.registry import from_table
+from analogrig.hardware.instrument import MEASURED
 from analogrig.rigs.description import open_rig
-from analogrig.run import CHANNELS, MEASURED, Run
+from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_emulator import CHANNELS
 from tests.harness.firmware import FOLDER, needs_firmware
 from tests.harness.processes import LONG_S
 

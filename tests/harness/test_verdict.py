@@ -16,8 +16,10 @@ from analogrig.plant import Plant
 from analogrig.run import LOST
 from tests.harness.runs import ESTIMATOR, made_run
 
-FRONT = Plant(115.0, 3021.0, 24500.0)
-SOFT = Plant(115.0, 3021.0, 18000.0)
+from .plants import front
+
+FRONT = front(115.0, 3021.0, 24500.0)
+SOFT = front(115.0, 3021.0, 18000.0)
 LOADED = np.full(800, 2900.0)
 CHANGE = [(0, FRONT), (400, SOFT)]
 
@@ -173,7 +175,7 @@ def test_wrong_diagnosis_has_no_error_of_its_extent() -> None:
 
 
 def test_several_is_right_if_more_than_one_has_changed() -> None:
-    said = told((420, Change.SEVERAL, 404, 1.0), after=Plant(115.0, 2000.0, 18000.0))
+    said = told((420, Change.SEVERAL, 404, 1.0), after=front(115.0, 2000.0, 18000.0))
     assert said is not None
     assert (said.named, said.right, said.extent, said.extent_error) == ("several", True, None, None)
     said = told((420, Change.SEVERAL, 404, 1.0))

@@ -14,7 +14,7 @@ from analogrig.campaigns.rows import row
 from analogrig.catalogue import Change
 from analogrig.errors import RecordingError
 from analogrig.judging.verdict import Verdict, as_json, judge
-from analogrig.plant import Plant, Segment
+from analogrig.plant import Segment
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
 from analogrig.run import Run
@@ -22,9 +22,11 @@ from analogrig.testing.played import Played
 from analogrig.testing.plugin.junit import latency_property
 from tests.harness.runs import made_run
 
-FRONT = Plant(115.0, 3021.0, 24500.0)
-SOFT = Plant(115.0, 3021.0, 18000.0)
-LIGHT = Plant(60.0, 3021.0, 18000.0)
+from .plants import front
+
+FRONT = front(115.0, 3021.0, 24500.0)
+SOFT = front(115.0, 3021.0, 18000.0)
+LIGHT = front(60.0, 3021.0, 18000.0)
 LOADED = np.full(800, 2900.0)
 SWITCHED = np.where(np.arange(800) // 50 % 2, 2900.0, 0.0)
 

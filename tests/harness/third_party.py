@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from analogrig import Plant, Scenario
-from analogrig.rigs import CHANNELS, Block, Channel, Hindsight, Performance, Rig, RigDescription, Segment
+from analogrig import Scenario
+from analogrig.plant import Plant
+from analogrig.program import Program
+from analogrig.rigs import Block, Channel, Hindsight, Performance, Rig, RigDescription, Segment
 
 BLOCK_N, CODES = 100, 4096
 
@@ -44,17 +45,17 @@ class FlatRig(Rig):
             "force": Channel(0.0, lsb, "N", 294.0, 1.0),
             "displacement": Channel(0.0, lsb, "m", 0.01996, 1.0),
         }
-        plant = Plant(115.0, 3021.0, 24500.0)
-        changed = dataclasses.replace(plant, stiffness_n_per_m=21000.0)
+        plant = Plant.of(Program.load("front"))
+        changed = plant.changed({"K": 21000.0})
         segments = (Segment(0, plant), Segment(self._description.jump_at, changed))
-        return Performance(5e-5, 200.0, channels, self._blocks(scenario.samples, seed), lambda: Hindsight(segments))
+        return Performance(5e-5, 200.0, channels, self._blocks(scenario, seed), lambda: Hindsight(segments))
 
-    def _blocks(self, samples: int, seed: int) -> Iterator[Block]:
+    def _blocks(self, scenario: Scenario, seed: int) -> Iterator[Block]:
         random = np.random.default_rng(seed)
-        for first in range(0, samples, BLOCK_N):
-            index = np.arange(first, min(first + BLOCK_N, samples))
-            codes = np.zeros((len(index), len(CHANNELS)), np.uint16)
-            codes[:, CHANNELS.index("force")] = 2000
+        for first in range(0, scenario.samples, BLOCK_N):
+            index = np.arange(first, min(first + BLOCK_N, scenario.samples))
+            codes = np.zeros((len(index), len(scenario.program.channels)), np.uint16)
+            codes[:, 0] = 2000
             displacement = np.where(index <= self._description.jump_at, 2000, 2300) + random.integers(-5, 6, len(index))
-            codes[:, CHANNELS.index("displacement")] = displacement
+            codes[:, 1] = displacement
             yield Block(first, codes.astype(np.float64) * (10.0 / CODES), codes, np.zeros(codes.shape, np.bool_))

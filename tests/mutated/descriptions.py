@@ -28,8 +28,9 @@ SCENARIO: dict[str, Any] = {
         "register_length": 9,
         "seed": 0,
     },
-    "plant": {"set": "front", "mass_kg": 115.0, "damping_n_s_per_m": 3021.0, "stiffness_n_per_m": 24500.0},
-    "tweaks": [{"sample": 200, "stiffness_n_per_m": 18000.0, "ramp_n": 20}, {"sample": 250, "mass_kg": 60.0}],
+    "program": "front",
+    "set": {"M": 115.0, "B": 3021.0, "K": 24500.0},
+    "tweaks": [{"sample": 200, "set": {"K": 18000.0}, "ramp_n": 20}, {"sample": 250, "set": {"M": 60.0}}],
     "expect": {
         "missed": 9,
         "false_alarms": 9,
@@ -172,8 +173,8 @@ CAMPAIGN: dict[str, Any] = {
     "chunk": 2,
     "samples": 800,
     "change_at": 700,
-    "grid": {"mass_kg": [115.0], "stiffness_factor": [0.7, 0.9], "noise_lsb": [1.0]},
-    "draw": {"damping_n_s_per_m": [2900.0, 3100.0]},
+    "grid": {"M": [115.0], "K_factor": [0.7, 0.9], "noise_lsb": [1.0]},
+    "draw": {"B": [2900.0, 3100.0]},
     "stop": {"quantity": "missed", "rate": 0.1, "confidence": 0.95},
 }
 

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,19 +124,19 @@ def simplest(runs: Path) -> str:
     return _words(tomllib.loads(files[0].read_text(encoding="utf-8"))) if files else "-"
 
 
+def _values(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in values.items())
+
+
 def _words(scenario: dict[str, Any]) -> str:
     if scenario.get("description"):
         rig = Path(str(scenario.get("rig", ""))).stem or "emulator"
         return f"{rig}: {scenario['description']}; {scenario['samples']} samples, seed {scenario['seed']}"
-    plant, excitation = scenario["plant"], scenario["excitation"]
-    units = (("mass_kg", "M"), ("damping_n_s_per_m", "B"), ("stiffness_n_per_m", "K"))
-    words = [", ".join(f"{short} {plant[key]:g}" for key, short in units if key in plant) or plant["set"]]
+    excitation = scenario["excitation"]
+    words = [_values(scenario.get("set", {})) or str(scenario["program"])]
     levels = f"{excitation['low_v']:g} to {excitation['high_v']:g} V"
     words.append(f"{excitation['shape']} {levels}, {excitation['frequency_hz']:g} Hz")
-    words += [
-        f"at {tweak['sample']} {', '.join(f'{short} {tweak[key]:g}' for key, short in units if key in tweak)}"
-        for tweak in scenario.get("tweaks", [])
-    ]
+    words += [f"at {tweak['sample']} {_values(tweak['set'])}" for tweak in scenario.get("tweaks", [])]
     return f"{'; '.join(words)}; {scenario['samples']} samples, seed {scenario['seed']}"
 
 

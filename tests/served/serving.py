@@ -18,6 +18,7 @@ from typing import Any
 
 from analogrig.hardware.simulator.served import ServedDescription
 from analogrig.hardware.simulator.server import Server
+from analogrig.program import Program
 from analogrig.scenario import DEFAULT_SEED
 from tests.harness.processes import LONG_S
 
@@ -134,7 +135,7 @@ def ended(served: ServedByProcess, statuses: Sequence[int] = (0,)) -> str:
 @contextmanager
 def serving_in_thread(*defects: str, rig: str = "emulator") -> Iterator[Served]:
     """Serve a rig with defects in a thread of this process until the end of the block: sooner than another process."""
-    server = Server(ServedDescription.load(rig, defects).set_up("front", DEFAULT_SEED))
+    server = Server(ServedDescription.load(rig, defects).set_up(Program.load("front"), DEFAULT_SEED))
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()

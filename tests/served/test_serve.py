@@ -16,6 +16,7 @@ import pyvisa
 from analogrig.cli import main
 from analogrig.hardware.simulator.scpi import Interpreter
 from analogrig.hardware.simulator.served import ServedDescription
+from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
@@ -82,7 +83,7 @@ def test_served_computer_has_the_components_of_the_emulated_rig_with_the_same_se
         assert isinstance(opened, EmulatorRig)
         emulated = [opened.set_up(scenario, seed).computer.circuit for seed in (1, 2)]
     described = ServedDescription.load(rig)
-    served = [described.set_up(plant, seed)._computer._computer.circuit for seed in (1, 2)]
+    served = [described.set_up(Program.load(plant), seed)._computer._computer.circuit for seed in (1, 2)]
     assert [circuit.elements for circuit in served] == [circuit.elements for circuit in emulated]
     assert served[0].elements != served[1].elements
 
@@ -91,7 +92,7 @@ def test_noise_depends_on_the_seed_alone() -> None:
     description = ServedDescription.load("emulator-ideal", ["inputs.noise_v=[0.01,0.01]"])
 
     def noisy(seed: int) -> np.ndarray:
-        ask = asking(Interpreter(description.set_up("front", seed).commands))
+        ask = asking(Interpreter(description.set_up(Program.load("front"), seed).commands))
         say(ask, SEQUENCE)
         return record(ask)
 
@@ -113,7 +114,7 @@ def test_faults_of_the_card_are_added_to_the_instrument_and_others_are_named() -
 
 
 def test_first_line_names_rig_and_address() -> None:
-    command = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--plant", "shock", "--seed", "7"]
+    command = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--program", "shock", "--seed", "7"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
@@ -137,7 +138,7 @@ def test_signal_ends_the_server_and_closes_connections(sign: signal.Signals) -> 
 def test_json_has_the_same_content(served: ServedByProcess) -> None:
     address = f"127.0.0.1:{served.port}"
     place = {"host": "127.0.0.1", "port": served.port, "address": address}
-    assert served.said == {"rig": "emulator-ideal", "plant": "front", "seed": 1995, **place}
+    assert served.said == {"rig": "emulator-ideal", "program": "front", "seed": 1995, **place}
 
 
 def test_server_listens_on_the_loopback_interface_only(served: ServedByProcess) -> None:
@@ -181,7 +182,7 @@ def status_of(*options: str) -> int:
         (["--host", "192.0.2.1"], "cannot listen at 192.0.2.1:0"),
         (["--host", ""], "cannot listen: the host is empty"),
         (["--port", "65536"], "argument --port: must be a whole number from 0 to 65535"),
-        (["--plant", "rear"], "argument --plant: invalid choice: 'rear'"),
+        (["--program", "rear"], "no program is called 'rear'"),
     ],
 )
 def test_unusable_description_is_one_line_and_status_2(

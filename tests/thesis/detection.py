@@ -13,7 +13,6 @@ from analogrig.devices.description import DeviceDescription
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.opening import open_dut
 from analogrig.judging.verdict import SegmentEstimate, Verdict, judge
-from analogrig.plant import PARAMETERS
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 
@@ -73,7 +72,7 @@ def detect(scenario_name: str, rig_name: str, seeds: Iterable[int]) -> Detection
 
 
 def _errors(segment: SegmentEstimate) -> list[float]:
-    return [segment.error.get(name, np.nan) for name in PARAMETERS]
+    return [segment.error.get(name, np.nan) for name in segment.truth]
 
 
 def _by_change(verdicts: list[Verdict], field: str) -> NDArray[np.float64]:

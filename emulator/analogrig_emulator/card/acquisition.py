@@ -86,13 +86,23 @@ def acquired(
     _check_rate(machine, card, count)
     if count == 1 and card.clock_drift_ppm == 0 and not ahead:
         return machine.play(excitation, samples, changes, block_samples)
-    clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
-    slow = _OnCardClock(**dataclasses.asdict(excitation), probes=count, clock_hz=clock_hz)
+    slow = on_card_clock(card, excitation)
     slow_changes = [PotTurn(k * count, values, ramp_n * count) for k, values, ramp_n in changes]
     if not ahead:
         return _take_probes(machine.play(slow, samples * count, slow_changes, block_samples * count), card, count)
     probed = machine.play(slow, samples * count, slow_changes, block_samples * count, ahead)
     return _take_samples(probed, card, count, ahead / TICKS_PER_SAMPLE, rng)
+
+
+def on_card_clock(card: Card, excitation: Excitation) -> Excitation:
+    """Excitation as a machine with sample_rate_hz = card.true_rate_hz probes_per_sample(card) is to play it."""
+    clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
+    return _OnCardClock(**dataclasses.asdict(excitation), probes=probes_per_sample(card), clock_hz=clock_hz)
+
+
+def probe_of_channel(card: Card, channel: int) -> int:
+    """Probe within a sample at which a channel is taken."""
+    return int(_rows(card, probes_per_sample(card))[channel])
 
 
 def _check_rate(machine: Playable, card: Card, count: int) -> None:

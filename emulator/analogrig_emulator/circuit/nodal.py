@@ -163,7 +163,7 @@ class Nodal:
         if place in self._kept:
             return self._kept[place]
         if self._untrimmed is None:
-            return _keep(self._kept, place, self._system(dials, closed))
+            return _keep(self._kept, place, self._system(self._solution(dials, closed)))
         system, trim = self._untrimmed.with_trim(dials, closed)
         return _keep(self._kept, place, trim.apply(system, self._laws.offset[self._laws.poles]))
 
@@ -178,8 +178,7 @@ class Nodal:
             tuple([closed.get(switch.name, switch.closed) for switch in self._switches]),
         )
 
-    def _system(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> PiecewiseLinear:
-        solution = self._solution(dials, closed)
+    def _system(self, solution: Matrix) -> PiecewiseLinear:
         abc, g, cde, w_phi = self._flow(solution)
         voltages = solution[: len(self._nodes)]
         return PiecewiseLinear(
@@ -206,13 +205,16 @@ class Nodal:
         if not self.can_be_trimmed:
             raise CircuitError("the offset of an op-amp without a pole enters every node: it cannot be trimmed")
         closed = closed or {}
-        system, place = self.at(dials, closed), self._place(dials, closed)
-        if place not in self._trims:
-            _keep(self._trims, place, self._trim(dials, closed))
-        return system, self._trims[place]
+        place = self._place(dials, closed)
+        if place not in self._trims or place not in self._kept:
+            solution = self._solution(dials, closed)
+            if place not in self._kept:
+                _keep(self._kept, place, self._system(solution))
+            _keep(self._trims, place, self._trim(solution))
+        return self._kept[place], self._trims[place]
 
-    def _trim(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Trim:
-        laws, solution = self._laws, self._solution(dials, closed)
+    def _trim(self, solution: Matrix) -> Trim:
+        laws = self._laws
         apart_v = (solution[laws.plus] - solution[laws.minus])[laws.poles, self._columns - 1]
         slew_kinks = dict(zip(laws.drive_of_kink[laws.slews].tolist(), laws.slews.tolist(), strict=True))
         return Trim(

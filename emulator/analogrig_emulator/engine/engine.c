@@ -43,6 +43,7 @@ void engine_restart(engine_t* const self) {
     self->w_before   = self->arguments[1];
     self->w_there    = self->arguments[2];
     memset(self->z, 0, sizeof self->z);
+    memset(self->drives, 0, sizeof self->drives);
     self->z[self->columns - 1] = 1.0;
     for (int k = 0; k < PADDED(ENGINE_MAX_KINKS); k++) {
         self->lower[k] = -(double)INFINITY;
@@ -467,6 +468,14 @@ void engine_get_overdue(const engine_t* const self, int64_t* tick) {
     for (int k = 0; k < self->kinks; k++) {
         tick[k] = mode_overdue_tick(self, k);
     }
+}
+
+engine_status_t engine_drive(engine_t* const self, int product, int64_t samples, const double* terms) {
+    if (product < 0 || product >= self->products || samples < 1) {
+        return ENGINE_EDGE;
+    }
+    self->drives[product] = (drive_t){ samples, terms };
+    return ENGINE_OK;
 }
 
 void engine_look_ahead(engine_t* const self, int64_t ticks) { self->ahead = ticks; }

@@ -15,7 +15,8 @@
 ///
 /// The last elements of u may be products: functions of two elements of w each, its arguments. Between events a circuit with
 /// products is affine but for them. It is stepped by exponential collocation: the products are polynomials through the
-/// Lobatto nodes of a step, and all else follows exactly.
+/// Lobatto nodes of a step, and all else follows exactly. A product can be driven: a polynomial of time in each sample period
+/// is added to it. Without factors it is an input that moves between samples, such as a recorded one.
 ///
 /// The library is C99 with malloc, libm and the vectors of GCC and clang, for the host: not for interrupts and not for the
 /// device. One engine must not be used by two threads at once; different engines may. Results depend on the inputs alone,
@@ -39,6 +40,7 @@
 #define ENGINE_MAX_OUTPUTS 256
 #define ENGINE_MAX_UNKNOWNS 256
 #define ENGINE_MAX_FACTOR_TERMS 16
+#define ENGINE_DRIVE_TERMS 5
 #define ENGINE_LEVELS 23
 #define ENGINE_TICKS_PER_SAMPLE (INT64_C(1) << (ENGINE_LEVELS - 1))
 
@@ -185,6 +187,12 @@ void engine_watch(engine_t* self, int64_t patience);
 /// For each kink, write the first tick since engine_watch() at which it had been outside for that long; -1 if there is none.
 void engine_get_overdue(const engine_t* self, int64_t* tick);
 
+/// Drive a product from now until engine_restart(): add to it the polynomial of the present sample period, with ENGINE_DRIVE_TERMS
+/// coefficients in order of powers of the time since its sample, in sample periods. terms: a row for each of `samples` samples,
+/// the first for sample 0; the last one holds from there on. They are not copied. Neighbouring polynomials must meet. NULL: no
+/// drive. Fails with ENGINE_EDGE iff there is no such product, or samples < 1. Its own curvature shortens no step.
+engine_status_t engine_drive(engine_t* self, int product, int64_t samples, const double* terms);
+
 /// From now on record y once more `ticks` after each sample, at most one sample period: a row then holds both. To be called
 /// before the first sample. Edges and circuits after the sample are not foreseen, and the samples do not change.
 /// Cost: a longer product a sample, and a copy of the engine where it does not step slow states.
@@ -222,11 +230,6 @@ void engine_noise_add(int                   n,
                       const double*         normal,
                       double*               x,
                       double*               volts);
-
-/// Step a sampled linear system of n states: x becomes phi x + gamma u in each of `samples` periods, with one number u of input,
-/// and out takes the first element of x after each. n is at most ENGINE_MAX_STATES.
-void engine_follow(
-    int n, int64_t samples, const double* phi, const double* gamma, const double* input, double* x, double* out);
 
 /// Round the instants of `count` edges to ticks, and up to a multiple of grid; those before tick 0 move there. Of edges at one
 /// tick keep the last, and of those only the ones that change the level. Write the edges from tick start to stop - 1 to tick and

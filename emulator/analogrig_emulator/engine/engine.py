@@ -8,13 +8,14 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.engine import library
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, EdgeRows, Edges, PiecewiseLinear
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, EdgeRows, Edges, PiecewiseLinear
 from analogrig_emulator.errors import EngineError
 
 _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
@@ -52,7 +53,8 @@ class Engine:
 
     system: circuit; outputs: nodes to record; events_per_sample: most mode changes within a sample period, or
     EngineError is raised. ahead_ticks: if not 0, the voltages so many ticks after each sample follow in its row, as
-    they would be without edges and changes after the sample.
+    they would be without edges and changes after the sample. drives: inputs that move between samples, which then take
+    no edges.
     """
 
     def __init__(
@@ -62,7 +64,10 @@ class Engine:
         sample_rate_hz: float = 20e3,
         events_per_sample: int = 10_000,
         ahead_ticks: int = 0,
+        drives: Mapping[str, Drive] = MappingProxyType({}),
     ) -> None:
+        system = system.driven(tuple(drives))
+        self._drives = dict(drives)
         self._outputs = tuple(outputs)
         self._ahead_ticks = ahead_ticks
         self._names = (system.states, system.inputs)
@@ -86,9 +91,14 @@ class Engine:
         weakref.finalize(self, _release, kind, self._handle)
         self._library.engine_look_ahead(self._handle, ahead_ticks)
         self._kinks = len(system.kinks)
+        for product, drive in enumerate(drives.values(), products - len(drives)):
+            terms = drive.terms
+            if terms.shape != (len(terms), library.DRIVE_TERMS) or not (len(terms) and np.isfinite(terms).all()):
+                raise EngineError(f"a drive needs rows of {library.DRIVE_TERMS} finite coefficients")
+            self._check(self._library.engine_drive(self._handle, product, len(terms), terms.ctypes.data))
         self._recorded = 0
         self._now_tick = -1
-        self.set_system(system)
+        self._set(system)
 
     @property
     def recorded(self) -> int:
@@ -122,6 +132,9 @@ class Engine:
         The next sample is the first of the new circuit. Voltages of capacitors and op-amps carry over. An equal circuit
         changes no bit. Raises EngineError; the engine then runs only after it has accepted another circuit.
         """
+        self._set(system.driven(tuple(self._drives)))
+
+    def _set(self, system: PiecewiseLinear) -> None:
         if (system.states, system.inputs) != self._names:
             raise EngineError(
                 f"the new circuit has states {system.states} and inputs {system.inputs}, not {self._names}"
@@ -163,7 +176,8 @@ class Engine:
         Equals alternating run() and set_system(), at a fraction of the cost. Raises EngineError like both.
         """
         volts = self._allocate(samples)
-        layouts = [self._layout, *(system.layout(self._outputs) for _, system in changes)]
+        drives = tuple(self._drives)
+        layouts = [self._layout, *(system.driven(drives).layout(self._outputs) for _, system in changes)]
         circuits = (library.System * len(layouts))(*(layout.circuit for layout in layouts))
         lasts = [*(sample for sample, _ in changes), self._recorded + samples - 1]
         until = np.array(lasts, np.int64) * TICKS_PER_SAMPLE
@@ -217,6 +231,8 @@ class Engine:
         Each play equals alternating set_system() and run() on a new engine, at a fraction of the cost. Clock and
         watch() restart. Raises EngineError.
         """
+        if self._drives:
+            raise EngineError("a schedule is for inputs with edges: play drives with run()")
         ((name, trains),) = edges.items()
         plays, room = trains.ticks.shape
         if not (np.isfinite(trains.levels_v).all() and len(constants) == plays):

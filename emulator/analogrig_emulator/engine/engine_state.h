@@ -162,6 +162,12 @@ typedef struct {
     judgement_t (*look_on)(engine_t* self, int64_t tick);
 } kernels_t;
 
+/// See engine_drive(); terms is NULL without one.
+typedef struct {
+    int64_t       samples;
+    const double* terms;
+} drive_t;
+
 struct engine {
     const kernels_t* kernels;
 
@@ -195,6 +201,8 @@ struct engine {
     bool          has_limit;                        // rest and energy_limit are those of the present mode and inputs
     double        rest[PADDED(ENGINE_MAX_STATES)];  // of the slow states
     double        energy_limit;  // no event comes while e'Q e is below it; negative if there is no such limit
+
+    drive_t drives[ENGINE_MAX_PRODUCTS];  // of the products
 
     int64_t ahead;                                 // ticks; see engine_look_ahead()
     double  weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes

@@ -17,6 +17,7 @@ MAX_KINKS = 128
 MAX_OUTPUTS = 256
 MAX_UNKNOWNS = 256
 MAX_FACTOR_TERMS = 16
+DRIVE_TERMS = 5
 
 _HERE = Path(__file__).parents[1]
 _BUILD = "make setup"
@@ -65,6 +66,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
     ("engine_play", c_int, (c_void_p, c_int64, POINTER(System), c_void_p, c_int64, *(c_void_p,) * 4)),
     ("engine_play_all", c_int, (c_void_p, POINTER(Schedule), c_int64, *(c_void_p,) * 2, c_int64, *(c_void_p,) * 5)),
+    ("engine_drive", c_int, (c_void_p, c_int, c_int64, c_void_p)),
     ("engine_look_ahead", None, (c_void_p, c_int64)),
     ("engine_watch", None, (c_void_p, c_int64)),
     ("engine_get_overdue", None, (c_void_p, c_void_p)),
@@ -72,7 +74,6 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
     ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
     ("engine_noise_add", None, (c_int, c_int, c_int64, POINTER(Noise), *(c_void_p,) * 4)),
-    ("engine_follow", None, (c_int, c_int64, *(c_void_p,) * 5)),
     ("engine_take", None, (c_int64, c_int, c_int64, c_void_p, c_double, *(c_void_p,) * 4)),
     ("engine_edges", None, (*(c_int64,) * 5, *(c_void_p,) * 4)),
     ("engine_see", c_int, (c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),

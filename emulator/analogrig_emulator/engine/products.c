@@ -11,6 +11,10 @@
 #include <stdlib.h>
 #include <string.h>
 
+#if ENGINE_DRIVE_TERMS != ORDER
+#error a drive must be a polynomial through the nodes of a step
+#endif
+
 #define MAX_MOMENTS (ORDER * ENGINE_MAX_PRODUCTS)
 #define MAX_VALUES (NODES * ENGINE_MAX_PRODUCTS)
 #define MAX_ARGUMENTS (2 * MAX_VALUES)
@@ -308,12 +312,28 @@ static double evaluate(const double* coefficients, int degree, double at) {
     return value;
 }
 
-/// Evaluate all products of one instant.
-static void multiply_out(const engine_t* const self, const double* arguments, double* values) {
+/// Values of all drives at an instant in ticks.
+static void follow_drives(const engine_t* const self, double tick, double* driven) {
+    for (int i = 0; i < self->products; i++) {
+        const drive_t* const drive = &self->drives[i];
+        driven[i]                  = 0.0;
+        if (drive->terms != NULL) {
+            const double  period = (double)ENGINE_TICKS_PER_SAMPLE;
+            const int64_t last = drive->samples - 1, sample = (int64_t)(tick / period),
+                          row = sample < last ? sample : last;
+            driven[i] =
+                evaluate(&drive->terms[row * ENGINE_DRIVE_TERMS], ENGINE_DRIVE_TERMS - 1, tick / period - (double)row);
+        }
+    }
+}
+
+/// Evaluate all products of one instant, at which these are their drives.
+static void multiply_out(const engine_t* const self, const double* driven, const double* arguments, double* values) {
     const law_t* law = self->circuit->law;
     for (int i = 0; i < self->products; i++, law++, arguments += 2) {
         values[i] = evaluate(law->factors.x, law->x_degree, arguments[0]) *
-                    evaluate(law->factors.y, law->y_degree, arguments[1]);
+                        evaluate(law->factors.y, law->y_degree, arguments[1]) +
+                    driven[i];
     }
 }
 
@@ -334,14 +354,15 @@ void products_set_laws(const engine_t* self, const engine_product_t* products) {
 
 engine_status_t products_solve(engine_t* const self) {
     double* const held = &self->z[column_of(self, 0)];
-    double        values[ENGINE_MAX_PRODUCTS];
+    double        values[ENGINE_MAX_PRODUCTS], driven[ENGINE_MAX_PRODUCTS];
+    follow_drives(self, (double)self->now, driven);
     for (int pass = 0; pass < PASSES; pass++) {
         const engine_status_t status  = kinks_solve(self);
         bool                  settled = true;
         if (status != ENGINE_OK) {
             return status;
         }
-        multiply_out(self, &self->w[self->kinks - 2 * self->products], values);
+        multiply_out(self, driven, &self->w[self->kinks - 2 * self->products], values);
         for (int i = 0; i < self->products; i++) {
             settled = settled && fabs(values[i] - held[i]) <= SETTLED * fabs(held[i]);
             if (!isfinite(values[i])) {
@@ -386,12 +407,15 @@ static void predict(const engine_t* const self, int64_t ticks, step_t* step) {
     }
 }
 
-/// Find the products at the nodes. Return false if the iteration does not converge.
-static bool iterate(const engine_t* const self, const rung_t* rung, step_t* step) {
+/// Find the products at the nodes of a step from now. Return false if the iteration does not converge.
+static bool iterate(const engine_t* const self, const rung_t* rung, int64_t ticks, step_t* step) {
     const int     products = self->products, count = 2 * NODES * products, values = NODES * products;
-    double        fixed[MAX_ARGUMENTS], fed[MAX_ARGUMENTS], next[MAX_VALUES];
+    double        fixed[MAX_ARGUMENTS], fed[MAX_ARGUMENTS], next[MAX_VALUES], driven[MAX_VALUES];
     double* const v = &step->values[products];
     self->kernels->multiply(count, self->columns, rung->arguments, self->z, fixed);
+    for (int node = 0; node < NODES; node++) {
+        follow_drives(self, (double)self->now + nodes[node + 1] * (double)ticks, &driven[node * products]);
+    }
     for (int i = 0; i < ITERATIONS; i++) {
         double moved     = 0.0;
         bool   converged = true;
@@ -400,7 +424,7 @@ static bool iterate(const engine_t* const self, const rung_t* rung, step_t* step
             fed[j] += fixed[j];
         }
         for (int node = 0; node < NODES; node++) {
-            multiply_out(self, &fed[node * 2 * products], &next[node * products]);
+            multiply_out(self, &driven[node * products], &fed[node * 2 * products], &next[node * products]);
         }
         for (int j = 0; j < values; j++) {
             const double change = fabs(next[j] - v[j]);
@@ -418,7 +442,7 @@ static bool iterate(const engine_t* const self, const rung_t* rung, step_t* step
     return false;
 }
 
-/// Set the polynomials through the products at the nodes. Return the largest last Legendre coefficient.
+/// Set the polynomials through the products at the nodes. Return the largest last Legendre coefficient of those not driven.
 static double fit(const engine_t* const self, step_t* step) {
     const int products = self->products;
     double    largest  = 0.0;
@@ -431,7 +455,7 @@ static double fit(const engine_t* const self, step_t* step) {
             step->moments[k * products + i] = sum;
         }
         const double tail = fabs(step->moments[NODES * products + i]) / LEADING;
-        largest           = tail > largest ? tail : largest;
+        largest           = self->drives[i].terms == NULL && tail > largest ? tail : largest;
     }
     return largest;
 }
@@ -483,7 +507,7 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
     const int64_t ticks = INT64_C(1) << level;
     self->counts.steps++;
     predict(self, ticks, step);
-    if (!iterate(self, rung, step)) {
+    if (!iterate(self, rung, ticks, step)) {
         return level > 0 ? TOO_LONG : FAILED;
     }
     *tail = fit(self, step);
@@ -509,7 +533,9 @@ static void accept(engine_t* const self, int level, const step_t* step) {
     self->clear = self->now;
     step_accept(self, INT64_C(1) << level);
     self->now = self->clear;
-    multiply_out(self, &self->w[self->kinks - 2 * self->products], &self->z[column_of(self, 0)]);
+    double driven[ENGINE_MAX_PRODUCTS];
+    follow_drives(self, (double)self->now, driven);
+    multiply_out(self, driven, &self->w[self->kinks - 2 * self->products], &self->z[column_of(self, 0)]);
 }
 
 engine_status_t products_advance(engine_t* const self, int64_t tick) {

@@ -85,6 +85,45 @@ class Edges:
         return Edges(self.ticks + ticks, self.levels_v)
 
 
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Level of one input that moves all the time: a polynomial in each sample period.
+
+    terms: float64 (samples, DRIVE_TERMS), V: coefficients in order of powers of the time since each sample, in sample
+    periods. Neighbours meet; the last one is constant.
+    """
+
+    terms: Matrix
+
+    @classmethod
+    def band_limited(cls, samples_v: Matrix) -> Drive:
+        """Band-limited interpolation of samples (n,) in V, which go on in their mirror image; n is at least 1.
+
+        The polynomials pass through the interpolation at the nodes of the engine's longest step.
+        """
+        mirrored = np.concatenate((samples_v, samples_v[::-1]))
+        spectrum, turns = np.fft.rfft(mirrored), np.fft.rfftfreq(mirrored.size)
+        inner = [
+            np.fft.irfft(spectrum * np.exp(2j * np.pi * turns * node), mirrored.size)[: samples_v.size]
+            for node in _NODES[1:-1]
+        ]
+        after = np.append(samples_v[1:], samples_v[-1])
+        values = np.stack([samples_v, *inner, after], axis=1)
+        values[-1] = samples_v[-1]
+        terms = np.ascontiguousarray(values.T)
+        solve_in_place(np.vander(_NODES, increasing=True), terms)
+        return cls(np.ascontiguousarray(terms.T))
+
+    def at(self, tick: int) -> float:
+        """Level at a tick, from 0 on."""
+        row = min(tick // TICKS_PER_SAMPLE, len(self.terms) - 1)
+        return _polynomial(tuple(self.terms[row].tolist()), tick / TICKS_PER_SAMPLE - row)
+
+
+_NODES = (0.0, 0.5 - 0.5 * math.sqrt(3.0 / 7.0), 0.5, 0.5 + 0.5 * math.sqrt(3.0 / 7.0), 1.0)
+"""Lobatto nodes of a step."""
+
+
 @dataclass(frozen=True)
 class Kink:
     """A continuous function of three linear pieces, with slopes below lower, between, and above upper.
@@ -241,6 +280,29 @@ class PiecewiseLinear:
     def with_drives(self, abc: Matrix, cde: Matrix) -> PiecewiseLinear:
         """The same state space with other abc and cde."""
         return replace(self, abc=abc, cde=cde, origin=self.origin or self)
+
+    def driven(self, names: Sequence[str]) -> PiecewiseLinear:
+        """The same state space with these inputs moved to the end of the products, for drives. Raises CircuitError."""
+        if missing := [name for name in names if name not in self.inputs]:
+            raise CircuitError(f"no input is called {missing[0]!r}; there are {', '.join(self.inputs) or 'none'}")
+        if not names:
+            return self
+        last, more = self.abc.shape[1] - 1, 2 * len(names)
+        moved = [len(self.states) + self.inputs.index(name) for name in names]
+        columns = [*(j for j in range(last) if j not in moved), *moved, last]
+        return PiecewiseLinear(
+            states=self.states,
+            inputs=tuple(name for name in self.inputs if name not in names),
+            nodes=self.nodes,
+            kinks=(*self.kinks, *(Kink.none(name) for name in names for _ in range(2))),
+            abc=self.abc[:, columns],
+            g=np.pad(self.g, ((0, 0), (0, more))),
+            cde=np.pad(self.cde[:, columns], ((0, more), (0, 0))),
+            w_phi=np.pad(self.w_phi, (0, more)),
+            lmn=self.lmn[:, columns],
+            v_phi=np.pad(self.v_phi, ((0, 0), (0, more))),
+            products=(*self.products, *(Product((0.0,), (0.0,), name) for name in names)),
+        )
 
     @functools.cached_property
     def layouts(self) -> dict[tuple[str, ...], Layout]:

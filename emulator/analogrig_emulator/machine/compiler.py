@@ -14,15 +14,18 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import PotError, ProgramError
+from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
-from analogrig_emulator.machine.program import SOURCE, PotRow, Program, Scale, Scales
+from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scale, Scales
 from analogrig_emulator.machine.program_file import Equations, read_program
+from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.stages import (
     REFERENCE,
     Cord,
@@ -33,6 +36,9 @@ from analogrig_emulator.machine.stages import (
     stages_of,
 )
 from analogrig_emulator.machine.trial import Reach, reaches
+
+DIAGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
+"""Circuits wired by hand, by the name that a program file gives as its diagram."""
 
 MACHINE_V = 10.0
 """Voltage of full scale, of the reference, and scale of the multipliers."""
@@ -98,7 +104,7 @@ class PatchedElement:
 
 
 @dataclass(frozen=True)
-class PatchedProgram(Program):
+class PatchedProgram(ProgramCircuit):
     """Program compiled from equations.
 
     patch: computing elements in the order of the diagram; inverters: names of the last amplifiers, by quantity;
@@ -171,6 +177,25 @@ class PatchedProgram(Program):
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
         given = iter(models)
         return [replace(each, model=next(given)) if isinstance(each, OpAmp) else each for each in self.elements]
+
+
+def wired(equations: Equations) -> ProgramCircuit:
+    """Circuit that solves the equations: that of the diagram that the file names, or else their patch.
+
+    Raises ProgramError like compile_program(), and for an unknown diagram or one with other parameters and channels.
+    """
+    if not equations.diagram:
+        return compile_program(equations)
+    if equations.diagram not in DIAGRAMS:
+        raise ProgramError(f"diagram: unknown {equations.diagram[:40]!r}{suggestion(equations.diagram, DIAGRAMS)}")
+    program = DIAGRAMS[equations.diagram]
+    pots = [name for name, row in equations.parameters.items() if row.pot]
+    if pots != list(program.values) or equations.channels != program.channels:
+        raise ProgramError(
+            f"diagram {equations.diagram}: it has the parameters {', '.join(program.values)} and the channels"
+            f" {', '.join(program.channels)}; leave out diagram, or name these"
+        )
+    return program
 
 
 def load_program(path: str | Path) -> PatchedProgram:

@@ -98,6 +98,11 @@ class Formula(ABC):
         for part in self.parts:
             yield from part.names()
 
+    def divisors(self) -> Iterator[str]:
+        """Names by which the formula divides, in order."""
+        for part in self.parts:
+            yield from part.divisors()
+
     @abstractmethod
     def law(self, tables: Tables) -> Law:
         """Function that computes the formula."""
@@ -181,6 +186,11 @@ class Operation(Formula):
         if one is None or other is None:
             return None
         return one * other if self.sign == "*" else one / other
+
+    def divisors(self) -> Iterator[str]:
+        yield from super().divisors()
+        if self.sign == "/":
+            yield from self.right.names()
 
 
 @dataclass(frozen=True)

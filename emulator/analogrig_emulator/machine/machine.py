@@ -41,7 +41,7 @@ from analogrig_emulator.circuit.nodal import Nodal, analyse
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Kink, PiecewiseLinear
 from analogrig_emulator.errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
 from analogrig_emulator.machine.patching import Patch, patches
 
@@ -121,10 +121,8 @@ class AnalogComputer:
             raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
         # First: it rejects a circuit that is too large at once.
         self._nodals = {Mode.OPERATE: analyse(circuit)}
-        if missing := [node for node in readings if node not in circuit.nodes]:
-            raise CircuitError(f"readings: no node is called {missing[0]!r}; there are {', '.join(circuit.nodes)}")
         self._patched = circuit
-        self._readings = tuple(readings)
+        self.read_nodes(readings)
         self._patches = patches(circuit)
         self._initial_v = dict(initial_v or {})
         self._ic_ohm = ic_ohm
@@ -175,6 +173,11 @@ class AnalogComputer:
         return self._engine.recorded
 
     @property
+    def state(self) -> NDArray[np.float64]:
+        """Voltages of the states of the circuit at the last sample recorded."""
+        return self._engine.state
+
+    @property
     def lamps(self) -> dict[str, int | None]:
         """First sample by amplifier with its overload lamp lit, None while it is dark."""
         amplifiers = [amp.name for amp in self._patched.of(OpAmp)]
@@ -194,7 +197,9 @@ class AnalogComputer:
         nodes = self._patched.nodes
         probe = Engine(self._system, nodes, self._sample_rate_hz)
         probe.state = self._engine.state
-        volts = probe.run(1, {name: Edges(np.zeros(1, np.int64), np.array([v])) for name, v in self._levels_v.items()})
+        driven_v = {name: drive.at(max(self._engine.now_tick, 0)) for name, drive in self._drives.items()}
+        levels_v = self._levels_v | driven_v
+        volts = probe.run(1, {name: Edges(np.zeros(1, np.int64), np.array([v])) for name, v in levels_v.items()})
         return dict(zip(nodes, volts[0].tolist(), strict=True))
 
     # ---- pots
@@ -234,6 +239,14 @@ class AnalogComputer:
         if pot not in self._wipers.pots:
             raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._wipers.pots)) or 'none'}")
 
+    def operating(self, dials: Mapping[str, float]) -> PiecewiseLinear:
+        """State space of OPERATE with pots at these dials, windings left out; the others as they stand.
+
+        The machine does not change. Raises PotError and CircuitError.
+        """
+        settled = self._dials | dict(dials) | self._wipers.contacts_at_rest(dials)
+        return self._nodals[Mode.OPERATE].at(settled, self._closed)
+
     def throw(self, closed: Mapping[str, bool]) -> None:
         """Throw switches of the circuit, in any mode.
 
@@ -267,12 +280,29 @@ class AnalogComputer:
 
     # ---- operation
 
-    def restart(self, mode: Mode = Mode.INITIAL_CONDITION, ahead_ticks: int = 0) -> None:
+    @property
+    def readings(self) -> int:
+        """Number of nodes that run() records."""
+        return len(self._readings)
+
+    def read_nodes(self, readings: Sequence[str]) -> None:
+        """Set the nodes that run() records, from the next restart() on. Raises CircuitError for an unknown node."""
+        if missing := [node for node in readings if node not in self._patched.nodes]:
+            there = ", ".join(self._patched.nodes)
+            raise CircuitError(f"readings: no node is called {missing[0]!r}; there are {there}")
+        self._readings = tuple(readings)
+
+    def restart(
+        self,
+        mode: Mode = Mode.INITIAL_CONDITION,
+        ahead_ticks: int = 0,
+        drives: Mapping[str, Drive] = MappingProxyType({}),
+    ) -> None:
         """Restart in a mode: empty capacitors, inputs at 0 V, dark lamps, clock before sample 0.
 
-        Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks: as for Engine.
+        Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks, drives: as for Engine.
         """
-        self._mode, self._ahead_ticks = mode, ahead_ticks
+        self._mode, self._ahead_ticks, self._drives = mode, ahead_ticks, dict(drives)
         self._dials |= self._wipers.contacts_at_rest(self._turns)
         self._turns = {}
         self._levels_v = {source.name: 0.0 for source in self._patched.inputs}
@@ -380,7 +410,9 @@ class AnalogComputer:
     def _engine(self) -> Engine:
         """Engine, made on first use after a restart: most machines have their pots set before they are played."""
         if self._powered is None:
-            self._powered = Engine(self._system, self._readings, self._sample_rate_hz, ahead_ticks=self._ahead_ticks)
+            self._powered = Engine(
+                self._system, self._readings, self._sample_rate_hz, ahead_ticks=self._ahead_ticks, drives=self._drives
+            )
             self._powered.watch(self._lamp_delay_ticks)
             self._charge_at_once(self._powered)
         return self._powered

@@ -105,7 +105,7 @@ class PotRow:
     settings: tuple[str, ...]
 
 
-class Program(ABC):
+class ProgramCircuit(ABC):
     """Circuit for the machine, with its scales and pots. Programs never change."""
 
     name: str
@@ -117,7 +117,7 @@ class Program(ABC):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """Parameters by setting ("M_kg") that turn one pot each, first mass, damper and spring of the sprung mass."""
+        """Parameters by setting ("M") that turn one pot each, first mass, damper and spring of the sprung mass."""
         return {}
 
     @property

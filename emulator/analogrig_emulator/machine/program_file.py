@@ -14,9 +14,13 @@
     omega = { unit = "rad/s", full = 250.0 }
     [parameters]
     R = { value = 1.2, unit = "ohm", range = [0.8, 1.6] }
+    [estimates]                          # formulas in gain, s0, s1 and the estimates above
+    k = "1 / gain"
 
 A line `x' = ...` is the derivative of a state. A line `S = ...` defines a signal, which `[signals]` may give a unit and
-a full scale. Nothing in a file is executed.
+a full scale. The first channel is the input, the second the output of the response that a device estimates:
+gain / (... + s1 s + s0) times s0, in the units of the plant. `diagram` names a circuit of the machine that is wired by
+hand; the compiler makes one otherwise. Nothing in a file is executed.
 """
 
 from __future__ import annotations
@@ -28,7 +32,7 @@ import itertools
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +80,8 @@ class Quantity:
 class ProgramParameter:
     """Parameter: value, least and greatest value for which pots must suffice, and unit.
 
-    pot: True if changes of a run may name it.
+    pot: True if changes of a run may name it. alias: another name in scenarios. diagnosis: name in the diagnoses of a
+    device.
     """
 
     value: float
@@ -84,6 +89,8 @@ class ProgramParameter:
     high: float
     unit: Unit | None = None
     pot: bool = True
+    alias: str = ""
+    diagnosis: str = ""
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,7 @@ class Equations:
 
     speed: speed of the machine relative to the plant. period_s: period of the trial play's square wave, in s of the
     plant. derivatives: equations of the states, in the order of `states`; definitions: those of the signals, in an
-    order in which they can be computed.
+    order in which they can be computed. diagram: circuit wired by hand. estimates: formulas of parameters, in order.
     """
 
     name: str
@@ -136,6 +143,8 @@ class Equations:
     functions: Mapping[str, Points]
     derivatives: tuple[Equation, ...]
     definitions: tuple[Equation, ...]
+    diagram: str = ""
+    estimates: Mapping[str, Formula] = field(default_factory=dict)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -197,13 +206,18 @@ def _parsed(data: bytes) -> Equations:
     if len(data) > _MOST_BYTES:
         raise ProgramError(f"larger than {_MOST_BYTES} bytes")
     try:
-        return _Reader(tomllib.loads(data.decode())).equations()
+        return equations_of(tomllib.loads(data.decode()))
     except UnicodeDecodeError as cause:
         raise ProgramError(f"is no UTF-8 text: byte {cause.start} does not fit; save it as UTF-8") from None
     except ValueError as cause:  # a TOMLDecodeError, or a number of too many digits
         raise ProgramError(f"is no TOML: {cause}") from None
     except RecursionError:
         raise ProgramError("is nested too deeply") from None
+
+
+def equations_of(table: Mapping[str, Any]) -> Equations:
+    """Program of a file's tables. Raises ProgramError that names the place and the cure."""
+    return _Reader(table).equations()
 
 
 class _Reader:
@@ -221,6 +235,8 @@ class _Reader:
         "signals",
         "parameters",
         "functions",
+        "diagram",
+        "estimates",
     )
 
     def __init__(self, table: Mapping[str, Any]) -> None:
@@ -260,6 +276,8 @@ class _Reader:
             functions=self.functions,
             derivatives=tuple(derivatives),
             definitions=tuple(definitions),
+            diagram=_text("diagram", self._table.get("diagram", "")),
+            estimates=self._estimates(),
         )
 
     # ---- tables
@@ -297,7 +315,7 @@ class _Reader:
 
     def _parameter(self, name: str, row: Mapping[str, Any]) -> ProgramParameter:
         place = f"parameters.{name}"
-        _check_keys(place, row, ("value", "range", "unit", "pot"))
+        _check_keys(place, row, ("value", "range", "unit", "pot", "alias", "diagnosis"))
         if "value" not in row:
             raise ProgramError(f"{place}: value is missing")
         value = _number(f"{place}.value", row["value"], low=_LEAST)
@@ -309,7 +327,8 @@ class _Reader:
         pot = row.get("pot", True)
         if not isinstance(pot, bool):
             raise ProgramError(f"{place}.pot: {pot!r} is neither true nor false")
-        return ProgramParameter(value, low, high, _unit(place, row), pot)
+        alias, diagnosis = (_text(f"{place}.{key}", row.get(key, "")) for key in ("alias", "diagnosis"))
+        return ProgramParameter(value, low, high, _unit(place, row), pot, alias, diagnosis)
 
     def _points(self, name: str, row: Mapping[str, Any]) -> Points:
         place = f"functions.{name}"
@@ -401,6 +420,34 @@ class _Reader:
             if name not in seen:
                 raise ProgramError(f"signals.{name}: no equation gives {name}; write it, or delete the signal")
         self.signals = {name: self.signals.get(name, Quantity()) for name in seen}
+
+    def _estimates(self) -> dict[str, Formula]:
+        """Formulas of the parameters that a device's model of the response from input to output yields."""
+        rows = self._table.get("estimates", {})
+        if not isinstance(rows, dict):
+            raise ProgramError("estimates: write a table, [estimates]")
+        units = self._response_units()
+        found: dict[str, Formula] = {}
+        for name, text in rows.items():
+            with _at(f"estimates.{name[:40]}"):
+                if name not in self.parameters or not self.parameters[name].pot:
+                    raise ProgramError(f"no pot shows a parameter {name[:40]!r}{suggestion(name, self.parameters)}")
+                formula = parse_formula(_text("formula", text))
+                for used in formula.names():
+                    if used not in units and used not in CONSTANTS:
+                        raise ProgramError(f"unknown name {used!r}{suggestion(used, units)}")
+                units[name] = self.parameters[name].unit
+                _check_unit(name, units[name], formula.unit(units, {}))
+                found[name] = formula
+        return found
+
+    def _response_units(self) -> dict[str, Unit | None]:
+        """Units of the response from input to output: of its gain and of the coefficients of its denominator."""
+        quantities = {**self.inputs, **self.states, **self.signals}
+        below, above = (quantities[name].unit for name in (self._channels() * 2)[:2])
+        units = {"gain": None if above is None or below is None else above / below}
+        order = len(self.states)
+        return units | {f"s{i}": parse_unit("s") ** (i - order) for i in range(order)}
 
     def _check_names(self) -> None:
         """Raise ProgramError for a name with two meanings."""

@@ -30,7 +30,7 @@ from analogrig_emulator.circuit.circuit import (
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.errors import CircuitError
-from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, ProgramCircuit, Scale, Scales
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class BumpStop:
 
 
 @dataclass(frozen=True)
-class SuspensionProgram(Program):
+class SuspensionProgram(ProgramCircuit):
     """Parameters with suitable scaling and nominal parts.
 
     force_n, velocity_m_per_s: full scale, 10 V; the displacement's is time velocity R2 C2. stop: optional bump stop.
@@ -122,9 +122,9 @@ class SuspensionProgram(Program):
         by_b, by_k = parts.rb_ohm / parts.rfb_ohm, parts.rk_ohm / parts.rfb_ohm
         displacement_m = self.scales.full("displacement")
         return {
-            "M_kg": Mass("M", "R1", self.M_kg, mass, velocity_m_per_s),
-            "B_n_s_per_m": ForceLaw("B", "RB", self.B_n_s_per_m, velocity_m_per_s, force_n, by_b),
-            "K_n_per_m": ForceLaw("K", "RK", self.K_n_per_m, displacement_m, force_n, by_k),
+            "M": Mass("M", "R1", self.M_kg, mass, velocity_m_per_s),
+            "B": ForceLaw("B", "RB", self.B_n_s_per_m, velocity_m_per_s, force_n, by_b),
+            "K": ForceLaw("K", "RK", self.K_n_per_m, displacement_m, force_n, by_k),
         }
 
     @property

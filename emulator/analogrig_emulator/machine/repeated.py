@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import OpAmp
 from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.engine.engine import CircuitSchedule, Engine
 from analogrig_emulator.machine.machine import lamp_samples
@@ -30,9 +31,10 @@ class Repeat(NamedTuple):
 
 
 def is_repeatable(computer: SuspensionComputer, changes: Sequence[PotTurn]) -> bool:
-    """True if RepeatedPlay accepts it: no ramps, and op-amps whose offsets enter nothing but their own drives."""
+    """True if RepeatedPlay accepts it: no ramps, no products, op-amps whose offsets enter only their own drives."""
     has_ramps = any(change.ramp_n for change in changes)
-    return not has_ramps and all(amp.model.has_state for amp in computer.circuit.of(OpAmp))
+    has_products = bool(computer.circuit.of(Multiplier) or computer.circuit.of(Function))
+    return not (has_ramps or has_products) and all(amp.model.has_state for amp in computer.circuit.of(OpAmp))
 
 
 class RepeatedPlay:

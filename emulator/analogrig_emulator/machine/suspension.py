@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TypeAlias
@@ -13,18 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
-from analogrig_emulator.engine.system import Edges, is_integer
+from analogrig_emulator.engine.system import Drive, Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
-from analogrig_emulator.machine.program import SOURCE, Program, Scales
+from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK
 from analogrig_emulator.machine.two_mass import TWO_MASS
 
-PROGRAMS: Mapping[str, Program] = MappingProxyType(
+PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType(
     {program.name: program for program in (FRONT, SHOCK, BUMP_STOP, TWO_MASS)}
 )
 """Programs by name."""
@@ -47,7 +48,7 @@ class SuspensionComputer:
 
     def __init__(
         self,
-        program: str | Program = "front",
+        program: str | ProgramCircuit = "front",
         *,
         opamp: str | OpAmpModel = "tl07x",
         components: Components = NOMINAL,
@@ -77,6 +78,8 @@ class SuspensionComputer:
         self._values = dict(self.program.values)
         self.machine.turn({pot: self._dial(pot, self._values) for pot in self._pots})
         self._plays = 0
+        self.probed: NDArray[np.float64] = np.empty((0, 0))
+        """Volts of the probed nodes in the last block of play_in_steps(): (samples, probes)."""
 
     @property
     def circuit(self) -> Circuit:
@@ -99,7 +102,7 @@ class SuspensionComputer:
         return {pot: self._pots[pot].coefficient(dial) for pot, dial in self.dials.items()}
 
     def set(self, ramp_n: int = 0, /, **settings: float) -> None:
-        """Set pots by value (front: M_kg, B_n_s_per_m, K_n_per_m) or by dial (M_dial, B_dial, K_dial, 0..1).
+        """Set pots by value (front: M, B, K) or by dial (M_dial, B_dial, K_dial, 0..1).
 
         Values set the coefficient under load, as in pot-set mode. A running machine keeps its voltages. With ramp_n
         the pots arrive so many samples after the last one taken.
@@ -112,6 +115,10 @@ class SuspensionComputer:
     def dials_for(self, **settings: float) -> dict[str, float]:
         """Dials to which set(**settings) turns the pots."""
         return self.machine.resting(self._resolve(settings, dict(self._values)))
+
+    def dials_between(self, settings: Mapping[str, float]) -> dict[str, float]:
+        """Dials for settings on continuous tracks, between windings. Raises PotError."""
+        return self._resolve(settings, dict(self._values))
 
     def plan(self, changes: Sequence[PotTurn], samples: int) -> list[PotTurn]:
         """Dials by pot that play(..., samples, changes) sets, in order of time. Raises PotError."""
@@ -127,7 +134,7 @@ class SuspensionComputer:
 
     def play(
         self,
-        excitation: Excitation,
+        excitation: Excitation | RecordedExcitation,
         samples: int,
         changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
@@ -137,7 +144,7 @@ class SuspensionComputer:
 
         If ahead_ticks is not 0, a row has 8 volts: those of the sample, and those so many ticks later, as for Engine.
 
-        The excitation's first level applies at sample 0. A change takes effect right after its sample is
+        The excitation's first level or sample applies at sample 0. A change takes effect right after its sample is
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
         Raises PotError, ExcitationError and EngineError; for invalid arguments before anything is played.
         """
@@ -145,7 +152,7 @@ class SuspensionComputer:
 
     def play_planned(
         self,
-        excitation: Excitation,
+        excitation: Excitation | RecordedExcitation,
         samples: int,
         turns: Sequence[PotTurn],
         block_samples: int = BLOCK_SAMPLES,
@@ -154,20 +161,49 @@ class SuspensionComputer:
         """Play like play(), with turns from plan()."""
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
-        excitation.period_ticks(self.sample_rate_hz)
-        self.machine.restart(Mode.OPERATE, ahead_ticks)
-        self._plays += 1
-        return self._blocks(self._plays, excitation, samples, list(turns), block_samples)
+        lengths = (min(block_samples, samples - start) for start in range(0, samples, block_samples))
+        return self._begin(excitation, lengths, list(turns), ahead_ticks)
+
+    def play_in_steps(
+        self, excitation: Excitation, lengths: Iterable[int], probes: Sequence[str] = (), ahead_ticks: int = 0
+    ) -> Iterator[NDArray[np.float64]]:
+        """Play from rest like play(), in blocks of these lengths, each drawn when its block is requested.
+
+        Between two blocks set() turns the pots and machine.switch() the relays. probes: nodes to read as well, into
+        `probed`. The volts are those of play() to the bit. Raises ExcitationError, EngineError and CircuitError.
+        """
+        return self._begin(excitation, lengths, [], ahead_ticks, probes)
 
     # ---- playing
 
-    def _blocks(
-        self, play: int, excitation: Excitation, samples: int, turns: list[PotTurn], block_samples: int
+    def _begin(
+        self,
+        excitation: Excitation | RecordedExcitation,
+        lengths: Iterable[int],
+        turns: list[PotTurn],
+        ahead_ticks: int,
+        probes: Sequence[str] = (),
     ) -> Iterator[NDArray[np.float64]]:
-        for start in range(0, samples, block_samples):
-            stop = min(start + block_samples, samples)
+        drives: dict[str, Drive] = {}
+        generator = None if isinstance(excitation, RecordedExcitation) else excitation
+        if isinstance(excitation, RecordedExcitation):
+            drives[SOURCE] = excitation.drive
+        else:
+            excitation.period_ticks(self.sample_rate_hz)
+        self.machine.read_nodes((*self.program.channel_nodes, *probes))
+        self.machine.restart(Mode.OPERATE, ahead_ticks, drives)
+        self._plays += 1
+        return self._blocks(self._plays, generator, lengths, turns)
+
+    def _blocks(
+        self, play: int, excitation: Excitation | None, lengths: Iterable[int], turns: list[PotTurn]
+    ) -> Iterator[NDArray[np.float64]]:
+        stop = 0
+        for length in lengths:
+            stop += length
             parts = []
-            edges = excitation.edges(*self.machine.window(stop - start), self.sample_rate_hz)
+            window = self.machine.window(length)
+            edges = None if excitation is None else excitation.edges(*window, self.sample_rate_hz)
             while play == self._plays and self.machine.recorded < stop:
                 now = [turn for turn in turns if turn.sample < stop]
                 if not self.machine.is_turning and not any(turn.ramp_n for turn in now):
@@ -183,14 +219,19 @@ class SuspensionComputer:
                 raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _advance(self, edges: Edges, samples: int, turns: Sequence[PotTurn] = ()) -> NDArray[np.float64]:
+    def _advance(self, edges: Edges | None, samples: int, turns: Sequence[PotTurn] = ()) -> NDArray[np.float64]:
         """Volts of the next samples, with these turns, all at once: (samples, channels)."""
-        trains = {SOURCE: edges.within(*self.machine.window(samples))}
+        trains = {} if edges is None else {SOURCE: edges.within(*self.machine.window(samples))}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
-        by_instant = volts.reshape(samples, -1, len(self._signs))
-        by_instant *= self._signs
-        return volts
+        channels = len(self._signs)
+        readings = self.machine.readings
+        by_instant = volts.reshape(samples, volts.shape[1] // readings, readings)
+        by_instant[..., :channels] *= self._signs
+        if readings == channels:
+            return volts
+        self.probed = by_instant[:, 0, channels:]
+        return by_instant[..., :channels].reshape(samples, -1)
 
     # ---- pots
 
@@ -241,19 +282,21 @@ class _LoadedPot:
 _LoadedPots: TypeAlias = dict[str, _LoadedPot]
 
 
-def _wired(program: Program, models: Sequence[OpAmpModel], components: Components) -> tuple[Circuit, _LoadedPots]:
+def _wired(
+    program: ProgramCircuit, models: Sequence[OpAmpModel], components: Components
+) -> tuple[Circuit, _LoadedPots]:
     """Circuit of a program with these op-amps and components, and its pots."""
     circuit = Circuit(components.fit(program.netlist(models)))
     return circuit, _pots(program, circuit, components)
 
 
 @functools.lru_cache(maxsize=8)
-def _nominal(program: Program, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
+def _nominal(program: ProgramCircuit, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
     """The same with perfect components. Equal machines share their circuit, and with it its equations."""
     return _wired(program, [model] * program.amplifiers, NOMINAL)
 
 
-def _pots(program: Program, circuit: Circuit, components: Components) -> _LoadedPots:
+def _pots(program: ProgramCircuit, circuit: Circuit, components: Components) -> _LoadedPots:
     loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
     tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
@@ -262,8 +305,8 @@ def _pots(program: Program, circuit: Circuit, components: Components) -> _Loaded
     }
 
 
-def _program(program: str | Program) -> Program:
-    if isinstance(program, Program):
+def _program(program: str | ProgramCircuit) -> ProgramCircuit:
+    if isinstance(program, ProgramCircuit):
         return program
     if program not in PROGRAMS:
         raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}")

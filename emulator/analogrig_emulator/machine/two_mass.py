@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from analogrig_emulator.circuit.circuit import Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
-from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, ProgramCircuit, Scale, Scales
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class TwoMassParts:
 
 
 @dataclass(frozen=True)
-class TwoMassProgram(Program):
+class TwoMassProgram(ProgramCircuit):
     """Plant and parts of the program; force_n, velocity_m_per_s: full scale, 10 V.
 
     All other scales follow from the ratios of the parts. At the edges of a square wave over 0..10 V (0..2940 N) the
@@ -119,12 +119,12 @@ class TwoMassProgram(Program):
             return ForceLaw(pot, f"R{pot}", value, full(quantity), full(total), gain)
 
         return {
-            "M2_kg": Mass("M2", "RM2", plant.M2_kg, m2, full("velocity")),
-            "B2_n_s_per_m": force("B2", plant.B2_n_s_per_m, "compression_rate", "suspension_force", parts.r_b2_ohm),
-            "K2_n_per_m": force("K2", plant.K2_n_per_m, "compression", "suspension_force", parts.r_k2_ohm),
-            "M1_kg": Mass("M1", "RM1", plant.M1_kg, m1, full("tyre_velocity")),
-            "B1_n_s_per_m": force("B1", plant.B1_n_s_per_m, "tyre_velocity", "tyre_net_force", parts.r_b1_ohm),
-            "K1_n_per_m": force("K1", plant.K1_n_per_m, "tyre_displacement", "tyre_net_force", parts.r_k1_ohm),
+            "M2": Mass("M2", "RM2", plant.M2_kg, m2, full("velocity")),
+            "B2": force("B2", plant.B2_n_s_per_m, "compression_rate", "suspension_force", parts.r_b2_ohm),
+            "K2": force("K2", plant.K2_n_per_m, "compression", "suspension_force", parts.r_k2_ohm),
+            "M1": Mass("M1", "RM1", plant.M1_kg, m1, full("tyre_velocity")),
+            "B1": force("B1", plant.B1_n_s_per_m, "tyre_velocity", "tyre_net_force", parts.r_b1_ohm),
+            "K1": force("K1", plant.K1_n_per_m, "tyre_displacement", "tyre_net_force", parts.r_k1_ohm),
         }
 
     @property

@@ -27,13 +27,14 @@ size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) 
 
 size_t port_transmit(const uint8_t* const bytes, const size_t n) { return uart_write(line, bytes, n); }
 
-/// An interrupt between the check and the sleep remains pending and ends the sleep at once.
+/// An interrupt between the check and the sleep remains pending and ends the sleep at once. Room that comes before its
+/// interrupt is enabled raises none, so it is enabled before the check.
 bool port_idle(const bool wants_input, const bool has_output) {
     uart_hold();
+    if (has_output) {
+        board_await_room(line);
+    }
     if (!(wants_input && uart_has_input(line)) && !(has_output && board_has_room(line))) {
-        if (has_output) {
-            board_await_room(line);
-        }
         uart_sleep();
     }
     uart_release();

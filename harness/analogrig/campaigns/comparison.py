@@ -27,17 +27,16 @@ from numpy.typing import NDArray
 from analogrig.campaigns.plan import Plan, list_differences
 from analogrig.campaigns.rows import Row, is_valid, row
 from analogrig.campaigns.store import Store
-from analogrig.campaigns.trials import MISSED, Trials
+from analogrig.campaigns.trials import MISSED, MOST_ERRORS, Trials
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.judging.verdict import judge
-from analogrig.plant import PARAMETERS
 from analogrig.run import Run
 
 EXACT_UP_TO = 14
 """Largest number of differences for which all sign patterns are enumerated."""
 
 LOST_ESTIMATE = 1.0
-"""Relative error assigned to a trial without a final estimate of M, B, K where the other side's has one."""
+"""Relative error assigned to a trial without a final estimate where the other side's has one."""
 
 RESAMPLES, _AT_ONCE = 99_999, 1_000
 
@@ -123,17 +122,23 @@ class Comparison:
         return any(each.word == "worse" for each in self.differences)
 
 
-def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0.01) -> Comparison:
-    """Comparison of ``b`` with ``a``. The same two sides give the same result."""
+def compare(
+    a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0.01, estimates: Sequence[str] = ()
+) -> Comparison:
+    """Comparison of ``b`` with ``a``. The same two sides give the same result.
+
+    :param estimates: names of the estimated parameters.
+    """
+    measures = _measures(estimates)
     ours, theirs = _valid(a), _valid(b)
     common = [key for key in ours if key in theirs]
     if not common:
-        found = [each for measure in MEASURES if (each := _unpaired(measure, ours, theirs)) is not None]
+        found = [each for measure in measures if (each := _unpaired(measure, ours, theirs)) is not None]
         return _comparison(found, alpha, (len(ours), len(theirs)), (len(a), len(b)), (0, 0))
     common.sort(key=lambda key: int(ours[key]["seed"]))
     seeds = np.array([ours[key]["seed"] for key in common], np.int64)
     places = np.unique(seeds, return_inverse=True)[1]
-    pairing = Pairing(int(places[-1]) + 1)
+    pairing = Pairing(int(places[-1]) + 1, measures)
     pairing.add(places, *(Trials.of([side[key] for key in common]) for side in (ours, theirs)))
     return _comparison(
         pairing.differences(), alpha, (len(ours), len(theirs)), (len(a), len(b)), (pairing.identical, len(common))
@@ -157,14 +162,15 @@ def _comparison(
 class Pairing:
     """Differences of all measures by seed, gathered from trials that both sides played."""
 
-    def __init__(self, seeds: int) -> None:
+    def __init__(self, seeds: int, measures: Sequence[Measure]) -> None:
         """Start with no trials of so many seeds."""
+        self._measures = measures
         self.identical = 0
         """Number of trials with the same estimates on both sides."""
         self._seeds, self._units = seeds, min(seeds, MOST_UNITS)
-        self._sums: NDArray[np.float64] = np.zeros((len(MEASURES), 3))
+        self._sums: NDArray[np.float64] = np.zeros((len(measures), 3))
         """By measure: sum over the seeds of A, of B, and number of seeds."""
-        self._moved: NDArray[np.float64] = np.zeros((len(MEASURES), self._units))
+        self._moved: NDArray[np.float64] = np.zeros((len(measures), self._units))
         """(measures, units) sums of the differences of the seeds that flip together."""
 
     def add(self, places: NDArray[np.int64], a: Trials, b: Trials) -> None:
@@ -176,7 +182,7 @@ class Pairing:
         first = int(places.min(initial=self._seeds))
         at = places - first
         unit = (first + np.arange(at.max(initial=-1) + 1)) * self._units // self._seeds
-        for i, measure in enumerate(MEASURES):
+        for i, measure in enumerate(self._measures):
             x, y = (_by_place(at, measure.of(mine, other)) for mine, other in ((a, b), (b, a)))
             both = ~(np.isnan(x) | np.isnan(y))
             self._sums[i] += x[both].sum(), y[both].sum(), np.count_nonzero(both)
@@ -185,7 +191,7 @@ class Pairing:
     def differences(self) -> list[Difference]:
         """Differences of the measures of which both sides have values, not yet adjusted."""
         out = []
-        for measure, (a, b, count), moved in zip(MEASURES, self._sums.tolist(), self._moved, strict=True):
+        for measure, (a, b, count), moved in zip(self._measures, self._sums.tolist(), self._moved, strict=True):
             if count:
                 means, p = (a / count, b / count), sign_flip_p(moved)
                 out.append(Difference(measure.name, measure.unit, *means, int(count), PAIRED, p, p, NO_DIFFERENCE))
@@ -228,12 +234,14 @@ def _error(i: int) -> Callable[[Trials, Trials | None], Values]:
     return errors
 
 
-MEASURES = (
-    Measure("latency", "samples", _latencies),
-    Measure("missed", "of the visible changes", _missed),
-    Measure("false alarms", "per sample", _false_alarms),
-    *(Measure(f"error of {name}", "relative", _error(i)) for i, name in enumerate(PARAMETERS)),
-)
+def _measures(estimates: Sequence[str]) -> tuple[Measure, ...]:
+    """Everything that is compared; ``estimates``: names of the estimated parameters."""
+    return (
+        Measure("latency", "samples", _latencies),
+        Measure("missed", "of the visible changes", _missed),
+        Measure("false alarms", "per sample", _false_alarms),
+        *(Measure(f"error of {name}", "relative", _error(i)) for i, name in enumerate(estimates[:MOST_ERRORS])),
+    )
 
 
 def _unpaired(measure: Measure, a: Mapping[Any, Row], b: Mapping[Any, Row]) -> Difference | None:
@@ -311,6 +319,8 @@ class Recorded:
 
     trials: tuple[Observation, ...]
     """Trials, valid or not."""
+    estimates: tuple[str, ...]
+    """Estimated parameters of the first one."""
 
 
 @dataclass(frozen=True)
@@ -328,7 +338,7 @@ def load(path: Path) -> Recorded | Campaign:
     :raises ConfigurationError: two recordings are of one play; names them.
     """
     if path.is_dir() or path.suffix == ".npz":
-        side = Recorded(_load_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path]))
+        side = _load_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path])
         if not _valid(side.trials):
             raise RecordingError(f"{path}: holds no valid trial")
         return side
@@ -348,7 +358,7 @@ def compare_sides(a: Recorded | Campaign, b: Recorded | Campaign, alpha: float =
     """
     match a, b:
         case Recorded(), Recorded():
-            return compare(*common_plays(a, b), alpha)
+            return compare(*common_plays(a, b), alpha, a.estimates)
         case Campaign(), Campaign():
             _check_same("A and B are different campaigns", _decisive_settings(a.plan), _decisive_settings(b.plan))
             return _compare_campaigns(a, b, alpha)
@@ -369,7 +379,7 @@ def common_plays(a: Recorded, b: Recorded) -> tuple[Sequence[Observation], Seque
 
 def _compare_campaigns(a: Campaign, b: Campaign, alpha: float) -> Comparison:
     valid, played, common = np.zeros(2, np.int64), np.zeros(2, np.int64), 0
-    pairing, cells = Pairing(a.plan.spec.trials), _matched_cells(a.plan, b.plan)
+    pairing, cells = Pairing(a.plan.spec.trials, _measures(a.plan.estimates)), _matched_cells(a.plan, b.plan)
     with Store.read(a.path) as ours, Store.read(b.path) as theirs:
         step = max(1, SEEDS_AT_ONCE // a.plan.size)
         for first in range(0, a.plan.spec.trials, step):
@@ -466,19 +476,22 @@ def _valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
     return {key: each for key, each in trials if is_valid(each)}
 
 
-def _load_recordings(paths: Sequence[Path]) -> tuple[Observation, ...]:
+def _load_recordings(paths: Sequence[Path]) -> Recorded:
+    estimates: tuple[str, ...] = ()
     found: dict[tuple[object, ...], tuple[Path, Row]] = {}
     for path in paths:
-        key, trial = _load_recording(path)
+        key, trial, named = _load_recording(path)
+        estimates = estimates or named
         if key in found:
             raise ConfigurationError(f"{found[key][0]} and {path} are of one scenario, rig and seed: which is meant?")
         found[key] = path, trial
-    return tuple((key, trial) for key, (_, trial) in found.items())
+    return Recorded(tuple((key, trial) for key, (_, trial) in found.items()), estimates)
 
 
-def _load_recording(path: Path) -> Observation:
+def _load_recording(path: Path) -> tuple[Any, Row, tuple[str, ...]]:
+    """Key and row of a recording, and the parameters that it estimates."""
     run = Run.load(path)
     of = run.conditions
     played = json.dumps(dict(of.scenario), sort_keys=True)  # many may have one name: what strategies draw
     machine = json.dumps(_without_names(of.rig), sort_keys=True)
-    return (played, machine, of.seed), row(run, judge(run))
+    return (played, machine, of.seed), row(run, judge(run)), of.program.estimates

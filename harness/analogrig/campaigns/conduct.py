@@ -79,7 +79,7 @@ def ended_results(plan: Plan, out: Path) -> Results | None:
 def _play(plan: Plan, workers: CampaignWorkers, store: Store, tally: Tally) -> Iterator[int]:
     """Play what is left; yield the number of trials of each task that has been stored and counted."""
     workers.supply(device_files(plan.devices))
-    tasks, axes = Tasks(plan, tally, workers.slots), len(plan.spec.draw.axes())
+    tasks, axes = Tasks(plan, tally, workers.slots), len(plan.spec.draw)
     work: Callable[[Task], PlayedTask] = functools.partial(play_task, plan.as_json())
     for _, played in workers.play(work, iter(tasks)):
         store.add(plan, played.parts)

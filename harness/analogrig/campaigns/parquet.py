@@ -14,7 +14,6 @@ from analogrig.campaigns.plan import Cell, Part, Plan
 from analogrig.campaigns.store import Store
 from analogrig.campaigns.trials import EXISTS, LATE, MISSED, OUTCOMES, Trials
 from analogrig.errors import ConfigurationError
-from analogrig.plant import PARAMETERS
 from analogrig.storage import replace_file
 
 GROUP_ROWS = 50_000
@@ -79,7 +78,7 @@ def _table(plan: Plan, cell: Cell, part: Part, trials: Trials) -> Any:
             "rig": same(plan.rigs[cell.rig]["name"]),
             "device": same(plan.devices[cell.device]["name"]),
             **{axis: same(float(value)) for axis, value in cell.values.items()},
-            **dict(zip(plan.spec.draw.axes(), map(arrow.array, trials.drawn.T), strict=True)),
+            **dict(zip(plan.spec.draw, map(arrow.array, trials.drawn.T), strict=True)),
             "outcome": arrow.array([OUTCOMES[outcome] for outcome in trials.outcome.tolist()]),
             **{name: arrow.array(getattr(trials, name)) for name in ("samples", "armed", "false_alarms")},
             "missed": by_change((trials.change & MISSED) != 0),
@@ -88,7 +87,7 @@ def _table(plan: Plan, cell: Cell, part: Part, trials: Trials) -> Any:
             "bound_n": by_change(trials.bound_n, trials.bound_n < 0),
             **{
                 f"error_{name}": arrow.array(error, mask=np.isnan(error))
-                for name, error in zip(PARAMETERS, trials.error.T, strict=True)
+                for name, error in zip(plan.estimates, trials.error.T, strict=False)
             },
             "theta": arrow.array(trials.theta),
             "why": arrow.array(trials.why, type=arrow.string()),

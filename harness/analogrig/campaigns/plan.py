@@ -20,11 +20,13 @@ import numpy as np
 
 from analogrig import config
 from analogrig.campaigns import builds
-from analogrig.campaigns.spec import MAX_CELLS, MAX_TRIALS, CampaignSpec
+from analogrig.campaigns.spec import MAX_CELLS, MAX_TRIALS, CampaignSpec, corners
+from analogrig.campaigns.trials import MOST_ERRORS
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.library import LIBRARY
 from analogrig.devices.registry import from_table, trusted
 from analogrig.errors import ConfigurationError
+from analogrig.plant import Plant
 from analogrig.rigs.description import from_table as rig_of
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import is_emulated
@@ -41,11 +43,8 @@ SHOWN, LONGEST = 3, 60
 
 _ABSENT = object()
 
-_CHANGES = {
-    "mass_factor": "mass_kg",
-    "damping_factor": "damping_n_s_per_m",
-    "stiffness_factor": "stiffness_n_per_m",
-}
+NOISE = "noise_lsb"
+"""Axis of the rms noise of the card."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ class Plan:
     @property
     def size(self) -> int:
         """Number of cells."""
-        combinations = math.prod(len(values) for values in self.spec.grid.axes().values())
+        combinations = math.prod(len(values) for values in self.spec.grid.values())
         return len(self.rigs) * len(self.devices) * combinations
 
     @classmethod
@@ -134,7 +133,7 @@ class Plan:
     def as_table(self) -> dict[str, Any]:
         """Plan as plain values: everything that decides the results, and nothing else."""
         table = dataclasses.asdict(self)
-        table["spec"] = {**config.plain(table["spec"]), "draw": config.plain(self.spec.draw.axes())}
+        table["spec"] = config.plain(table["spec"])
         return table
 
     def as_json(self) -> str:
@@ -152,7 +151,7 @@ class Plan:
 
     def cells(self) -> list[Cell]:
         """Cells in the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
-        axes = self.spec.grid.axes()
+        axes = self.spec.grid
         combinations = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
         return [
             Cell(rig, device, values)
@@ -165,21 +164,21 @@ class Plan:
 
     def draw(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""
-        if not (axes := self.spec.draw.axes()):
+        if not self.spec.draw:
             return {}
         rng = np.random.default_rng([seed, _DRAWS])
-        return {axis: float(rng.uniform(low, high)) for axis, (low, high) in axes.items()}
+        return {axis: float(rng.uniform(low, high)) for axis, (low, high) in self.spec.draw.items()}
 
     def case(self, cell: Cell, seed: int, drawn: Mapping[str, float] | None = None) -> Case:
         """:raises ConfigurationError: the values make no scenario."""
         values = {**cell.values, **(self.draw(seed) if drawn is None else drawn)}
         try:
-            scenario = _scenario(self._base, values, self.spec)
+            scenario = self._scenario(values)
         except ValueError as error:
             raise ConfigurationError(f"{_text(values)}: {error}" if values else str(error)) from error
         rig = dict(self.rigs[cell.rig])
-        if "noise_lsb" in values:
-            rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
+        if NOISE in values:
+            rig["card"] = {**rig["card"], NOISE: values[NOISE]}
         return Case(rig, self.devices[cell.device], scenario, seed)
 
     @property
@@ -192,6 +191,41 @@ class Plan:
         """Scenario before the values of a cell are set."""
         return Scenario.from_table(self.scenario, "the campaign's scenario")
 
+    def axis(self, name: str) -> tuple[str, str]:
+        """Name and unit of an axis in words."""
+        if name == NOISE:
+            return "noise", "LSB rms"
+        program = self._base.program
+        return name.replace("_", " "), program.unit(self._starts[name]) if name in self._starts else ""
+
+    @property
+    def estimates(self) -> tuple[str, ...]:
+        """Parameters whose estimates the results keep."""
+        return self._base.program.estimates[:MOST_ERRORS]
+
+    @property
+    def _starts(self) -> Mapping[str, str]:
+        """Parameters by the axes of their values at the start."""
+        return self._base.program.names
+
+    @functools.cached_property
+    def _factors(self) -> Mapping[str, str]:
+        """Parameters by the axes of their factors at the change."""
+        rows = self._base.program.parameters.items()
+        return {f"{each}_factor": name for name, row in rows for each in (name, row.diagnosis) if each}
+
+    def _scenario(self, values: Mapping[str, float]) -> Scenario:
+        """Scenario with these values of the axes."""
+        base, starts, factors = self._base, self._starts, self._factors
+        start = {**base.set, **{starts[axis]: value for axis, value in values.items() if axis in starts}}
+        before = Plant.of(base.program, start).parameters()
+        changed = {factors[axis]: value * before[factors[axis]] for axis, value in values.items() if axis in factors}
+        tweaks = (*base.tweaks, PotChange(self.spec.change_at, changed)) if changed else base.tweaks
+        expect = base.expect
+        if self.spec.false_alarms is not None:
+            expect = dataclasses.replace(expect, false_alarms=self.spec.false_alarms)
+        return dataclasses.replace(base, set=start, tweaks=tweaks, expect=expect)
+
     def _check(self) -> None:
         spec = self.spec
         where = f"campaign {spec.name}"
@@ -200,13 +234,21 @@ class Plan:
                 f"{where}: {number_of(self.size, 'cell')} of {number_of(spec.trials, 'trial')};"
                 f" at most {MAX_CELLS} cells and {MAX_TRIALS} trials in all"
             )
-        axes = {*spec.grid.axes(), *spec.draw.axes()}
-        if axes & set(_CHANGES) and self.scenario.get("tweaks"):
+        axes = {*spec.grid, *spec.draw}
+        known = [NOISE, *self._starts, *self._factors]
+        for axis in axes:
+            if axis not in known:
+                named = ", ".join((NOISE, *self._base.program.parameters))
+                raise ConfigurationError(
+                    f"{where}: unknown axis {axis[:40]!r}{config.suggest(axis, known)} (known: {named}, and each"
+                    " parameter with _factor)"
+                )
+        if axes & set(self._factors) and self.scenario.get("tweaks"):
             raise ConfigurationError(f"{where}: the scenario {spec.scenario} has tweaks of its own: no factors besides")
-        if "noise_lsb" in axes and any("card" not in table for table in self.rigs):
+        if NOISE in axes and any("card" not in table for table in self.rigs):
             raise ConfigurationError(f"{where}: noise_lsb is for emulated rigs")
         for cell in self.cells():
-            for drawn, opposite in (*itertools.permutations(spec.draw.corners(), 2), (self.draw(spec.first_seed), {})):
+            for drawn, opposite in (*itertools.permutations(corners(spec.draw), 2), (self.draw(spec.first_seed), {})):
                 problem = self._problem(cell, drawn)
                 if problem:
                     raise ConfigurationError(f"{where}: {self._blame(cell, drawn, opposite)}{problem}")
@@ -302,18 +344,6 @@ def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]
             )
         described = config.plain(rig.description())
         return described if is_emulated(rig) else {"name": name, "kind": described["kind"], "described": described}
-
-
-def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -> Scenario:
-    start: dict[str, Any] = {axis: value for axis, value in values.items() if axis in _CHANGES.values()}
-    plant = dataclasses.replace(base.plant, **start)
-    before = vars(plant.plant())
-    changed = {_CHANGES[axis]: factor * before[_CHANGES[axis]] for axis, factor in values.items() if axis in _CHANGES}
-    tweaks = (*base.tweaks, PotChange(spec.change_at, **changed)) if changed else base.tweaks
-    expect = base.expect
-    if spec.false_alarms is not None:
-        expect = dataclasses.replace(expect, false_alarms=spec.false_alarms)
-    return dataclasses.replace(base, plant=plant, tweaks=tweaks, expect=expect)
 
 
 def _text(values: Mapping[str, float]) -> str:

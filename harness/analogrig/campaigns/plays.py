@@ -144,7 +144,7 @@ def play_task(plan: str, task: Sequence[Part]) -> PlayedTask:
     """
     start_s = time.monotonic()
     planned, _ = _plan(plan)
-    axes = list(planned.spec.draw.axes())
+    axes = list(planned.spec.draw)
     parts = [(part, Trials.of(play_part(plan, part), axes).encode()) for part in task]
     return PlayedTask(parts, time.monotonic() - start_s)
 

@@ -33,8 +33,9 @@ from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.exposure import ObservedRecord, record_exposure
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Block, Performance
-from analogrig.run import CHANNELS
+from analogrig.run import OUTPUT
 from analogrig.scenario import Scenario
+from analogrig_emulator import Card, Sampler
 
 BRANCHES_N = 2_000
 """Number of branches off each play."""
@@ -48,7 +49,6 @@ PLAY_N, TAIL_N = 20_000, 2_000 + FOLLOWED_N
 LOUDER = np.array([1.6, 2.0, 2.6])
 """Factors on the standard deviation of the branches' noise, used in turn."""
 
-_DISPLACEMENT = CHANNELS.index("displacement")
 
 LEAD_IN_N = 16
 """Samples that fill the regressors before the first equation, for any model that a device can have."""
@@ -112,11 +112,11 @@ def false_alarm_rate(
         raise ConfigurationError(f"rare rates are found for the trigger cusum, not {trigger} of {device.name}")
     played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
     performance = rig.in_blocks(played.samples).perform(played, seed)
-    settings = dataclasses.replace(device.estimator, force_zero=performance.channels["force"].zero)
+    settings = dataclasses.replace(device.estimator, force_zero=performance.of_device["u"].zero)
     estimator = Estimator(settings, library=device.estimator_library)
-    return _Climbs(rig, settings, estimator, performance, np.random.default_rng([seed, _BRANCHES])).estimate(
-        first, branches
-    )
+    return _Climbs(
+        rig.card(scenario.program), settings, estimator, performance, np.random.default_rng([seed, _BRANCHES])
+    ).estimate(first, branches)
 
 
 class _Climbs:
@@ -124,18 +124,18 @@ class _Climbs:
 
     def __init__(
         self,
-        rig: EmulatorRig,
+        card: Card,
         settings: EstimatorConfig,
         estimator: Estimator,
         performance: Performance,
         rng: np.random.Generator,
     ) -> None:
-        self._rig = rig
+        self._card = card
         self._settings = settings
         self._estimator = estimator
         (self._play,) = performance.blocks
         self._signals = _estimator_inputs(self._play.samples())
-        self._noise_lsb = performance.channels["force"].noise_lsb
+        self._noise_lsb = performance.of_device["u"].noise_lsb
         self._rng = rng
         self._samples = 0
 
@@ -228,12 +228,12 @@ class _Climbs:
         index = going.following[:, None] + np.arange(-1, _STRETCH_N)  # the card holds part of the sample before
         if index[:, -1].max() >= len(self._play.volts):
             raise DeviceError(f"the statistic neither came to an alarm nor back to zero within {TAIL_N} samples")
-        volts = self._play.volts[index].reshape(-1, len(CHANNELS))
-        normals = self._rng.standard_normal((*index.shape, len(CHANNELS)))
-        normals[:, :, _DISPLACEMENT] *= going.louder[:, None]
-        codes, clipped = self._rig.sampler(self._rng).sample(volts, normals.reshape(volts.shape))
+        volts = self._play.volts[index].reshape(-1, self._play.volts.shape[1])
+        normals = self._rng.standard_normal((*index.shape, volts.shape[1]))
+        normals[:, :, OUTPUT] *= going.louder[:, None]
+        codes, clipped = Sampler(self._card, self._rng).sample(volts, normals.reshape(volts.shape))
         signals = _estimator_inputs(Block(0, volts, codes, clipped).samples())
-        return [signal.reshape(index.shape)[:, 1:] for signal in signals], normals[:, 1:, _DISPLACEMENT]
+        return [signal.reshape(index.shape)[:, 1:] for signal in signals], normals[:, 1:, OUTPUT]
 
 
 def _estimator_inputs(samples: Samples) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:

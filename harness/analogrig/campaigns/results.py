@@ -42,11 +42,14 @@ class Results:
     @functools.cached_property
     def cells(self) -> list[tuple[Cell, Summary]]:
         """Cells, each with the summary of its trials."""
-        return [(cell, Summary.of(each)) for cell, each in zip(self.plan.cells(), self.aggregates, strict=True)]
+        return [
+            (cell, Summary.of(each, self.plan.estimates))
+            for cell, each in zip(self.plan.cells(), self.aggregates, strict=True)
+        ]
 
     @functools.cached_property
     def total(self) -> Summary:
-        return Summary.of(Aggregate.merged(self.aggregates))
+        return Summary.of(Aggregate.merged(self.aggregates), self.plan.estimates)
 
     @functools.cached_property
     def latencies(self) -> Histogram:

@@ -39,12 +39,12 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
     """Record of a trial.
 
     ``armed``: the samples in which the trigger was armed. ``changes``: the fields of ``Change`` of each. ``errors``:
-    relative errors of M, B, K at the end, or none. ``theta``: the first digits of the hash of all estimates, which
-    identifies the build. ``why``: the first reason why the trial has not passed.
+    relative errors of the estimates at the end, or none. ``theta``: the first digits of the hash of all estimates,
+    which identifies the build. ``why``: the first reason why the trial has not passed.
     """
     return _row(
         run.conditions.seed,
-        verdict.outcome,
+        verdict.outcome if verdict.valid else "inconclusive",
         drawn,
         why=verdict.reasons[0] if verdict.reasons else "",
         samples=run.samples,

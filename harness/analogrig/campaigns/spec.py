@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -14,50 +15,17 @@ from analogrig.trust import resolve_name
 MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
 
 
-@dataclass(frozen=True)
-class _Axes:
-    """Axes that can be varied: plant at the start, factors at the change, rms noise of the card."""
-
-    mass_kg: tuple[float, ...] = ()
-    damping_n_s_per_m: tuple[float, ...] = ()
-    stiffness_n_per_m: tuple[float, ...] = ()
-    mass_factor: tuple[float, ...] = ()
-    damping_factor: tuple[float, ...] = ()
-    stiffness_factor: tuple[float, ...] = ()
-    noise_lsb: tuple[float, ...] = ()
-
-    def axes(self) -> dict[str, tuple[float, ...]]:
-        """Axes that are given, with their values."""
-        return {axis: values for axis, values in vars(self).items() if values}
+Axes = Mapping[str, tuple[float, ...]]
+"""Values by axis: a parameter at the start (``K``), its factor at the change (``K_factor``), or ``noise_lsb``."""
 
 
-@dataclass(frozen=True)
-class Grid(_Axes):
-    """The ``[grid]`` table: every combination of these values is a cell."""
+def corners(draw: Axes) -> tuple[dict[str, float], ...]:
+    """Low ends of all drawn axes, and high ends of all of them.
 
-    def __post_init__(self) -> None:
-        for axis, values in self.axes().items():
-            if len(set(values)) != len(values):
-                raise ValueError(f"{axis} has a value twice")
-
-
-@dataclass(frozen=True)
-class Draw(_Axes):
-    """The ``[draw]`` table: values drawn for each trial from its seed, uniformly between the ends (low, high)."""
-
-    def __post_init__(self) -> None:
-        for axis, ends in self.axes().items():
-            if len(ends) != 2 or not ends[0] < ends[1]:
-                raise ValueError(f"{axis} must be (low, high), not ({', '.join(f'{end:g}' for end in ends)})")
-
-    def corners(self) -> tuple[dict[str, float], ...]:
-        """Low ends of all axes, and high ends of all axes.
-
-        Every pot and the noise stay between their values at these two corners: a parameter and its factor move the same
-        pot in the same direction.
-        """
-        axes = self.axes()
-        return tuple({axis: ends[i] for axis, ends in axes.items()} for i in range(2 if axes else 0))
+    Every pot and the noise stay between their values at these two corners: a parameter and its factor move the same
+    pot in the same direction.
+    """
+    return tuple({axis: ends[i] for axis, ends in draw.items()} for i in range(2 if draw else 0))
 
 
 @dataclass(frozen=True)
@@ -96,8 +64,10 @@ class CampaignSpec:
     """Largest number of false alarms in a trial that passes; overrides the scenario's."""
     change_at: int = 1000
     """Sample at which the factors take effect."""
-    grid: Grid = field(default_factory=Grid)
-    draw: Draw = field(default_factory=Draw)
+    grid: Axes = field(default_factory=dict)
+    """Table ``[grid]``: every combination of these values is a cell."""
+    draw: Axes = field(default_factory=dict)
+    """Table ``[draw]``: values drawn for each trial from its seed, uniformly between the ends (low, high)."""
     stop: Stop | None = None
     description: str = ""
     name: str = ""
@@ -116,9 +86,7 @@ class CampaignSpec:
                 raise ValueError(f"{name} must be 1 to {most}, not {getattr(self, name)}")
         if not 0 <= self.first_seed < 2**62:
             raise ValueError(f"first_seed must be 0 to 2^62, not {self.first_seed}")
-        twice = set(self.grid.axes()) & set(self.draw.axes())
-        if twice:
-            raise ValueError(f"{', '.join(sorted(twice))}: in the grid and drawn as well")
+        _check_axes(self.grid, self.draw)
 
     @classmethod
     def load(cls, name: str) -> CampaignSpec:
@@ -132,3 +100,15 @@ class CampaignSpec:
             raise ConfigurationError(f"{path}: name must be one that a file can have, not {spec.name!r}")
         rigs, devices = (tuple(resolve_name(path, each) for each in names) for names in (spec.rigs, spec.devices))
         return dataclasses.replace(spec, scenario=resolve_name(path, spec.scenario), rigs=rigs, devices=devices)
+
+
+def _check_axes(grid: Axes, draw: Axes) -> None:
+    """:raises ValueError: a value is there twice, or is no pair of ends."""
+    for axis, values in grid.items():
+        if not values or len(set(values)) != len(values):
+            raise ValueError(f"grid: {axis} has {'a value twice' if values else 'no value'}")
+    for axis, ends in draw.items():
+        if len(ends) != 2 or not ends[0] < ends[1]:
+            raise ValueError(f"draw: {axis} must be (low, high), not ({', '.join(f'{end:g}' for end in ends)})")
+        if axis in grid:
+            raise ValueError(f"{axis}: in the grid and drawn as well")

@@ -228,7 +228,7 @@ class Store:
                     if not all(isinstance(value, bytes) for value in values):
                         raise ValueError("a column that is no blob")
                     found = dict(zip(columns, values, strict=True))
-                    axes = len(plan.spec.draw.axes())
+                    axes = len(plan.spec.draw)
                     yield Part(cell, place, count), Trials.decode(count, found, axes)
 
     def _check_schema(self) -> None:

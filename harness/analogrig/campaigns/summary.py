@@ -13,9 +13,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.campaigns.trials import EXISTS, FAILED, INCONCLUSIVE, LATE, MISSED, OUTCOMES, PASSED, Trials
+from analogrig.campaigns.trials import EXISTS, FAILED, INCONCLUSIVE, LATE, MISSED, MOST_ERRORS, OUTCOMES, PASSED, Trials
 from analogrig.judging.bursts import BURST, ConfidenceSequence, dispersion
-from analogrig.plant import PARAMETERS
 
 CONFIDENCE = 0.95
 """Confidence level of the bounds in the tables; they hold at any stopping time of a campaign."""
@@ -131,7 +130,7 @@ class Aggregate:
     bound_n: int = 0
     """Sum over the changes that were detected and detectable, and their number."""
     bounds: int = 0
-    error_squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(len(PARAMETERS)))
+    error_squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(MOST_ERRORS))
     """Sums over the trials with an estimate, and their number."""
     estimates: int = 0
     blocks: list[Blocks] = field(default_factory=lambda: [Blocks()])
@@ -220,12 +219,13 @@ class Summary:
     bound_n: float | None
     """Mean information bound of the changes that were detected and detectable."""
     error: Mapping[str, float]
-    """rms relative error of M, B and K at the end."""
+    """rms relative error of each estimate at the end."""
     doubt: str
     """Seed of the first inconclusive trial, with the reason; empty if there is none."""
 
     @classmethod
-    def of(cls, found: Aggregate) -> Summary:
+    def of(cls, found: Aggregate, estimates: Sequence[str]) -> Summary:
+        """Summary of an aggregate; ``estimates``: names of the estimated parameters."""
         blocks = np.concatenate([each.counts for each in found.blocks])
         rates = {name: _bounds(rate, found.counted, blocks) for name, rate in RATES.items()}
         rms = np.sqrt(found.error_squares / max(1, found.estimates)).tolist()
@@ -241,7 +241,7 @@ class Summary:
             latency_n=found.latency_n.mean,
             latency_p95_n=found.latency_n.quantile(95),
             bound_n=found.bound_n / found.bounds if found.bounds else None,
-            error=dict(zip(PARAMETERS, rms, strict=True)) if found.estimates else {},
+            error=dict(zip(estimates, rms, strict=False)) if found.estimates else {},
             doubt=found.doubt,
         )
 
@@ -260,7 +260,7 @@ class Distribution:
         """Start with no trials; ``drawn``: ends of the drawn axes."""
         self.axes = dict(list(drawn.items())[:2])
         """The first two drawn axes, with their ends."""
-        self.errors: NDArray[np.int64] = np.zeros((len(PARAMETERS), ERROR_BINS + 2), np.int64)
+        self.errors: NDArray[np.int64] = np.zeros((MOST_ERRORS, ERROR_BINS + 2), np.int64)
         """(3, bins): the first and the last bin hold what is beyond."""
         shape = (DRAWN_BINS,) * len(self.axes)
         self.visible, self.missed, self.detected, self.latency_n = (np.zeros(shape, np.int64) for _ in range(4))

@@ -28,7 +28,7 @@ class Tally:
         :param read: returns the trials of a part that came before those in front of it.
         """
         self.cells = [Aggregate() for _ in range(plan.size)]
-        self.distribution = Distribution(plan.spec.draw.axes())
+        self.distribution = Distribution(plan.spec.draw)
         self.trials = 0
         self._plan, self._read = plan, read
         self._decided = [False] * plan.size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.campaigns.rows import Row, changes
-from analogrig.plant import MAX_SAMPLES, PARAMETERS
+from analogrig.plant import MAX_SAMPLES
 
 OUTCOMES = ("passed", "failed", "inconclusive")
 PASSED, FAILED, INCONCLUSIVE = range(3)
@@ -53,6 +54,12 @@ COLUMNS = (*_TYPES, "why")
 """Names of all columns, in the order of ``Trials.encode``."""
 
 
+MOST_ERRORS = 3
+"""Estimated parameters whose errors are kept."""
+
+_NO_ERRORS = [math.nan] * MOST_ERRORS
+
+
 @dataclass(frozen=True, eq=False)
 class Trials:
     """n trials of one cell with consecutive seeds; c is the number of changes, d of drawn axes."""
@@ -70,7 +77,7 @@ class Trials:
     bound_n: NDArray[np.int32]
     """(n, c) information bounds; -1: not detectable."""
     error: NDArray[np.float32]
-    """(n, 3) relative errors of the last estimate of M, B, K; NaN: none."""
+    """(n, MOST_ERRORS) relative errors of the last estimates; NaN: none."""
     theta: NDArray[np.uint64]
     """(n,) first 64 bits of the hash of all estimates; 0: nothing was played."""
     drawn: NDArray[np.float32]
@@ -99,9 +106,9 @@ class Trials:
                 latency_n[i, k] = _NONE if one.latency_n is None else one.latency_n
                 bound_n[i, k] = _NONE if one.bound_n is None else one.bound_n
         with np.errstate(over="ignore"):  # an error beyond float32 is none
-            error = np.array([row["errors"] or [np.nan] * len(PARAMETERS) for row in rows], np.float32)
-        error = error.reshape(n, len(PARAMETERS))
-        error[~np.isfinite(error).all(axis=1)] = np.nan
+            error = np.array([[*row["errors"], *_NO_ERRORS][:MOST_ERRORS] for row in rows], np.float32)
+        error = error.reshape(n, MOST_ERRORS)
+        error[~np.isfinite(error[:, 0])] = np.nan
         drawn = np.array([[row.get("drawn", {}).get(axis, 0.0) for axis in axes] for row in rows], np.float32)
         return cls(
             outcome=np.array([OUTCOMES.index(row["outcome"]) for row in rows], np.uint8),
@@ -188,8 +195,8 @@ class Trials:
             raise ValueError("counts that cannot be")
         if "change" in names:
             self._check_changes()
-        if "error" in names and self.error.shape != (count, len(PARAMETERS)):
-            raise ValueError(f"errors that are not {len(PARAMETERS)}")
+        if "error" in names and self.error.shape != (count, MOST_ERRORS):
+            raise ValueError(f"errors that are not {MOST_ERRORS}")
         if np.isinf(self.error).any():
             raise ValueError("an infinite error")
         if "drawn" in names and (self.drawn.shape[1] != axes or not np.isfinite(self.drawn).all()):

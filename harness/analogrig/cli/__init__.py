@@ -10,11 +10,11 @@ import errno
 import os
 import shlex
 import sys
-import traceback
 from collections.abc import Sequence
 from typing import NoReturn
 
 from analogrig.cli import (
+    bench,
     calibrate,
     campaign,
     certify,
@@ -22,6 +22,7 @@ from analogrig.cli import (
     compare_rigs,
     doctor,
     emulation,
+    importing,
     listing,
     new,
     patch,
@@ -37,6 +38,8 @@ _COMMANDS = (
     playing.add_run,
     playing.add_replay,
     playing.add_judge,
+    importing.add,
+    bench.add,
     campaign.add,
     certify.add,
     compare.add,
@@ -118,6 +121,8 @@ def _explain(error: BaseException) -> int:
 
 def _package_of(error: BaseException) -> str:
     """Package of somebody else, which adds kinds, in whose code an error was raised; empty if there is none."""
+    import traceback  # here, for --help needs none
+
     from analogrig.devices import registry
     from analogrig.rigs import description
 

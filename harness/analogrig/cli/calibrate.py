@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_command, add_json, add_rig, add_seed, files_read, trust_of
+from analogrig.cli.fitting import fit_recording
+from analogrig.cli.options import FILE, add_command, add_json, add_rig, add_seed, count, files_read, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
 
 if TYPE_CHECKING:
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 
 MOST_LSB = 1.0
 """Largest rms difference between rig and twin, on data that the fit has not seen."""
+
+PROGRAMS = ("front", "shock")
+"""Programs with which rigs are fitted."""
 
 _SHOWN_AS = {"": (100.0, "%"), "V": (1e3, "mV"), "s": (1e6, "us"), "LSB": (1.0, "LSB")}
 """Scale and unit in which an estimate is shown, by its own unit."""
@@ -26,6 +30,7 @@ def add(commands: Any) -> None:
         "fit the emulator to a rig's recordings, and keep it as the rig's twin",
         "calibrate --rig emulator-real --out build/twin.toml",
         "calibrate --rig bench --op-amp 741 --components polyester",
+        "calibrate --recording build/silverbox.npz --program silverbox --span 40000:130000 --check 0:40000",
     )
     add_rig(command)
     command.add_argument(
@@ -37,9 +42,20 @@ def add(commands: Any) -> None:
     )
     command.add_argument(
         "--program",
-        choices=("front", "shock"),
         default="front",
-        help="program of the computer (default: %(default)s)",
+        metavar="PROGRAM",
+        help="program of the computer: front or shock, or with --recording any program file (default: %(default)s)",
+    )
+    command.add_argument(
+        "--recording", type=Path, metavar=FILE, help="fit the program's parameters to this recording instead of a rig"
+    )
+    command.add_argument("--span", metavar="FIRST:END", help="samples of the recording to fit (default: all)")
+    command.add_argument("--check", metavar="FIRST:END", help="samples of the recording to compare only")
+    command.add_argument(
+        "--settle", type=count, metavar="N", help="samples at the start of either that are not compared (default: 200)"
+    )
+    command.add_argument(
+        "--most-rms", type=float, metavar="X", help="largest rms difference of a twin to keep, in the output's unit"
     )
     command.add_argument(
         "--op-amp",
@@ -72,6 +88,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
+    if arguments.recording is not None:
+        return fit_recording(arguments)
+    _check_for_a_rig(arguments)
     move_aside(arguments.out, files_read(arguments))
     plays, recordings = [*scenarios(arguments.program), check_scenario(arguments.program)], []
     show_progress = progress_line("recordings")
@@ -102,6 +121,17 @@ def _run(arguments: argparse.Namespace) -> int:
         kept = f"kept as {arguments.out}" if is_twin else f"no twin: more than {MOST_LSB:g} LSB; nothing kept"
         show("\n".join([heading, *_values(found), "", *_said(found, check_lsb), kept]))
     return PASSED if is_twin else FAILED
+
+
+def _check_for_a_rig(arguments: argparse.Namespace) -> None:
+    """:raises ConfigurationError: an option or program is for recordings alone."""
+    from analogrig.errors import ConfigurationError
+
+    for option in ("span", "check", "settle", "most_rms"):
+        if getattr(arguments, option) is not None:
+            raise ConfigurationError(f"--{option.replace('_', '-')} is for --recording")
+    if arguments.program not in PROGRAMS:
+        raise ConfigurationError(f"--program {arguments.program}: a rig is fitted with {' or '.join(PROGRAMS)}")
 
 
 def _values(found: Calibration) -> list[str]:

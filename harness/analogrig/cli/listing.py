@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
-from analogrig.cli.options import CAMPAIGN, DUT, PROGRAMS, RIG, SCENARIO, add_command, add_json
+from analogrig.cli.options import CAMPAIGN, DUT, PROGRAM, RIG, SCENARIO, add_command, add_json
 from analogrig.cli.terminal import PASSED, show, show_json, show_plain
 
 KINDS = ("scenarios", "rigs", "devices", "campaigns", "programs")
@@ -20,7 +20,7 @@ COMPLETION_VARIABLE = "_ARGCOMPLETE"
 INCLUDE = Path(__file__).parents[1] / "include"
 """Folder of the headers that the package brings."""
 
-_KIND_OF_METAVAR = {SCENARIO: "scenarios", RIG: "rigs", DUT: "devices", CAMPAIGN: "campaigns"}
+_KIND_OF_METAVAR = {SCENARIO: "scenarios", RIG: "rigs", DUT: "devices", CAMPAIGN: "campaigns", PROGRAM: "programs"}
 
 _PLACEHOLDER = re.compile(r"\[|[A-Z]+")
 """Beginning of what a user fills in, in the usage of a kind of device."""
@@ -82,8 +82,6 @@ def _entries(kind: str) -> list[dict[str, str]]:
 
     :raises ConfigurationError: a file cannot be read.
     """
-    if kind == "programs":
-        return [_entry(name, description) for name, description in PROGRAMS.items()]
     from analogrig import config
 
     found: dict[str, dict[str, str]] = {}

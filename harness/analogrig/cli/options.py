@@ -19,15 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SCENARIO = "thesis"
 
-PROGRAMS = {
-    "front": "front suspension of a racing motorcycle: mass, damper, spring",
-    "shock": "single shock absorber on a test bench",
-    "bump-stop": "front suspension with a second spring towards the end of its travel",
-    "two-mass": "front suspension on its wheel and tyre",
-}
-"""Descriptions of the programs. The names are those of analogrig_emulator.PROGRAMS, which takes 0.1 s to import."""
-
-SCENARIO, CAMPAIGN, RIG, DUT, FILE = "SCENARIO", "CAMPAIGN", "RIG", "DUT", "FILE"
+SCENARIO, CAMPAIGN, PROGRAM, RIG, DUT, FILE = "SCENARIO", "CAMPAIGN", "PROGRAM", "RIG", "DUT", "FILE"
 """Metavars. They say what an option takes, and `completion` completes by them."""
 
 RIG_NAMES = "shipped name, table of your rigs file, FILE.toml or FILE.toml:NAME"
@@ -83,10 +75,13 @@ def add_what_to_play(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--scenario",
         metavar=SCENARIO,
-        help=f"shipped name or .toml file (default: {DEFAULT_SCENARIO}, or that of the recording)",
+        help="shipped name or .toml file (default: that of the recording, or one change of --program, or"
+        f" {DEFAULT_SCENARIO})",
     )
     command.add_argument(
-        "--program", choices=PROGRAMS, help="program of the computer, instead of the scenario's plant.set"
+        "--program",
+        metavar=PROGRAM,
+        help="program of the computer instead of the scenario's: shipped name or .toml file",
     )
     add_rig(
         command, f"{RIG_NAMES}, or recording:FILE (default: $ANALOGRIG_RIG, that of the scenario, or emulator)", None
@@ -169,17 +164,19 @@ def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
 @contextlib.contextmanager
 def open_what_to_play(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]:
     """Open the requested rig, scenario and seed; the scenario or the recording supplies those not given."""
-    from dataclasses import replace
-
+    from analogrig.program import Program
     from analogrig.rigs.description import DEFAULT_RIG, open_rig
     from analogrig.scenario import DEFAULT_SEED, Scenario
 
     asked = None if arguments.scenario is None else Scenario.load(arguments.scenario)
     with open_rig(arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG, allow=trust_of(arguments)) as rig:
         recorded, recorded_seed = rig.recorded or (None, None)
-        scenario = asked or recorded or Scenario.load(DEFAULT_SCENARIO)
-        if arguments.program is not None:
-            scenario = replace(scenario, plant=replace(scenario.plant, set=arguments.program))
+        program = None if arguments.program is None else Program.load(arguments.program)
+        scenario = asked or recorded
+        if scenario is None:
+            scenario = Scenario.load(DEFAULT_SCENARIO) if program is None else Scenario.of_program(program)
+        elif program is not None:
+            scenario = scenario.on_program(program)
         seeds = (arguments.seed, scenario.seed, recorded_seed, DEFAULT_SEED)
         yield rig, scenario, next(seed for seed in seeds if seed is not None)
 
@@ -191,12 +188,20 @@ def files_read(arguments: argparse.Namespace) -> tuple[Path, ...]:
     from analogrig.trust import resolve_name
 
     given = vars(arguments)
-    names = [str(given[key]) for key in ("file", "rig", "scenario", "dut", "log_dut") if given.get(key) is not None]
+    names = [
+        str(given[key])
+        for key in ("file", "rig", "scenario", "program", "dut", "log_dut")
+        if given.get(key) is not None
+    ]
     scenario = Path(given.get("scenario") or "")
     if scenario.suffix == ".toml":
         with contextlib.suppress(AnalogrigError):  # the command that loads it reports the error
             table = read_toml(scenario)
-            names += [resolve_name(scenario, str(table[key])) for key in ("rig", "dut") if key in table]
+            names += [
+                resolve_name(scenario, str(table[key]))
+                for key in ("rig", "dut", "program")
+                if isinstance(table.get(key), str)
+            ]
     return tuple(Path(re.sub(r"(\.toml):.*$", r"\1", name.removeprefix("recording:"))) for name in names)
 
 

@@ -141,6 +141,8 @@ def _replay(arguments: argparse.Namespace) -> int:
             raise ConfigurationError(f"{arguments.file}: a CAN log does not name its device: name one with --dut")
         with RecordingRig.of(load_capture(arguments), arguments.file) as rig:
             conditions = rig.run.conditions
+            if arguments.dut is None and conditions.dut.get("kind") == "import":
+                raise ConfigurationError(f"{arguments.file}: measured data has no device: name one with --dut")
             device: Callable[..., Device] = functools.partial(reopen_dut, conditions.dut, str(arguments.file))
             if arguments.dut:
                 device = functools.partial(open_dut, arguments.dut)
@@ -237,7 +239,7 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
     else:
         show(f"{summary(run, verdict)}\nreport: {output.page}\nrun:    {output.path / RUN_FILE}")
     if not verdict.valid:
-        complain(f"INCONCLUSIVE: {verdict.reasons[0]}", INCONCLUSIVE)
+        complain(f"{verdict.outcome.upper()}: {verdict.reasons[0]}", INCONCLUSIVE)
     return STATUS[verdict.outcome]
 
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import PROGRAMS, RIG, add_command, add_json, add_seed
+from analogrig.cli.options import PROGRAM, RIG, add_command, add_json, add_seed
 from analogrig.cli.terminal import PASSED, complain, show, show_json
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
         help="emulated rig: shipped name or .toml file, which may have a table [instrument] (default: %(default)s)",
     )
     command.add_argument(
-        "--plant", choices=PROGRAMS, default="front", help="program of the computer (default: %(default)s)"
+        "--program", metavar=PROGRAM, default="front", help="shipped name or .toml file (default: %(default)s)"
     )
     add_seed(command, default=None, shown="1995")
     command.add_argument(
@@ -74,14 +74,17 @@ def _run(arguments: argparse.Namespace) -> int:
 
     from analogrig.hardware.simulator.served import ServedDescription
     from analogrig.hardware.simulator.server import Server
+    from analogrig.program import Program
     from analogrig.scenario import DEFAULT_SEED
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
     described = ServedDescription.load(arguments.rig, arguments.defect)
-    server = Server(described.set_up(arguments.plant, drawn_from, time.monotonic if arguments.real_time else None))
+    server = Server(
+        described.set_up(Program.load(arguments.program), drawn_from, time.monotonic if arguments.real_time else None)
+    )
     if described.unsupported:
         complain(f"{described.name}: the instrument has no {', '.join(described.unsupported)}", PASSED)
-    names = {"rig": described.name, "plant": arguments.plant, "seed": drawn_from}
+    names = {"rig": described.name, "program": arguments.program, "seed": drawn_from}
     return asyncio.run(_serve(server, arguments, names))
 
 
@@ -96,7 +99,7 @@ async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str,
         if arguments.json:
             show_json({**names, "host": host, "port": number, "address": address})
         else:
-            show(f"rig {names['rig']} ({names['plant']}, seed {names['seed']}) at {address}")
+            show(f"rig {names['rig']} ({names['program']}, seed {names['seed']}) at {address}")
         return await (_client(arguments.client, ended) if arguments.client else ended)
     finally:
         await server.close()

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 PASSED, FAILED, USAGE, INCONCLUSIVE, INTERRUPTED = 0, 1, 2, 3, 130
 """Exit statuses."""
 
-STATUS = {"passed": PASSED, "failed": FAILED, "inconclusive": INCONCLUSIVE}
+STATUS = {"passed": PASSED, "failed": FAILED, "inconclusive": INCONCLUSIVE, "unjudged": INCONCLUSIVE}
 """Exit status by outcome of a verdict."""
 
 _GREEN, _RED, _YELLOW = 32, 31, 33
 _COLOURS = {
     **dict.fromkeys(("PASSED", "CERTIFIED"), _GREEN),
     **dict.fromkeys(("FAILED", "REFUTED", "WRONG", "WORSE"), _RED),
-    **dict.fromkeys(("INCONCLUSIVE", "NOT MEASURED"), _YELLOW),
+    **dict.fromkeys(("INCONCLUSIVE", "NOT MEASURED", "UNJUDGED"), _YELLOW),
 }
 """SGR colour codes of the verdicts, which the results write in capitals."""
 

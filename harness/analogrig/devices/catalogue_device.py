@@ -169,7 +169,7 @@ class CatalogueDevice(Device):
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
         """Set the code of zero force; errors as ``configure``."""
-        self._apply(dataclasses.replace(self.estimator, force_zero=channels["force"].zero))
+        self._apply(dataclasses.replace(self.estimator, force_zero=channels["u"].zero))
 
     def _apply(self, estimator: EstimatorConfig) -> None:
         self._description = dataclasses.replace(self._description, estimator=estimator)

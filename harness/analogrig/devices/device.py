@@ -68,7 +68,7 @@ class Device(ABC):
             raise DeviceRefused(f"device {self.name}: has no setting {next(iter(settings))}")
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: B027 - few devices need it
-        """Take the scales of the rig's channels, and the machine time between samples, before ``start``.
+        """Take the scales of the channels ``u`` and ``y``, and the machine time between samples, before ``start``.
 
         Messages that carry physical units need them, and so does the code of zero force.
         """

@@ -54,7 +54,7 @@ class DirectDevice(Device):
         self._apply(self._as_opened.changed(f"device {self.name}", settings))
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
-        zero = channels["force"].zero
+        zero = channels["u"].zero
         if zero != self._description.estimator.force_zero:
             self._apply(dataclasses.replace(self._description.estimator, force_zero=zero))
 

@@ -25,7 +25,7 @@ FD_BYTES = 64
 _LARGEST_FLOAT = {16: 65504.0, 32: LARGEST_FLOAT32, 64: math.inf}
 """Largest finite value of a float signal by its length in bits."""
 
-_CHANNELS = {"u": "force", "y": "displacement"}
+_INPUTS = ("u", "y")
 
 
 class Answer(NamedTuple):
@@ -109,7 +109,7 @@ class EcuMessages:
         :param channels: channels of the rig; None: units that depend on them are not checked.
         :raises ConfigurationError: a code does not fit its signal.
         """
-        tables = {key: self._raw_values(key, self._channel(key, channels)) for key in _CHANNELS}
+        tables = {key: self._raw_values(key, None if channels is None else channels[key]) for key in _INPUTS}
         u_of, y_of = tables["u"], tables["y"]
         parts = [self._encode_part(self._frames[name]) for name in self.order]
 
@@ -217,9 +217,9 @@ class EcuMessages:
 
         It is the inverse of ``encoder``, as far as the signals have a step for each code.
         """
-        known = {key: scale(self._units(key), channels[name]) for key, name in _CHANNELS.items()}
+        known = {key: scale(self._units(key), channels[key]) for key in _INPUTS}
         scales = {key: factors for key, factors in known.items() if factors is not None}
-        most = {key: channels[name].codes for key, name in _CHANNELS.items()}
+        most = {key: channels[key].codes for key in _INPUTS}
 
         def decode(values: Mapping[str, float]) -> tuple[int, int, bool] | None:
             codes = {key: round((values[key] - offset) / factor) for key, (factor, offset) in scales.items()}
@@ -233,7 +233,7 @@ class EcuMessages:
 
     def _find_sent(self) -> None:
         sent = self._description.send
-        self._carriers = {key: self._signal(f"send.{key}", getattr(sent, key)) for key in _CHANNELS}
+        self._carriers = {key: self._signal(f"send.{key}", getattr(sent, key)) for key in _INPUTS}
         if sent.valid:
             self._carriers["valid"] = self._signal("send.valid", sent.valid)
         self._send_counters = self._counters("send.counter", sent.counter)
@@ -314,10 +314,6 @@ class EcuMessages:
     def _units(self, key: str) -> Units:
         units: Units = getattr(self._description.send.units, key)
         return units
-
-    @staticmethod
-    def _channel(key: str, channels: Mapping[str, Channel] | None) -> Channel | None:
-        return None if channels is None else channels[_CHANNELS[key]]
 
     # ---------------------------------------------------------------------------------------------------------- receive
 

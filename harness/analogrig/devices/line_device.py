@@ -77,7 +77,7 @@ class TemplateDevice(Device):
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
         if self._description.units == "volts":
-            self._to_codes = ToCodes(self._sheet, channels["force"], channels["displacement"])
+            self._to_codes = ToCodes(self._sheet, channels["u"], channels["y"])
 
     def limit(self, left_s: float) -> None:
         self._until_s = self._wire.clock() + left_s

@@ -11,7 +11,7 @@ from analogrig.hardware.dating.instants import NoInstant, TurnInstants, date_jum
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import Clock
-from analogrig.plant import AT_REST, Plant, SampledPlant, Segment
+from analogrig.plant import Plant, SampledPlant, Segment
 
 BEFORE_S, AFTER_S = 0.02, 0.05
 """Margins of the search: a record may start late, and a pot may still move after it was reported set."""
@@ -165,12 +165,16 @@ def contradictions(signals: Signals, changes: Sequence[PlannedChange], first: in
 def _is_detectable(signals: Signals, change: PlannedChange, stretch: range) -> bool:
     """True if the change, made at the start of ``stretch``, would be detected with certainty."""
     plants = [SampledPlant.from_plant(plant, signals.period_s) for plant in (change.before, change.after)]
-    states = [AT_REST, AT_REST]
+    states = [plant.at_rest for plant in plants]
     information = 0.0
     for k in range(stretch.stop):
         inside = k >= stretch.start
         states = [
             plants[1 if inside and i else 0].next(state, float(signals.force_n[k])) for i, state in enumerate(states)
         ]
-        information += 0.5 * ((states[1][0] - states[0][0]) / signals.noise_m) ** 2 if inside else 0.0
+        information += (
+            0.5 * ((plants[1].output(states[1]) - plants[0].output(states[0])) / signals.noise_m) ** 2
+            if inside
+            else 0.0
+        )
     return information > _CERTAIN_INFORMATION

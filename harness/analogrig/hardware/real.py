@@ -20,15 +20,15 @@ from typing import Any
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
 from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
 from analogrig.hardware.dating.two_filter import Signals
-from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
+from analogrig.hardware.instrument import MEASURED, DialChange, InputRecord, Instrument, Pots, find_driver
 from analogrig.hardware.lock import lock_instrument
 from analogrig.hardware.self_test import self_test
 from analogrig.hardware.wiring import RealDescription, check_wiring
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant, Segment
-from analogrig.rigs.emulator import Stream, emulator_errors, settings_of
+from analogrig.program import Program
+from analogrig.rigs.emulator import Stream, emulator_errors
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
-from analogrig.run import MEASURED
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation, SuspensionComputer
 
@@ -106,19 +106,19 @@ class RealRig(Rig):
     def _plan(self, scenario: Scenario, seed: int) -> PlayPlan:
         """:raises ConfigurationError: the rig cannot play the scenario, or it would exceed the limits."""
         description, where = self._description, f"scenario {scenario.name}: "
-        if scenario.plant.set != description.plant:
+        if scenario.program != Program.load(description.plant):
             raise ConfigurationError(
-                f"{where}wants the program {scenario.plant.set!r}; {description.name or 'the rig'} has"
+                f"{where}wants the program {scenario.program.name!r}; {description.name or 'the rig'} has"
                 f" {description.plant!r} patched"
             )
-        computer = SuspensionComputer(scenario.plant.set)
+        computer = SuspensionComputer(scenario.program.circuit)
         with emulator_errors(where):
-            computer.set(**settings_of(computer, scenario.plant.overrides()))
+            computer.set(**scenario.set)
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         self._check_force(excitation, where)
         description.check_dials(computer.dials, where)
         changes: list[PlannedChange] = []
-        plant = scenario.plant.plant()
+        plant = scenario.plant
         for i, tweak in enumerate(scenario.tweaks):
             place = f"{where}tweaks[{i}] at sample {tweak.sample}: "
             if not description.pots.changeable:
@@ -126,11 +126,11 @@ class RealRig(Rig):
             if tweak.ramp_n:
                 raise ConfigurationError(f"{place}the pots of this rig jump, they do not turn evenly: leave out ramp_n")
             with emulator_errors(place):
-                dials = computer.dials_for(**settings_of(computer, tweak.overrides()))
+                dials = computer.dials_for(**tweak.set)
             description.check_dials(dials, place)
-            before, plant = plant, dataclasses.replace(plant, **tweak.overrides())
+            before, plant = plant, plant.changed(tweak.set)
             changes.append(PlannedChange(tweak.sample, dials, before, plant))
-        dated = None if description.pots.exact else [Segment(0, scenario.plant.plant())]
+        dated = None if description.pots.exact else [Segment(0, scenario.plant)]
         return PlayPlan(computer, excitation, tuple(changes), [], dated)
 
     def _check_force(self, excitation: Excitation, where: str) -> None:
@@ -157,7 +157,7 @@ class RealRig(Rig):
         channels = self._description.channels(plan.computer, self._noise_lsb)
         period_s = self._description.time_scale(plan.computer) / self._datasheet.rate_hz
         cuts = split_records(scenario.samples, self._datasheet.record_n, [change.sample for change in plan.changes])
-        dials, plant = dict(plan.computer.dials), scenario.plant.plant()
+        dials, plant = dict(plan.computer.dials), scenario.plant
         for record, (start, end) in enumerate(cuts):
             changes = [dataclasses.replace(c, sample=c.sample - start) for c in plan.changes if start <= c.sample < end]
             with self._leave_safe(instrument):

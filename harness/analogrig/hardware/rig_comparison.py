@@ -21,7 +21,7 @@ from analogrig.campaigns.rows import Row, changes, row
 from analogrig.judging.bursts import bound_rate
 from analogrig.judging.statistics import mean_interval, upper_rate
 from analogrig.judging.verdict import judge
-from analogrig.run import CHANNELS, MEASURED, Run
+from analogrig.run import INPUT, Run
 from analogrig.scenario import Scenario
 
 _THIRD_DIFFERENCE = (1.0, -3.0, 3.0, -1.0)
@@ -170,10 +170,10 @@ def compare_rigs(
         confidence=confidence,
         plays=len(runs),
         invalid=tuple(invalid),
-        signals=tuple(signal_difference(runs, name, confidence) for name in MEASURED),
+        signals=tuple(signal_difference(runs, name, confidence) for name in scenario.program.measured),
         latency=_latency(rows_a, rows_b, confidence),
         false_alarms=(FalseAlarms.of(rows_a, confidence), FalseAlarms.of(rows_b, confidence)),
-        verdicts=compare(keyed_a, keyed_b, alpha=round(1.0 - confidence, 12)),
+        verdicts=compare(keyed_a, keyed_b, round(1.0 - confidence, 12), scenario.program.estimates),
     )
 
 
@@ -208,25 +208,26 @@ def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence:
 
 def _difference(a: Run, b: Run, channel: str) -> tuple[NDArray[np.float64], NDArray[np.bool_], int]:
     """Difference (n,) in LSB of a; mask (n,) of the samples compared; number of samples at edges that lie apart."""
-    column, samples = CHANNELS.index(channel), min(a.samples, b.samples)
+    names = a.conditions.program.channels
+    column, samples = names.index(channel), min(a.samples, b.samples)
     of_a, of_b = a.conditions.channels[channel], b.conditions.channels[channel]
     volts = of_b.volts(b.codes[:samples, column]) - of_a.volts(a.codes[:samples, column])
     counted = ~(a.clipped[:samples, column] | b.clipped[:samples, column])
     apart = 0
-    if channel == "force":
+    if channel == names[INPUT]:
         edges = _at_edges(a, samples) | _at_edges(b, samples)
-        apart = int((np.abs(volts[edges]) > _EDGE_PART * np.ptp(_force_v(a))).sum())
+        apart = int((np.abs(volts[edges]) > _EDGE_PART * np.ptp(_input_v(a))).sum())
         counted &= ~edges
     return volts / of_a.lsb_v, counted, apart
 
 
-def _force_v(run: Run) -> NDArray[np.float64]:
-    return run.conditions.channels["force"].volts(run.codes[:, CHANNELS.index("force")])
+def _input_v(run: Run) -> NDArray[np.float64]:
+    return run.conditions.input.volts(run.codes[:, INPUT])
 
 
 def _at_edges(run: Run, samples: int) -> NDArray[np.bool_]:
     """(samples,): True next to an edge, where a small part of a sample period decides the level."""
-    volts = _force_v(run)
+    volts = _input_v(run)
     jump = np.flatnonzero(np.abs(np.diff(volts[:samples])) > _EDGE_PART * np.ptp(volts))
     near = np.zeros(samples, np.bool_)
     for away in (-1, 0, 1, 2):

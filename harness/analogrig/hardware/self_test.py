@@ -26,12 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import SelfTestError
+from analogrig.hardware.instrument import MEASURED
 from analogrig.hardware.square_wave import Response, SquareWave, Uncertain
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant
+from analogrig.program import Program
 from analogrig.rigs.rig import Rig
-from analogrig.run import CHANNELS, MEASURED, Channel
-from analogrig.scenario import PLANTS, PlantChoice, Scenario
+from analogrig.run import Channel
+from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
 
 State = Literal["well", "wrong", "not measured"]
@@ -167,8 +169,7 @@ def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
     if program not in PROGRAMS:
         raise SelfTestError(f"the self-test supports the programs {', '.join(PROGRAMS)}, not {program}")
     excitation = Excitation(low_v=LOW_V, high_v=HIGH_V, frequency_hz=FREQUENCY_HZ, clock="free")
-    plant = PlantChoice(set=program)  # type: ignore[arg-type]
-    scenario = Scenario(SAMPLES, excitation, random_phase=True, plant=plant, name="self-test")
+    scenario = Scenario(SAMPLES, excitation, Program.load(program), random_phase=True, name="self-test")
     performance = rig.perform(scenario, seed)
     if performance.sample_period_s * SAMPLES * FREQUENCY_HZ < LEAST_PERIODS:
         most_hz = SAMPLES * FREQUENCY_HZ / LEAST_PERIODS
@@ -183,9 +184,9 @@ def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
     half_period_n = 0.5 / (FREQUENCY_HZ * performance.sample_period_s)
     force, displacement = (
         _Signal(name, performance.channels[name], codes[:, i], clipped[:, i], half_period_n)
-        for name, i in ((name, CHANNELS.index(name)) for name in MEASURED)
+        for i, name in enumerate(MEASURED)
     )
-    analysis = _Analysis(force, displacement, PLANTS[program], performance.sample_period_s, performance.time_scale)
+    analysis = _Analysis(force, displacement, scenario.plant, performance.sample_period_s, performance.time_scale)
     return Findings(str(rig.description().get("name", "")), program, analysis.checks())
 
 
@@ -385,7 +386,7 @@ class _Analysis:
     def _gains(self) -> tuple[float, float]:
         """Deviation of the displacement's static gain, by the force as measured and as commanded."""
         unit_per_v = self.displacement.channel.unit_per_v / self.force.channel.unit_per_v
-        measured = self._response.gain.value * self.plant.stiffness_n_per_m * unit_per_v - 1.0
+        measured = self._response.gain.value * self.plant.parameters()["K"] * unit_per_v - 1.0
         return measured, measured if self._is_clipped else (1.0 + measured) * (1.0 + self._force_gain.value) - 1.0
 
     @cached_property

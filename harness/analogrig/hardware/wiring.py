@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from analogrig.config import check_range
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import InputRecord, Instrument, InstrumentDatasheet, find_driver
+from analogrig.hardware.instrument import MEASURED, InputRecord, Instrument, InstrumentDatasheet, find_driver
 from analogrig.hardware.pots import PotsDescription
-from analogrig.rigs.rig import CHANNEL_UNITS, Rig, RigDescription
-from analogrig.run import CHANNELS, MEASURED, Channel
+from analogrig.rigs.rig import Rig, RigDescription
+from analogrig.run import Channel
 from analogrig.trust import Thing
-from analogrig_emulator import Excitation, SuspensionComputer
+from analogrig_emulator import CHANNELS, Excitation, SuspensionComputer
 
 _MOST_CODE = 0xFFFF
+_UNITS = {"force": "N", "displacement": "m"}
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 
 
@@ -208,7 +209,7 @@ class RealDescription(RigDescription):
             out[name] = Channel(
                 low_v=low_v,
                 lsb_v=lsb_v,
-                unit=CHANNEL_UNITS[name],
+                unit=_UNITS[name],
                 unit_per_v=(full[name] or computer.scales.full(name)) / 10.0,
                 noise_lsb=noise_lsb.get(name, wired.noise_lsb),
                 codes=math.ceil((ends_v[1] - low_v) / lsb_v),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChannelFault, MisfitPeriod, Verdict
+from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChannelFault, MisfitPeriod, Verdict, unreported
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -34,7 +34,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     return (
         *_statement(run),
         *_misfits(verdict),
-        *_unjudged_quantities(verdict),
+        *_unjudged_quantities(run, verdict),
         *_theta_without_a_model(run),
         *_assumed_settings(run),
         *_overloads(verdict),
@@ -58,9 +58,12 @@ def _cause(period: MisfitPeriod) -> str:
     return period.cause
 
 
-def _unjudged_quantities(verdict: Verdict) -> Iterator[str]:
-    if {*verdict.not_judged} - {DIAGNOSES}:  # many devices have no diagnoses, and lack nothing
-        yield f"not judged, because the device does not report them: {', '.join(verdict.not_judged)}"
+def _unjudged_quantities(run: Run, verdict: Verdict) -> Iterator[str]:
+    absent = unreported(run.datasheet)
+    if {*absent} - {DIAGNOSES}:  # many devices have no diagnoses, and lack nothing
+        yield f"not judged, because the device does not report them: {', '.join(absent)}"
+    if others := [name for name in verdict.not_judged if name not in absent]:
+        yield f"not judged on the program {run.conditions.program.name}: {', '.join(others)}"
     if verdict.cannot_tell:
         yield f"the device's protocol does not show: {', '.join(verdict.cannot_tell)}"
 
@@ -70,7 +73,7 @@ def _theta_without_a_model(run: Run) -> Iterator[str]:
     if sheet.theta_n and sheet.model is None:
         yield (
             f"the {number_of(sheet.theta_n, 'element')} of theta are recorded, but their model is not known: state"
-            " na, nb and offset under [datasheet.model] to have M, B, K judged"
+            " na, nb and offset under [datasheet.model] to have estimates judged"
         )
 
 
@@ -122,7 +125,7 @@ def _name(fault: ChannelFault) -> str:
 
 
 def _noise_setting(run: Run) -> Iterator[str]:
-    measured = run.conditions.channels["displacement"].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2
+    measured = run.conditions.output.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2
     expected = run.datasheet.noise_variance
     if expected is not None and measured > NOISE_MARGIN * expected:
         yield (
@@ -159,8 +162,8 @@ def _warm_up(run: Run) -> Iterator[str]:
 
 
 def _excitation(run: Run) -> Excitation | None:
-    """Recorded excitation; None if the scenario has none."""
-    table = run.conditions.scenario.get("excitation")
+    """Recorded excitation; None if the scenario has none, or nothing is known of it."""
+    table = run.conditions.scenario.get("excitation") if run.conditions.segments else None
     return None if table is None else config.build(Excitation, table, "the recorded excitation")
 
 
@@ -177,7 +180,7 @@ def _false_alarm_rate(verdict: Verdict) -> Iterator[str]:
 
 def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
     for tweak in verdict.tweaks:
-        if tweak.bound_n is None and not tweak.unseen:
+        if tweak.bound_n is None and tweak.is_bounded and not tweak.unseen:
             yield f"{tweak.what} at {tweak.sample} is not judged: not detectable before the next change or the end"
 
 
@@ -187,4 +190,4 @@ def _implausible_estimates(verdict: Verdict) -> Iterator[str]:
     for segment in verdict.estimates:
         if segment.estimate is None:
             samples = f"{segment.start}-{segment.end - 1}"
-            yield f"the last estimate of samples {samples} describes no mass, damper and spring"
+            yield f"the last estimate of samples {samples} describes no plant of the program"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import Datasheet
-from analogrig.run import CHANNELS, LOST, UNARMED, Run, stack
+from analogrig.run import INPUT, LOST, UNARMED, Run, stack
 from analogrig.wording import number_of
 
 EDGE_NOISES = 9.0
@@ -24,8 +24,6 @@ EDGE_NOISES = 9.0
 pairs."""
 
 _QUANTISATION_LSB = 12.0**-0.5
-
-_FORCE = CHANNELS.index("force")
 
 _NOT_PROCESSED = np.uint8(SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST)
 
@@ -89,8 +87,8 @@ def exposure(run: Run) -> Exposure:
 def exposures(runs: Sequence[Run]) -> list[Exposure]:
     """Exposure of each run, for runs that have length, records, channels and device in common."""
     run, sheet = runs[0], runs[0].datasheet
-    noise_lsb = run.conditions.channels["force"].noise_lsb
-    force, flags = stack([each.codes[:, _FORCE] for each in runs]), stack([each.flags for each in runs])
+    noise_lsb = run.conditions.input.noise_lsb
+    driven, flags = stack([each.codes[:, INPUT] for each in runs]), stack([each.flags for each in runs])
     are_finite = np.isfinite(stack([each.innovation for each in runs]))
     are_finite &= np.isfinite(stack([each.statistic for each in runs]))
     for i in range(run.theta.shape[1]):
@@ -99,7 +97,7 @@ def exposures(runs: Sequence[Run]) -> list[Exposure]:
     for start, end in run.records:
         alarms = [each.alarm_index[(each.alarm_index >= start) & (each.alarm_index < end)] - start for each in runs]
         part = slice(start, end)
-        counts += _count(force[:, part], flags[:, part], are_finite[:, part], alarms, sheet, noise_lsb)
+        counts += _count(driven[:, part], flags[:, part], are_finite[:, part], alarms, sheet, noise_lsb)
     return [
         Exposure(run.samples, armed, unexcited, non_finite, sheet) for armed, unexcited, non_finite in counts.T.tolist()
     ]

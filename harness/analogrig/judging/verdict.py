@@ -26,8 +26,9 @@ from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
+from analogrig.judging.courses import first_at_level
 from analogrig.judging.exposure import Exposure, exposures
-from analogrig.plant import PARAMETERS, Segment, physical_parameters
+from analogrig.plant import Segment, estimated_parameters
 from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
@@ -37,14 +38,21 @@ LARGEST_LEVEL = 700.0
 
 _NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
 
-Outcome = Literal["passed", "failed", "inconclusive"]
+Outcome = Literal["passed", "failed", "inconclusive", "unjudged"]
+"""``unjudged``: nothing is known of the plant, so that no alarm can be true or false."""
+
+UNKNOWN_PLANT = "nothing is known of the plant and its changes: pass a scenario that holds them with --scenario"
+"""Reason of an unjudged run."""
 
 Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not judged"]
 """Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
 instant, which is known only as an interval. ``not judged``: the change was not found in the samples."""
 
-ESTIMATES, STATISTIC, DIAGNOSES = "estimates of M, B, K", "the trigger's statistic", "diagnoses"
+ESTIMATES, STATISTIC, DIAGNOSES = "estimates of parameters", "the trigger's statistic", "diagnoses"
 """Quantities in ``Verdict.not_judged`` that reports show elsewhere."""
+
+BOUNDS = "delays"
+"""Quantity in ``Verdict.not_judged`` where no bound is known: every change then counts as detectable."""
 
 CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERAL)
 """Changes that are faults of a channel. Diagnosed where a parameter has changed, they are wrong."""
@@ -52,10 +60,8 @@ CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERA
 GAINS = frozenset({Change.FORCE_GAIN, Change.DISPLACEMENT_GAIN})
 """Faults of a channel that have an extent."""
 
-DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"} | {
-    fault: fault.name.lower().replace("_", " ") for fault in CHANNEL_FAULTS
-}
-"""Changes that a device can diagnose, with their names in verdicts, such as ``force offset``."""
+DIAGNOSABLE = {change: change.name.lower().replace("_", " ") for change in Change if change}
+"""Changes that a device can diagnose, with their names: ``mass``, ``several``, ``force offset``."""
 
 CURES: Mapping[str, str] = {
     "drift": "remove the mean of the displacement by a high-pass filter, or make the run shorter",
@@ -128,7 +134,7 @@ class DiagnosisVerdict:
     """Verdict on the first diagnosis after the detection of a change."""
 
     named: str
-    """Name in ``DIAGNOSABLE``: ``M``, ``B``, ``K``, ``several`` or a fault of a channel, such as ``force offset``."""
+    """Parameter of the program, or a name in ``DIAGNOSABLE``: ``several``, ``force offset``."""
     right: bool
     delay_n: int
     """Samples from the change to the diagnosis."""
@@ -157,6 +163,8 @@ class ChangeVerdict:
     """Information bound of this change; None: not detectable before the next change or the end."""
     deadline_n: int | None
     """Latest alarm that is not late; None: no alarm is late."""
+    is_bounded: bool = True
+    """False: the bound is unknown, and the change counts as detectable."""
     diagnosis: DiagnosisVerdict | None = None
     """None: the device reported no diagnosis."""
     alternatives: tuple[ChangeVerdict, ...] = ()
@@ -200,7 +208,7 @@ class ChangeVerdict:
     @property
     def missed(self) -> bool:
         """True if the change was detectable and raised no alarm."""
-        return self.latency_n is None and self.bound_n is not None
+        return self.latency_n is None and (self.bound_n is not None or not self.is_bounded)
 
     @property
     def late(self) -> bool:
@@ -219,17 +227,17 @@ def _result_at_instant(tweak: ChangeVerdict) -> Result:
 
 @dataclass(frozen=True)
 class SegmentEstimate:
-    """Last estimate of M, B, K in a segment of constant plant, samples ``start`` <= k < ``end``."""
+    """Last estimates of parameters in a segment of constant plant, samples ``start`` <= k < ``end``."""
 
     start: int
     end: int
     truth: Mapping[str, float]
     estimate: Mapping[str, float] | None
-    """None: the estimate describes no mass, damper and spring."""
+    """None: the estimate describes no plant of the program."""
 
     @property
     def error(self) -> Mapping[str, float]:
-        """Relative errors of M, B, K by name; empty without an estimate."""
+        """Relative errors by name; empty without an estimate."""
         if self.estimate is None:
             return {}
         return {name: self.estimate[name] / truth - 1.0 for name, truth in self.truth.items()}
@@ -237,9 +245,9 @@ class SegmentEstimate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a run: ``passed``, ``failed`` or ``inconclusive``, with the reasons and the figures behind it.
+    """Verdict on a run, with the reasons and the figures behind it. Instants are sample indices.
 
-    Instants are sample indices. An inconclusive verdict is never a passed one.
+    An inconclusive verdict and an unjudged run never count as passed.
     """
 
     outcome: Outcome
@@ -272,6 +280,8 @@ class Verdict:
     """Periods of a misfit, in order; None if the device does not watch whether its model fits."""
     channel_faults: tuple[ChannelFault, ...] = ()
     """Faults of the channels that the device diagnosed, in order. No scenario contains one."""
+    knows_truth: bool = True
+    """False if nothing is known of the plant: the alarms are then neither detections nor false."""
 
     def __bool__(self) -> bool:
         raise TypeError('a verdict is neither true nor false: ask for verdict.outcome == "passed"')
@@ -279,7 +289,7 @@ class Verdict:
     @property
     def valid(self) -> bool:
         """True if the run permits a verdict on the device."""
-        return self.outcome != "inconclusive"
+        return self.outcome not in {"inconclusive", "unjudged"}
 
 
 def is_captured(run: Run) -> bool:
@@ -329,6 +339,9 @@ def _judge(run: Run, expect: Expectations, shown: Exposure, estimates: tuple[Seg
     outcome, reasons = _decide_outcome(results, expect)
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
     possible = {index for each in results for index in each.false_alarms}
+    knows_truth = bool(run.conditions.segments) or not run.samples
+    if not knows_truth:
+        outcome, reasons, certain, possible = "unjudged", [UNKNOWN_PLANT], set(), set()
     return Verdict(
         outcome="inconclusive" if invalid else outcome,
         reasons=(*invalid, *reasons),
@@ -342,11 +355,12 @@ def _judge(run: Run, expect: Expectations, shown: Exposure, estimates: tuple[Seg
         armed_n=shown.armed,
         theta_hash=run.theta_hash(),
         alarm_hash=run.alarm_hash(),
-        not_judged=unreported(sheet),
+        not_judged=not_judged(run),
         cannot_tell=sheet.cannot_tell,
         overloads=dict(run.conditions.overloads),
         fit=misfit_periods(run) if sheet.misfits else None,
         channel_faults=channel_faults(run),
+        knows_truth=knows_truth,
     )
 
 
@@ -387,6 +401,14 @@ def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
     return tuple(out)
 
 
+def not_judged(run: Run) -> tuple[str, ...]:
+    """Quantities that the device does not report, or that the program does not relate to its parameters."""
+    program = run.conditions.program
+    stated = {ESTIMATES: program.estimates, DIAGNOSES: program.diagnosed, BOUNDS: information.is_bounded(run)}
+    unstated = (name for name, is_stated in stated.items() if not is_stated)
+    return tuple(dict.fromkeys((*unreported(run.datasheet), *unstated)))
+
+
 def unreported(sheet: Datasheet) -> tuple[str, ...]:
     """Quantities that the device does not report."""
     reported = {
@@ -399,21 +421,25 @@ def unreported(sheet: Datasheet) -> tuple[str, ...]:
 
 
 def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
-    """Estimated M, B, K after each of ``samples``, (n, 3) float64; NaN if theta does not describe them."""
-    return _physical(run, run.theta[samples])
+    """Estimated parameters after each of ``samples``, (n, m) float64; NaN if theta does not describe them.
+
+    The columns are those of ``Program.estimates``.
+    """
+    return _parameters_of(run, run.theta[samples])
 
 
-def _physical(run: Run, theta: NDArray[np.float32]) -> NDArray[np.float64]:
-    """M, B, K, (n, 3) float64, of estimates (n, p) of a device as in ``run``; NaN if they do not describe them."""
-    channels, model = run.conditions.channels, run.datasheet.model
+def _parameters_of(run: Run, theta: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Parameters, as of ``trajectory``, of estimates (n, p) of a device as in ``run``."""
+    conditions, model = run.conditions, run.datasheet.model
     if model is None or not theta.shape[1]:
-        return np.full((len(theta), len(PARAMETERS)), np.nan)
-    return physical_parameters(
+        return np.full((len(theta), len(conditions.program.estimates)), np.nan)
+    return estimated_parameters(
+        conditions.program,
         theta,
         model,
-        n_per_code=channels["force"].lsb,
-        m_per_code=channels["displacement"].lsb,
-        period_s=run.conditions.sample_period_problem_s,
+        input_per_code=conditions.input.lsb,
+        output_per_code=conditions.output.lsb,
+        period_s=conditions.sample_period_problem_s,
     )
 
 
@@ -544,7 +570,9 @@ def _attribute_alarms(
     by_start = {segment.start: segment for segment in run.conditions.segments}
     detected: set[int] = set()
     tweaks = []
-    isolation_bounds = information.isolation_bounds(run) if len(run.diagnosis_index) else [None] * len(run.segments)
+    diagnosed, is_bounded = run.conditions.program.diagnosed, information.is_bounded(run)
+    isolates = len(run.diagnosis_index) and diagnosed
+    isolation_bounds = information.isolation_bounds(run) if isolates else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
         run.segments, run.segments[1:], information.change_information(run), isolation_bounds, strict=False
     ):
@@ -555,7 +583,7 @@ def _attribute_alarms(
         detection = in_segment[0] if in_segment else None
         detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
-        late = information.first_at_level(gathered, expect.late_information_ratio * level)
+        late = first_at_level(gathered, expect.late_information_ratio * level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -564,10 +592,11 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=information.first_at_level(gathered, level),
+                bound_n=first_at_level(gathered, level),
+                is_bounded=is_bounded,
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
-                if detection is None
+                if detection is None or not diagnosed
                 else _judge_diagnosis(run, start, (detection, end), changed, isolation_bound_n),
             )
         )
@@ -582,9 +611,10 @@ def _judge_diagnosis(
     if not len(reported):
         return None
     first = reported[0]
-    named = DIAGNOSABLE[Change(run.diagnosis_change[first])]
+    diagnosis, parameters = DIAGNOSABLE[Change(run.diagnosis_change[first])], run.conditions.program.diagnosed
+    named = parameters.get(diagnosis, diagnosis)
     ratio = float(run.diagnosis_extent[first])
-    extent = ratio if named in PARAMETERS and math.isfinite(ratio) else None
+    extent = ratio if diagnosis in parameters and math.isfinite(ratio) else None
     right = (named,) == tuple(changed) or (named == "several" and len(changed) > 1)
     error = extent * changed[named][0] / changed[named][1] - 1.0 if right and extent is not None else None
     return DiagnosisVerdict(
@@ -618,7 +648,8 @@ def invalid_reasons(run: Run, shown: Exposure, expect: Expectations) -> list[str
     refused = run.conditions.counters.get("refused", 0)
     reasons += [f"the device refused {number_of(refused, 'sample')}"] if refused else []
     reasons += expect.excess_missing(run.samples, int(np.count_nonzero(run.missing)), missing_text(run))
-    return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence and run.samples else [])
+    is_evidence = bool(run.conditions.segments) or shown.non_finite > 0  # alarms of an unknown plant prove nothing
+    return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence and run.samples and is_evidence else [])
 
 
 def _loss_reasons(run: Run) -> list[str]:
@@ -666,13 +697,18 @@ def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]
     """Last estimate of each segment whose plant is known, for each run."""
     run = runs[0] if _is_exact(runs[0]) else runs[0].with_change_instants(Segment.earliest)
     unseen = {segment.start for segment in run.conditions.segments if segment.unseen}
-    segments = [(start, end, plant.parameters()) for start, end, plant in run.segments if start not in unseen]
+    names = run.conditions.program.estimates
+    segments = [
+        (start, end, {name: plant.parameters()[name] for name in names})
+        for start, end, plant in run.segments
+        if start not in unseen
+    ]
     ends = [end - 1 for _, end, _ in segments]
-    lasts = _physical(run, np.concatenate([each.theta[ends] for each in runs]))
-    is_known = ~np.isnan(lasts).any(axis=1)
+    lasts = _parameters_of(run, np.concatenate([each.theta[ends] for each in runs]))
+    is_known = ~np.isnan(lasts).any(axis=1) & bool(names)
     estimates = (
-        dict(zip(PARAMETERS, last, strict=True)) if known else None
-        for last, known in zip(lasts.tolist(), np.asarray(is_known), strict=True)
+        dict(zip(names, last, strict=True)) if known else None
+        for last, known in zip(lasts.tolist(), is_known.tolist(), strict=True)
     )
     return [tuple(SegmentEstimate(*each, next(estimates)) for each in segments) for _ in runs]
 

@@ -19,7 +19,7 @@ from analogrig.recordings.decoder import CaptureDecoder, FrameDictionary
 from analogrig.recordings.ecu_decoder import EcuDecoder
 from analogrig.recordings.files import CapturedFrames
 from analogrig.rigs.rig import Block
-from analogrig.run import CHANNELS, LOST, MEASURED, Conditions, Run
+from analogrig.run import INPUT, LOST, OUTPUT, Conditions, Run
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
@@ -58,7 +58,7 @@ def import_run(
         if device is None:
             decoder = CaptureDecoder(FrameDictionary(dbc), frames)
         else:
-            decoder = EcuDecoder(device, performance.channels, frames, most_n=scenario.samples)
+            decoder = EcuDecoder(device, performance.of_device, frames, most_n=scenario.samples)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
     captured = _select_run(decoder, frames, number)
@@ -70,14 +70,13 @@ def import_run(
     answers = captured.answers(path)
     dut = {**captured.device(path), "most_lost_n": most_lost_n}
     faults = (
-        *scenario.caveats,
         *captured.faults,
         *captured.capture_faults(path),
         *([frames.end] if frames.end else []),
     )
-    builder = RunBuilder(captured.extent, Datasheet.recorded(dut))
+    builder = RunBuilder(captured.extent, len(scenario.program.channels), Datasheet.recorded(dut))
     builder.begin_record()
-    builder.add(_block(captured), answers)
+    builder.add(_block(captured, len(scenario.program.channels)), answers)
     return builder.build(
         Conditions(
             seed=0,
@@ -93,6 +92,7 @@ def import_run(
             counters=_plausible_counters(captured, answers),
             link_counters=_line_counts(decoder, frames),
             faults=faults,
+            program=scenario.program,
         )
     )
 
@@ -106,11 +106,11 @@ def _plausible_counters(captured: CapturedRun, answers: Answers) -> Mapping[str,
     return {name: value for name, value in counters.items() if name not in {"samples_lost", "updated"}}
 
 
-def _block(captured: CapturedRun) -> Block:
+def _block(captured: CapturedRun, channels: int) -> Block:
     """All samples of the run; those that the log lacks repeat the codes before them, as clipped."""
     n = captured.extent
-    codes, clipped = np.zeros((n, len(CHANNELS)), np.uint16), np.ones((n, len(CHANNELS)), np.bool_)
-    used = [CHANNELS.index(name) for name in MEASURED]
+    codes, clipped = np.zeros((n, channels), np.uint16), np.ones((n, channels), np.bool_)
+    used = [INPUT, OUTPUT]
     for k in range(n):
         sample = captured.samples.get(k)
         if sample is not None:
@@ -123,14 +123,18 @@ def _block(captured: CapturedRun) -> Block:
 def replace_scenario(run: Run, scenario: Scenario) -> Run:
     """The same run with the plant and the expectations of another scenario.
 
-    :raises ConfigurationError: ``scenario`` has fewer samples than the run.
+    :raises ConfigurationError: ``scenario`` has fewer samples than the run, or other channels.
     """
     if run.samples > scenario.samples:
         raise ConfigurationError(
             f"the recording has {number_of(run.samples, 'sample')}, scenario {scenario.name} {scenario.samples}"
         )
+    if scenario.program.channels != run.conditions.program.channels:
+        there, here = (", ".join(each.channels) for each in (run.conditions.program, scenario.program))
+        raise ConfigurationError(f"the recording has the channels {there}, scenario {scenario.name} {here}")
     conditions = dataclasses.replace(
         run.conditions,
+        program=scenario.program,
         scenario=scenario.as_table(),
         segments=scenario.segments(),
         samples_asked=scenario.samples,

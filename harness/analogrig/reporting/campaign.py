@@ -12,7 +12,6 @@ from analogrig.campaigns.results import Results
 from analogrig.campaigns.summary import CONFIDENCE, ERROR_STEP, RATES, Summary
 from analogrig.errors import ConfigurationError
 from analogrig.judging.bursts import BURST
-from analogrig.plant import PARAMETERS
 from analogrig.storage import replace_file
 from analogrig.wording import counter_text, number_of
 
@@ -116,7 +115,7 @@ def as_json(results: Results) -> dict[str, Any]:
         },
         "errors": {
             "step": ERROR_STEP,
-            "counts": dict(zip(PARAMETERS, found.errors.tolist(), strict=True)),
+            "counts": dict(zip(results.plan.estimates, found.errors.tolist(), strict=False)),
         },
         "drawn": {
             "axes": {axis: list(ends) for axis, ends in found.axes.items()},

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.summary import (
     CONFIDENCE,
@@ -20,7 +21,6 @@ from analogrig.campaigns.summary import (
 )
 from analogrig.identity import Identity
 from analogrig.pages import FOLDER, TABLES, assemble_page
-from analogrig.plant import PARAMETERS
 from analogrig.reporting.campaign import BOUNDS, COLUMNS, labelled
 from analogrig.reporting.maps import Square, Squares, heat_map, legend
 from analogrig.reporting.markings import figure, levels, words
@@ -36,17 +36,6 @@ MOST_ROWS = 2_000
 """Largest number of cells in the table."""
 
 _BARS, _BARS_WIDTH, _BARS_HEIGHT, _BARS_LEFT = 100, 290, 120, 52
-
-_AXES = {
-    "mass_kg": ("mass", "kg"),
-    "damping_n_s_per_m": ("damping", "N s/m"),
-    "stiffness_n_per_m": ("stiffness", "N/m"),
-    "mass_factor": ("mass factor", ""),
-    "damping_factor": ("damping factor", ""),
-    "stiffness_factor": ("stiffness factor", ""),
-    "noise_lsb": ("noise", "LSB rms"),
-}
-"""Names and units of the axes of a campaign's file; a factor is that of the change."""
 
 
 def write_page(results: Results, path: Path) -> None:
@@ -118,13 +107,13 @@ _NOTE = (
 
 def _maps(results: Results) -> str:
     """Maps of each quantity, one panel for every combination of the values that are not on the axes."""
-    axes = [axis for axis, values in results.plan.spec.grid.axes().items() if len(values) > 1][:2]
+    axes = [axis for axis, values in results.plan.spec.grid.items() if len(values) > 1][:2]
     if not axes:
         return ""
     across, down = (*axes, "")[:2]
     groups: dict[str, dict[tuple[str, str], tuple[int, Mapping[str, str], Summary]]] = {}
     for number, (names, summary) in enumerate(labelled(results)):
-        where = _place({name: value for name, value in names.items() if name not in axes})
+        where = _place(results.plan, {name: value for name, value in names.items() if name not in axes})
         groups.setdefault(where, {})[names[across], names[down] if down else ""] = number, names, summary
     size = len(_MAPPED) * max(map(len, groups.values()))
     shown, numbered = list(groups.items())[: MOST_SQUARES // size], MOST_NUMBERS // size
@@ -135,8 +124,8 @@ def _maps(results: Results) -> str:
         panels = (
             heat_map(
                 where or "all cells",
-                (_axis(across), _axis(down) if down else ""),
-                dict(_squares(quantity, found, has_numbers=i < numbered)),
+                (_axis(results.plan, across), _axis(results.plan, down) if down else ""),
+                dict(_squares(results.plan, quantity, found, has_numbers=i < numbered)),
                 most,
                 with_numbers=i < numbered,
             )
@@ -152,19 +141,26 @@ def _maps(results: Results) -> str:
 
 
 def _squares(
-    quantity: _Mapped, found: Mapping[tuple[str, str], tuple[int, Mapping[str, str], Summary]], *, has_numbers: bool
+    plan: Plan,
+    quantity: _Mapped,
+    found: Mapping[tuple[str, str], tuple[int, Mapping[str, str], Summary]],
+    *,
+    has_numbers: bool,
 ) -> Iterator[tuple[tuple[str, str], Square]]:
     for key, (number, names, summary) in found.items():
         link = f"#cell-{number}" if has_numbers and number < MOST_ROWS else ""
-        yield key, quantity.square(summary, _title(names, summary) if has_numbers else _short(names, summary), link)
+        yield (
+            key,
+            quantity.square(summary, _title(plan, names, summary) if has_numbers else _short(names, summary), link),
+        )
 
 
-def _title(names: Mapping[str, str], summary: Summary) -> str:
+def _title(plan: Plan, names: Mapping[str, str], summary: Summary) -> str:
     latency = "none detected" if summary.latency_n is None else f"latency {summary.latency_n:.1f} samples"
     bound = "" if summary.bound_n is None else f" (bound {summary.bound_n:.1f})"
     rate = f" (rate ≤ {100 * summary.miss_rate[1]:.2g}%)" if summary.visible else ""
     return (
-        f"{_place(names)}: {latency}{bound}, {summary.missed:,} of {summary.visible:,} changes missed{rate},"
+        f"{_place(plan, names)}: {latency}{bound}, {summary.missed:,} of {summary.visible:,} changes missed{rate},"
         f" {number_of(summary.false_alarms, 'false alarm', form=',')}"
     )
 
@@ -174,15 +170,15 @@ def _short(names: Mapping[str, str], summary: Summary) -> str:
     return f"{', '.join(names.values())}: {latency}, {summary.missed}/{summary.visible}"
 
 
-def _place(names: Mapping[str, str]) -> str:
+def _place(plan: Plan, names: Mapping[str, str]) -> str:
     """Values on some axes in words."""
-    parts = ((*_AXES.get(axis, (axis, "")), value) for axis, value in names.items())
+    parts = ((*plan.axis(axis), value) for axis, value in names.items())
     return ", ".join(f"{name} {value}{f' {unit}' if unit else ''}" for name, unit, value in parts)
 
 
-def _axis(axis: str) -> str:
+def _axis(plan: Plan, axis: str) -> str:
     """Title of an axis with its unit; of ``rig`` and ``device`` the name."""
-    name, unit = _AXES.get(axis, (axis, ""))
+    name, unit = plan.axis(axis)
     return f"{name} [{unit}]" if unit else name
 
 
@@ -199,7 +195,7 @@ def _drawn_maps(results: Results) -> str:
         [f"{low + (i + 0.5) * (high - low) / DRAWN_BINS:.4g}" for i in range(DRAWN_BINS)]
         for low, high in found.axes.values()
     ]
-    axes = (*map(_axis, found.axes), "")[:2]
+    axes = (*(_axis(results.plan, axis) for axis in found.axes), "")[:2]
     keys = [(name, other) for name in names[0] for other in (names[1] if len(names) > 1 else [""])]
     sections = []
     for quantity, sums, counts in zip(
@@ -236,7 +232,7 @@ def _distributions(results: Results) -> str:
         counts[np.searchsorted(delays.values, edges[:-1]) == np.searchsorted(delays.values, edges[1:])] = 0
         ends = f"{edges[0]}", f"{edges[-1] - 1}"
         bars.append(_histogram("Detection delay", "delay [samples]", "changes", counts.tolist(), ends))
-    for name, errors in zip(PARAMETERS, results.distribution.errors, strict=True):
+    for name, errors in zip(results.plan.estimates, results.distribution.errors, strict=False):
         inner = errors[1:-1]
         if errors.any():
             wide = max((abs(i - ERROR_BINS // 2 + 0.5) for i in np.flatnonzero(inner).tolist()), default=0.0)
@@ -283,7 +279,7 @@ def _histogram(caption: str, across: str, up: str, counts: Sequence[int], ends: 
 def _table(results: Results) -> str:
     cells = labelled(results)
     not_passed = [bool(each.not_passed) for each in results.aggregates]
-    head = heading(map(_axis, cells[0][0]), (column.title for column in COLUMNS))
+    head = heading((_axis(results.plan, axis) for axis in cells[0][0]), (column.title for column in COLUMNS))
     caption = f"{BOUNDS.capitalize()}; latency and bound in samples from the change"
     if len(cells) > MOST_ROWS:
         caption += f"; {number_of(len(cells) - MOST_ROWS, 'more cell')}: see the JSON file"
@@ -315,7 +311,7 @@ def _not_passed(results: Results) -> str:
             rows.append(row(cells, "" if i else f"trials-{number}"))
     if not rows:
         return "<p>Every trial has passed.</p>"
-    head = heading(map(_axis, names[0]), ("seed",), ("outcome", "reason"))
+    head = heading((_axis(results.plan, axis) for axis in names[0]), ("seed",), ("outcome", "reason"))
     caption = f"The first {MOST_NOT_PASSED} of each cell; all trials are in the SQLite file"
     return table(caption, head, rows, SORTABLE, MOST_ROWS)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,7 +15,6 @@ from analogrig.bench import Progress
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.emulator import SetUp, is_emulated
 from analogrig.rigs.rig import Block, Rig
-from analogrig.run import CHANNELS
 from analogrig.scenario import Scenario
 from analogrig.storage import replace_file
 from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotTurn
@@ -43,17 +43,19 @@ def write_signals(
     )
     with replace_file(path) as file:
         if path.suffix == ".csv":
-            _write_csv(volts, codes, clipped, file)
+            _write_csv(scenario.program.channels, volts, codes, clipped, file)
         else:
-            np.savez(file, channels=np.array(CHANNELS), volts=volts, codes=codes, clipped=clipped)
+            np.savez(file, channels=np.array(scenario.program.channels), volts=volts, codes=codes, clipped=clipped)
     overloads = dict(performance.hindsight().lamps)
     return {"samples": len(codes), "clipped": int(clipped.any(axis=1).sum()), "overloads": overloads}
 
 
-def _write_csv(volts: NDArray[Any], codes: NDArray[Any], clipped: NDArray[Any], file: BinaryIO) -> None:
+def _write_csv(
+    channels: Sequence[str], volts: NDArray[Any], codes: NDArray[Any], clipped: NDArray[Any], file: BinaryIO
+) -> None:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["sample", *(f"{channel}_{kind}" for kind in ("v", "code", "clipped") for channel in CHANNELS)])
+    writer.writerow(["sample", *(f"{channel}_{kind}" for kind in ("v", "code", "clipped") for channel in channels)])
     for index, row in enumerate(zip(volts.tolist(), codes.tolist(), clipped.astype(int).tolist(), strict=True)):
         writer.writerow([index, *(f"{v:.6f}" for v in row[0]), *row[1], *row[2]])
     file.write(out.getvalue().encode("ascii"))

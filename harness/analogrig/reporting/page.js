@@ -190,28 +190,36 @@
   // A generator holds its level between edges.
   const stepped = uPlot.paths.stepped({ align: 1 });
 
-  function pair(signals, ink, caption, left, right) {
-    const words = (name) => name.replace("_", " ");
+  // Plot of one channel, or of two.
+  function pair(signals, ink, left, right) {
+    const words = (name) => name.replaceAll("_", " ");
     const label = (name) => `${words(name)} [${signals[name].unit}]`;
     const curveOf = (name, scale, colour) => {
       const points = circled(signals.clipped.raw, run.columns.findIndex((c) => c.name === name), ink, colour);
-      const paths = name === "force" ? stepped : undefined;
+      const paths = name === run.channels[0] ? stepped : undefined;
       return { of: signals[name].values, label: words(name), colour, unit: signals[name].unit, scale, points, paths };
     };
-    const curves = [curveOf(left, "left", "first"), curveOf(right, "right", "second")];
-    const axes = [axis("left", label(left), 3, ink, "first"), axis("right", label(right), 1, ink, "second")];
-    return plotOf(ink, caption, curves, plainRange, axes);
+    const curves = [curveOf(left, "left", "first")], axes = [axis("left", label(left), 3, ink, "first")];
+    if (right === undefined) return plotOf(ink, words(left), curves, plainRange, axes);
+    curves.push(curveOf(right, "right", "second"));
+    axes.push(axis("right", label(right), 1, ink, "second"));
+    return plotOf(ink, `${words(left)} and ${words(right)}`, curves, plainRange, axes);
   }
 
-  function estimate(signals, ink, name, caption, unit) {
+  function estimate(signals, ink, name, unit) {
     const known = truth(name);
     const found = { of: signals[name].values, label: "estimate", colour: "first", unit };
     const curves = known ? [{ of: known, label: "truth", colour: "truth", unit, width: 4, paths: stepped }, found] : [found];
-    return plotOf(ink, caption, curves, estimateRange(found.of, known), [axis("left", `${name} [${unit}]`, 3, ink)]);
+    return plotOf(ink, `${name}: estimate and truth`, curves, estimateRange(found.of, known), [axis("left", `${name} [${unit}]`, 3, ink)]);
+  }
+
+  function gainUnit(signals) {
+    const [input, output] = run.channels;
+    return `${signals[output].unit}/${signals[input].unit}`;
   }
 
   function innovation(signals, ink) {
-    const caption = "Innovation: the measured displacement less the predicted one";
+    const caption = "Innovation: the measured output less the predicted one";
     const curves = [{ of: signals.innovation.values, label: "innovation", colour: "first", unit: "codes" }];
     return plotOf(ink, caption, curves, innovationRange, [axis("left", "innovation [codes]", 3, ink)]);
   }
@@ -239,13 +247,13 @@
 
   function described(signals, ink) {
     return [
-      pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
-      ...(signals.velocity && signals.net_force
-        ? [pair(signals, ink, "Velocity and net force", "velocity", "net_force")] : []),
-      ...(signals.M ? [ // otherwise the device reports no estimates
-        estimate(signals, ink, "M", "Mass: estimate and truth", "kg"),
-        estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
-        estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),
+      pair(signals, ink, ...run.channels.slice(0, 2)),
+      ...(run.channels.length > 2 ? [pair(signals, ink, ...run.channels.slice(2, 4))] : []),
+      ...run.estimates.map(({ name, unit }) => estimate(signals, ink, name, unit)),
+      ...(signals.resonance ? [ // of an unknown plant
+        estimate(signals, ink, "resonance", "Hz"),
+        estimate(signals, ink, "damping", "1"),
+        estimate(signals, ink, "gain", gainUnit(signals)),
       ] : []),
       ...(signals.innovation ? [innovation(signals, ink)] : []),
       ...(signals.statistic ? [statistic(signals, ink)] : []),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from analogrig.judging.verdict import Verdict
 from analogrig.pages import FOLDER, PLOTS, assemble_page
-from analogrig.reporting import tables
+from analogrig.reporting import measured, tables
 from analogrig.reporting.payload import as_script, payload
 from analogrig.run import Run
 from analogrig.storage import replace_file
@@ -36,12 +36,14 @@ def render(run: Run, verdict: Verdict) -> str:
         title=tables.title(run, verdict),
         outcome=tables.outcome(run, verdict),
         conditions=tables.conditions(run, verdict),
-        tweaks=tables.tweaks(verdict),
-        diagnoses=tables.diagnoses(verdict),
-        channel_faults=tables.channel_faults(verdict),
+        measured=measured.section(run),
+        alarm="detection" if verdict.knows_truth else "alarm",
+        tweaks=tables.tweaks(run, verdict),
+        diagnoses=tables.diagnoses(run, verdict),
+        channel_faults=tables.channel_faults(run, verdict),
         false_alarms=tables.false_alarms(run, verdict),
         fit=tables.fit(verdict),
-        estimates=tables.estimates(verdict),
+        estimates=tables.estimates(run, verdict),
         settings=tables.settings(run),
         period=tables.period(run),
         resolution=tables.resolution(run, verdict),

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.verdict import ChangeVerdict, Verdict, trajectory
-from analogrig.plant import PARAMETERS, Plant
-from analogrig.run import CHANNELS, CHUNK_SAMPLES, Run, missing_samples
+from analogrig.plant import Plant
+from analogrig.run import CHUNK_SAMPLES, Run, missing_samples
 
 MOST_POINTS = 100_000
 """Longest run that is shown sample by sample."""
@@ -33,6 +33,9 @@ _MOST_NEAR_MOMENTS = 50_000
 _MOST_MOMENTS = 100
 _LONGEST_REACH = 1_000
 """Samples on either side of a moment."""
+
+_MODE = ("resonance", "damping", "gain")
+"""Estimates of a plant of which nothing is known."""
 
 _DISPLAY_UNITS = {"m": ("mm", 1000.0)}
 """Units that the page displays as others, with the factor."""
@@ -130,8 +133,11 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
     shown = _pieces(run, verdict)
     values = _signals(run, shown)
     detections, false = _alarms(run, verdict)
+    program = run.conditions.program
     return {
         "samples": run.samples,
+        "channels": [name for name in program.channels if name in run.conditions.channels],
+        "estimates": [{"name": name, "unit": program.unit(name)} for name in program.estimates if name in values],
         "points": sum(piece.points for piece in shown),
         "pieces": shown,
         "columns": [{"name": name, "type": each.dtype.name, **_units(run, name)} for name, each in values.items()],
@@ -214,7 +220,7 @@ def _direction(tweak: ChangeVerdict) -> str:
 
 def _signals(run: Run, shown: Sequence[Piece]) -> dict[str, NDArray[Any]]:
     """Signals by name: (p,) uint8, uint16 or float32, of the points of the plot."""
-    measured = [i for i, name in enumerate(CHANNELS) if name in run.conditions.channels]
+    measured = [i for i, name in enumerate(run.conditions.program.channels) if name in run.conditions.channels]
     none = _points(run, slice(0), 1, measured)
     parts = [none, *(_points(run, part, piece.size, measured) for piece in shown for part in piece.parts())]
     return {name: np.concatenate([part[name] for part in parts]) for name in none}
@@ -228,18 +234,30 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
     missing = missing_samples(run.clipped[part]).astype(np.uint8)
     reported: dict[str, NDArray[Any]] = {}
     if run.datasheet.model is not None:
-        estimates = condense(trajectory(run, part).astype(np.float32), size)
-        reported |= {name: estimates[:, i] for i, name in enumerate(PARAMETERS)}
+        names, estimates = _estimates(run, part)
+        shown_estimates = condense(estimates.astype(np.float32), size)
+        reported |= {name: shown_estimates[:, i] for i, name in enumerate(names)}
     if run.datasheet.innovation:
         reported["innovation"] = condense(run.innovation[part], size)
     if run.datasheet.statistic:
         reported["statistic"] = condense(run.statistic[part], size)
     return {
-        **{CHANNELS[channel]: shown[:, i] for i, channel in enumerate(measured)},
+        **{run.conditions.program.channels[channel]: shown[:, i] for i, channel in enumerate(measured)},
         "clipped": bits,
         "missing": np.repeat(condense(missing, size)[1::2], 2) if size > 1 else missing,
         **reported,
     }
+
+
+def _estimates(run: Run, part: slice) -> tuple[Sequence[str], NDArray[np.float64]]:
+    """Names and values (n, m) of the estimates; of an unknown plant its resonance, damping and gain."""
+    found = trajectory(run, part)
+    if run.conditions.segments:
+        return run.conditions.program.estimates, found
+    with np.errstate(all="ignore"):
+        mass, damping, stiffness = found.T
+        resonance_hz = np.sqrt(stiffness / mass) / (2.0 * np.pi) * run.conditions.time_scale
+        return _MODE, np.stack([resonance_hz, damping / (2.0 * np.sqrt(stiffness * mass)), 1.0 / stiffness], axis=1)
 
 
 def _units(run: Run, name: str) -> dict[str, Any]:

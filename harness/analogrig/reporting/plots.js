@@ -305,5 +305,5 @@ const plotting = (() => {
     }
   }
 
-  return { axis, begin, curve, drawn, lettered, padded, position, trouble, verticals };
+  return { axis, begin, curve, drawn, inks, lettered, padded, position, trouble, verticals };
 })();

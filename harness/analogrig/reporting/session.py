@@ -30,9 +30,14 @@ _MOST_BYTES = 16_000_000
 
 _MOST_TRENDS = 40
 _WIDTH, _HEIGHT, _LEFT, _TOP, _BELOW = 600, 180, 56, 26, 62
-_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
-_STYLES = {"passed": "good", "failed": "bad", "inconclusive": "neutral"}
-_COLOURS = {"passed": "var(--alarm)", "failed": "var(--false)", "inconclusive": "var(--truth)"}
+_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?", "unjudged": "–"}
+_STYLES = {"passed": "good", "failed": "bad", "inconclusive": "neutral", "unjudged": "neutral"}
+_COLOURS = {
+    "passed": "var(--alarm)",
+    "failed": "var(--false)",
+    "inconclusive": "var(--truth)",
+    "unjudged": "var(--truth)",
+}
 
 
 @dataclass(frozen=True)
@@ -174,8 +179,9 @@ def write_session(session: RunList, path: Path) -> None:
 
 def render(session: RunList) -> str:
     """The page as text."""
-    counts = ", ".join(f"{session.count(outcome)} {outcome}" for outcome in _SIGNS)
-    worst = next((outcome for outcome in ("failed", "inconclusive") if session.count(outcome)), "passed")
+    shown = [outcome for outcome in _SIGNS if outcome != "unjudged" or session.count(outcome)]
+    counts = ", ".join(f"{session.count(outcome)} {outcome}" for outcome in shown)
+    worst = next((outcome for outcome in ("failed", "inconclusive", "unjudged") if session.count(outcome)), "passed")
     lines = (*session.unended, *session.unread)
     worst = "inconclusive" if worst == "passed" and lines else worst
     unread = "".join(f"<li>{text(line)}</li>" for line in lines)
@@ -265,10 +271,12 @@ def _level(value: float, most: float) -> str:
 def _point(run: Entry, x: float, y: float) -> str:
     """Mark of a run, which leads to its page: a disc if it passed, a cross if it failed, else a ring."""
     colour = _COLOURS[run.outcome]
+    ring = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="none" stroke="{colour}" stroke-width="2"/>'
     shapes = {
         "passed": f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>',
         "failed": f'<path d="M{x - 5:.1f} {y - 5:.1f}l10 10m0 -10l-10 10" stroke="{colour}" stroke-width="3"/>',
-        "inconclusive": f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="none" stroke="{colour}" stroke-width="2"/>',
+        "inconclusive": ring,
+        "unjudged": ring,
     }
     ratio = "no change detected" if run.ratio is None else f"{run.ratio:.2f} bounds"
     alarms = number_of(run.false_alarms, "false alarm")

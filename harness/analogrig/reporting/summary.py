@@ -15,8 +15,9 @@ from analogrig.judging.verdict import (
     Verdict,
     missing_text,
 )
-from analogrig.plant import UNITS
+from analogrig.program import Program
 from analogrig.protocol.bus_load import BusLoad, load_of
+from analogrig.reporting import measured
 from analogrig.run import Run
 from analogrig.wording import counter_text, number_of
 
@@ -33,7 +34,7 @@ def summary(run: Run, verdict: Verdict) -> str:
     lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
-        lines += [line for tweak in verdict.tweaks for line in _change_lines(tweak)]
+        lines += [line for tweak in verdict.tweaks for line in _change_lines(tweak, conditions.program)]
     diagnoses = [(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
     if diagnoses:
         width = max(len("several"), *(len(diagnosis.named) for _, diagnosis in diagnoses))
@@ -43,8 +44,9 @@ def summary(run: Run, verdict: Verdict) -> str:
             *(_diagnosis_line(*each, width) for each in diagnoses),
         ]
     load = load_of(run)
+    raised = verdict.false_alarms if verdict.knows_truth else run.alarm_index.tolist()
     facts = {
-        "false alarms": f"{_alarms(verdict.false_alarms)} in {number_of(run.samples, 'sample')}",
+        "false alarms" if verdict.knows_truth else "alarms": f"{_alarms(raised)} in {number_of(run.samples, 'sample')}",
         "false or not, depending on the instants of the changes": verdict.doubtful_alarms
         and f"alarms at {', '.join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))}",
         "faults of channels": verdict.channel_faults and channel_faults_text(verdict.channel_faults),
@@ -55,8 +57,10 @@ def summary(run: Run, verdict: Verdict) -> str:
         "bus": load and load_text(load),
     }
     lines += ["", *(f"  {name}: {text}" for name, text in facts.items() if text)]
-    if ESTIMATES not in verdict.not_judged:
-        lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
+    if not verdict.knows_truth:
+        lines += ["", *measured.lines(run)]
+    elif ESTIMATES not in verdict.not_judged:
+        lines += ["", _estimates_head(conditions.program)]
         lines += [_segment_line(segment) for segment in verdict.estimates]
     digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  {digest}"]
@@ -102,18 +106,30 @@ def _alarms(samples: Sequence[int]) -> str:
     return f"{len(samples)} (at {', '.join(map(str, samples[:SHOWN_ALARMS]))}{more})"
 
 
-def _change_lines(tweak: ChangeVerdict) -> list[str]:
-    bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
-    out = [f"  {tweak.sample:6}  {change_text(tweak):43}  {tweak.latency_text:>7}  {bound:>5}"]
+def _change_lines(tweak: ChangeVerdict, program: Program) -> list[str]:
+    bound = bound_text(tweak)
+    out = [f"  {tweak.sample:6}  {change_text(tweak, program):43}  {tweak.latency_text:>7}  {bound:>5}"]
     low, high = tweak.between
     if low < high:
         out += [f"          between {low} and {high} (the likeliest instant is shown): {tweak.result}"]
     return out
 
 
-def change_text(tweak: ChangeVerdict) -> str:
+def change_text(tweak: ChangeVerdict, program: Program) -> str:
     """Parameters before and after a change: ``K 24500 -> 18000 N/m``."""
-    return ", ".join(f"{name} {old:g} -> {tweak.after[name]:g} {UNITS[name]}" for name, old in tweak.before.items())
+    return ", ".join(
+        f"{name} {old:g} -> {tweak.after[name]:g} {program.unit(name)}".rstrip() for name, old in tweak.before.items()
+    )
+
+
+def bound_text(tweak: ChangeVerdict) -> str:
+    """Information bound of a change: ``3``, ``none`` if it is not detectable, ``?`` if it is unknown."""
+    return "?" if not tweak.is_bounded else "none" if tweak.bound_n is None else str(tweak.bound_n)
+
+
+def _estimates_head(program: Program) -> str:
+    units = {name: f"{name} [{program.unit(name)}]" for name in program.estimates}
+    return f"  {'samples':12}" + "  ".join(f"{unit:>12}  {f'true {name}':9}" for name, unit in units.items()).rstrip()
 
 
 def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict, width: int) -> str:
@@ -129,7 +145,7 @@ def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict, width: int) -> str
 
 def _segment_line(segment: SegmentEstimate) -> str:
     cells = [
-        f"{'-' if segment.estimate is None else format(segment.estimate[name], '.5g'):>8}  {segment.truth[name]:<9.5g}"
-        for name in UNITS
+        f"{'-' if segment.estimate is None else format(segment.estimate[name], '.5g'):>12}  {segment.truth[name]:<9.5g}"
+        for name in segment.truth
     ]
     return f"  {segment.start:5}-{segment.end - 1:<6}" + "  ".join(cells)

@@ -18,7 +18,7 @@ from analogrig.judging.verdict import (
     Verdict,
     missing_text,
 )
-from analogrig.plant import PARAMETERS, UNITS
+from analogrig.program import Program
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
 from analogrig.reporting.payload import is_thinned, marked_alarms
@@ -35,13 +35,16 @@ _MAX_MISFITS = 20
 _MAX_CHANNEL_FAULTS = 20
 """Rows in the table of faults of the channels."""
 
-_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
+_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?", "unjudged": "–"}
 
 _SENTENCES = {
     "passed": "The device met the expectations of the scenario.",
     "failed": "The device did not meet the expectations of the scenario.",
     "inconclusive": "This run is not valid. The figures below prove nothing about the device.",
+    "unjudged": "Nothing is known of the plant: no figure below is a verdict on the device.",
 }
+
+_NO_DIAGNOSES = "<p>Not judged: the device does not report diagnoses.</p>"
 
 
 def title(run: Run, verdict: Verdict) -> str:
@@ -98,8 +101,10 @@ def provenance(identity: Identity | None) -> list[tuple[str, str]]:
     ]
 
 
-def tweaks(verdict: Verdict) -> str:
+def tweaks(run: Run, verdict: Verdict) -> str:
     """Table of the changes of the plant, with latency, bound and result."""
+    if not verdict.knows_truth:
+        return "<p>Not judged: nothing is known of the plant.</p>"
     if not verdict.tweaks:
         return "<p>The plant did not change in this run.</p>"
     assumed = f"the bound is of first order, for one false alarm in {verdict.arl0:,.0f} samples"
@@ -107,13 +112,15 @@ def tweaks(verdict: Verdict) -> str:
     if any(tweak.alternatives for tweak in verdict.tweaks):
         caption += "; a range if the instant was estimated from the samples"
     head = heading(("Sample", "Change"), ("Latency", "Bound", "Latency / bound"), ("Result",))
-    return table(caption, head, (_change_row(tweak) for tweak in verdict.tweaks))
+    return table(caption, head, (_change_row(tweak, run.conditions.program) for tweak in verdict.tweaks))
 
 
-def diagnoses(verdict: Verdict) -> str:
+def diagnoses(run: Run, verdict: Verdict) -> str:
     """Table of the diagnoses, compared with the truth."""
+    if not run.datasheet.diagnoses:
+        return _NO_DIAGNOSES
     if DIAGNOSES in verdict.not_judged:
-        return "<p>Not judged: the device does not report diagnoses.</p>"
+        return f"<p>Not judged: no parameter of the program {text(run.conditions.program.name)} has a diagnosis.</p>"
     if all(tweak.diagnosis is None for tweak in verdict.tweaks):
         return "<p>The device reported no diagnosis of a change.</p>"
     caption = "Diagnoses of the device; delay and isolation bound in samples from the change"
@@ -122,10 +129,10 @@ def diagnoses(verdict: Verdict) -> str:
     return table(caption, head, map(_diagnosis_row, verdict.tweaks))
 
 
-def channel_faults(verdict: Verdict) -> str:
+def channel_faults(run: Run, verdict: Verdict) -> str:
     """Table of the faults of the channels that the device diagnosed."""
-    if DIAGNOSES in verdict.not_judged:
-        return "<p>Not judged: the device does not report diagnoses.</p>"
+    if not run.datasheet.diagnoses:
+        return _NO_DIAGNOSES
     if not verdict.channel_faults:
         return "<p>The device reported none.</p>"
     shown = verdict.channel_faults[:_MAX_CHANNEL_FAULTS]
@@ -137,6 +144,8 @@ def channel_faults(verdict: Verdict) -> str:
 def false_alarms(run: Run, verdict: Verdict) -> str:
     """Table of the false alarms."""
     count = len(verdict.false_alarms)
+    if not verdict.knows_truth:
+        return f"<p>Not judged: {number_of(len(run.alarm_index), 'alarm', form=',')}, each false or not.</p>"
     if not count and verdict.doubtful_alarms:
         at = ", ".join(map(str, verdict.doubtful_alarms[:_MAX_FALSE_ALARMS]))
         return f"<p>None for certain. Depending on the instants of the changes, the alarms at {at} are false.</p>"
@@ -164,15 +173,20 @@ def fit(verdict: Verdict) -> str:
     return table(caption, head, (_misfit_row(period) for period in verdict.fit[:_MAX_MISFITS]))
 
 
-def estimates(verdict: Verdict) -> str:
-    """Table of M, B and K at the end of each segment, compared with the truth."""
+def estimates(run: Run, verdict: Verdict) -> str:
+    """Table of the estimated parameters at the end of each segment, compared with the truth."""
+    program = run.conditions.program
+    if not program.estimates:
+        return f"<p>Not judged: the program {text(program.name)} relates no estimate to its parameters.</p>"
     if ESTIMATES in verdict.not_judged:
         return "<p>Not judged: the device does not report estimates of them.</p>"
     if not verdict.estimates:
         return "<p>The rig does not know the truth about its plant.</p>"
-    groups = [f'<th scope="colgroup" colspan="3">{name} [{text(UNITS[name])}]</th>' for name in PARAMETERS]
+    groups = [
+        f'<th scope="colgroup" colspan="3">{name} [{text(program.unit(name))}]</th>' for name in program.estimates
+    ]
     head = row(['<th scope="col" rowspan="2">Samples</th>', *groups])
-    head += heading((), ("estimate", "truth", "error") * len(PARAMETERS))
+    head += heading((), ("estimate", "truth", "error") * len(program.estimates))
     rows = (_segment_row(segment) for segment in verdict.estimates)
     return table("The estimate after the last sample of each segment", head, rows)
 
@@ -238,14 +252,15 @@ def _samples(run: Run, verdict: Verdict) -> str:
     return f"{played}; {verdict.missing_n:,} {missing_text(run)}"
 
 
-def _change_row(tweak: ChangeVerdict) -> str:
+def _change_row(tweak: ChangeVerdict, program: Program) -> str:
     exact = not tweak.alternatives and tweak.latency_n is not None and tweak.bound_n
     ratio = (tweak.latency_n or 0) / (tweak.bound_n or 1) if exact else None
     word, kind = _result(tweak)
     low, high = tweak.between
     instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
     latency = "–" if tweak.latencies_n is None else tweak.latency_text.replace("-", "–")
-    cells = [instant, cell(change_text(tweak).replace("->", "→")), cell(latency, "number"), number(tweak.bound_n)]
+    cells = [instant, cell(change_text(tweak, program).replace("->", "→"))]
+    cells += [cell(latency, "number"), cell("?", "number") if not tweak.is_bounded else number(tweak.bound_n)]
     return row([*cells, number(ratio, ".2f"), cell(word, f"text {kind}")])
 
 
@@ -286,7 +301,7 @@ def _result(tweak: ChangeVerdict) -> tuple[str, str]:
 
 def _segment_row(segment: SegmentEstimate) -> str:
     cells = [_zoom(segment.start, segment.end - 1)]
-    for name in PARAMETERS:
+    for name in segment.truth:
         estimate = None if segment.estimate is None else segment.estimate[name]
         error = None if estimate is None else round(segment.error[name], 4) + 0.0  # never a negative zero
         cells += [number(estimate, ".5g"), number(segment.truth[name], ".6g"), number(error, "+.2%")]

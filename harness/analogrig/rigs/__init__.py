@@ -10,7 +10,7 @@ as in ``--rig mykind``, stands for a description with all defaults:
 =============  ==========================================================================================
 describe       ``RigDescription`` (base class), ``Thing``
 perform        ``Rig`` (base class), ``Performance``, ``Hindsight``, ``CAPABILITIES``
-sample         ``Block``, ``CHANNELS``, ``Channel``, ``Segment``
+sample         ``Block``, ``Channel``, ``Segment``
 errors         ``RigTimeout``, ``RigClosed``, ``RigRefused``; ``RigError`` is in ``analogrig``
 =============  ==========================================================================================
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from analogrig.errors import RigClosed, RigRefused, RigTimeout
     from analogrig.plant import Segment
     from analogrig.rigs.rig import Block, Hindsight, Performance, Rig, RigDescription
-    from analogrig.run import CHANNELS, Channel
+    from analogrig.run import Channel
     from analogrig.trust import Thing
 else:
     from analogrig.lazy import loader
@@ -37,14 +37,13 @@ else:
             "analogrig.errors": "RigClosed RigRefused RigTimeout",
             "analogrig.plant": "Segment",
             "analogrig.rigs.rig": "Block Hindsight Performance Rig RigDescription",
-            "analogrig.run": "CHANNELS Channel",
+            "analogrig.run": "Channel",
             "analogrig.trust": "Thing",
         },
     )
 
 __all__ = [
     "CAPABILITIES",
-    "CHANNELS",
     "Block",
     "Channel",
     "Hindsight",

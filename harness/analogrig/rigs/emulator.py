@@ -7,7 +7,7 @@ import dataclasses
 import enum
 import functools
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeGuard
 
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
 from analogrig.plant import Plant, Segment
-from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance, Rig, RigDescription
-from analogrig.run import CHANNELS, Channel
+from analogrig.program import Program
+from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
+from analogrig.run import OUTPUT, Channel
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
     CARDS,
@@ -28,6 +29,7 @@ from analogrig_emulator import (
     Capacitor,
     Card,
     Components,
+    Courses,
     EmulatorError,
     Excitation,
     NoisySuspension,
@@ -35,10 +37,13 @@ from analogrig_emulator import (
     OpAmpGrade,
     Pot,
     PotTurn,
+    ProgramCircuit,
     RepeatedPlay,
     Resistor,
     Sampler,
     SuspensionComputer,
+    WideProgram,
+    Wired,
     acquired,
     ahead_ticks,
     drawn_offsets_v,
@@ -50,6 +55,12 @@ from analogrig_emulator import (
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
 MOST_DEVIATION = 0.9
+
+CHANNEL_FIELDS = ("noise_lsb", "skew_s", "gain_error", "offset_lsb")
+"""Fields of a card with one number for each channel, or none."""
+
+WHOLE_RANGE_V = (-12.5, 12.5)
+"""Range of the channels of programs that ``range_v`` does not name: what amplifiers can put out."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +104,7 @@ class MeasuredValues:
 
 @functools.cache
 def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the resistors, capacitors and pots, and names of the amplifiers, of all programs, in diagram order."""
+    """Names of the resistors, capacitors and pots, and names of the amplifiers, of all diagrams, in their order."""
     programs = PROGRAMS.values()
     parts = [name for program in programs for name in program.element_names(Resistor, Capacitor, Pot)]
     amplifiers = [name for program in programs for name in program.element_names(OpAmp)]
@@ -143,7 +154,7 @@ class ComputerDescription:
         stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
         return stock if self.values is None else self.values.put_in(stock)
 
-    def machine(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+    def machine(self, program: ProgramCircuit, seed: int, sample_rate_hz: float) -> SuspensionComputer:
         """Machine drawn from the seed of a run, wired as a program, with the program's pots.
 
         :raises EmulatorError: it cannot be.
@@ -175,7 +186,10 @@ class ComputerDescription:
 
 @dataclass(frozen=True)
 class CardDescription:
-    """The ``[card]`` table. ``range_v`` gives the ends of each channel's range, by the channel's name."""
+    """The ``[card]`` table.
+
+    ``range_v`` gives the ends of a channel's range, by the channel's name; WHOLE_RANGE_V if it is not named.
+    """
 
     range_v: Mapping[str, tuple[float, float]]
     bits: int = 12
@@ -193,17 +207,16 @@ class CardDescription:
             if fault not in known:
                 raise ValueError(f"faults: unknown key {fault!r} (known: {', '.join(sorted(known))})")
         self._faults()
-        if set(self.range_v) != set(CHANNELS):
-            raise ValueError(f"range_v must give the channels {', '.join(CHANNELS)}, not {', '.join(self.range_v)}")
         for name, (low, high) in self.range_v.items():
             if not -MOST_VOLTS <= low < high <= MOST_VOLTS or high - low < LEAST_SPAN_V:
                 raise ValueError(
                     f"range_v.{name} must be (low, high) within +-{MOST_VOLTS:g} V, not ({low:g}, {high:g})"
                 )
         config.check_range(self, "rate_hz", 1.0, MOST_RATE_HZ)
-        if isinstance(self.noise_lsb, Mapping) and set(self.noise_lsb) != set(CHANNELS):
-            raise ValueError(f"noise_lsb must give the channels {', '.join(CHANNELS)}, not {', '.join(self.noise_lsb)}")
-        for noise_lsb in self._noises_lsb() or ():
+        given = self.noise_lsb
+        if isinstance(given, Mapping) and set(given) != set(self.range_v):
+            raise ValueError(f"noise_lsb must give the channels {', '.join(self.range_v)}, not {', '.join(given)}")
+        for noise_lsb in given.values() if isinstance(given, Mapping) else () if given is None else (given,):
             if not 0.0 <= noise_lsb <= MOST_NOISE_LSB:
                 raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {noise_lsb:g}")
 
@@ -215,23 +228,21 @@ class CardDescription:
         hints = typing.get_type_hints(Card)
         return {name: config.convert(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
 
-    def _noises_lsb(self) -> tuple[float, ...] | None:
-        """Noise of each channel in LSB; None if not given."""
-        if isinstance(self.noise_lsb, Mapping):
-            return tuple(self.noise_lsb[channel] for channel in CHANNELS)
-        return None if self.noise_lsb is None else (self.noise_lsb,) * len(CHANNELS)
+    def card(self, channels: Sequence[str]) -> Card:
+        """Card with these channels.
 
-    def card(self) -> Card:
-        """:raises SamplerError: a value is out of range."""
-        model = CARDS[self.model]
-        noises_lsb = self._noises_lsb()
-        fields: dict[str, Any] = {
-            "bits": self.bits,
-            "rate_hz": self.rate_hz,
-            "ranges_v": tuple(self.range_v[channel] for channel in CHANNELS),
-            "noise_lsb": model.noise_lsb if noises_lsb is None else noises_lsb,
-        }
-        return dataclasses.replace(model, **(fields | self._faults()))
+        :raises SamplerError: a value is out of range.
+        """
+        model, given = CARDS[self.model], self.noise_lsb
+        fields: dict[str, Any] = {name: getattr(model, name) for name in CHANNEL_FIELDS}
+        if isinstance(given, Mapping):
+            fields["noise_lsb"] = tuple(given.get(channel, max(given.values())) for channel in channels)
+        elif given is not None:
+            fields["noise_lsb"] = (given,) * len(channels)
+        fields |= self._faults()
+        fields |= {name: fields[name][: len(channels)] for name in CHANNEL_FIELDS}
+        ranges_v = tuple(self.range_v.get(channel, WHOLE_RANGE_V) for channel in channels)
+        return dataclasses.replace(model, bits=self.bits, rate_hz=self.rate_hz, ranges_v=ranges_v, **fields)
 
 
 @dataclass(frozen=True)
@@ -276,6 +287,7 @@ class _Prepared(NamedTuple):
     key: tuple[object, ...]
     """Parts of the scenario on which the data depend."""
     computer: SuspensionComputer
+    card: Card
     play: RepeatedPlay | None
     """Repeated play; None where more than offsets and phase depends on the seed."""
     channels: Mapping[str, Channel]
@@ -291,7 +303,9 @@ class EmulatorRig(Rig):
     def __init__(self, description: EmulatorDescription, block_samples: int = BLOCK_SAMPLES) -> None:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
-        self._card = description.card.card()
+        description.card.card(
+            tuple(description.card.range_v) or ("input",)
+        )  # refused here, and not when it is first played
         self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._last_prepared: _Prepared | None = None
         self._table = dataclasses.asdict(description)  # to write it takes as long as to play a thousand samples
@@ -307,9 +321,9 @@ class EmulatorRig(Rig):
         """
         return EmulatorRig(self._description, samples)
 
-    def sampler(self, rng: np.random.Generator) -> Sampler:
-        """Sampler of the rig's card with its own noise, to convert again what the circuit has played."""
-        return Sampler(self._card, rng)
+    def card(self, program: Program) -> Card:
+        """Card with the channels of a program."""
+        return self._description.card.card(program.channels)
 
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:
         """Machine as the scenario starts it, with the excitation and the changes to play on it.
@@ -320,23 +334,42 @@ class EmulatorRig(Rig):
             computer = self._computer(scenario, seed)
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         changes: list[PotTurn] = []
+        plant = scenario.plant
         for i, tweak in enumerate(scenario.tweaks):
+            plant = plant.changed(tweak.set)
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = self._pot_settings(settings_of(computer, tweak.overrides()), scenario.plant.set)
+                settings = self.pot_settings(plant, tweak.set)
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
+
+    def courses(self, scenario: Scenario, seed: int, samples: int) -> Courses:
+        """Noise-free courses of the output on the machine of a play, for so many samples.
+
+        :raises EmulatorError: the machine cannot be, or not play the excitation.
+        """
+        program, card = scenario.program, self.card(scenario.program)
+        rate_hz = card.true_rate_hz * probes_per_sample(card)
+
+        def wired(gain: float) -> Wired:
+            machine = _drawn_machine(self._description.computer, _with_gain(program, gain), seed, rate_hz)
+            is_digital = self._description.computer.pots == "dial"
+            return Wired(machine, _nominal(program, gain) if is_digital else machine)
+
+        excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
+        return Courses(wired, card, excitation, samples, OUTPUT)
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         if repeated := self._repeat(scenario, [seed]):
             return repeated[0]
         computer, excitation, changes = self.set_up(scenario, seed)
+        card = self.card(scenario.program)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._description.computer.add_noise(computer, seed)
             jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
                 machine,
-                self._card,
+                card,
                 excitation,
                 scenario.samples,
                 changes,
@@ -344,33 +377,64 @@ class EmulatorRig(Rig):
                 block_samples=self._block_samples,
             )
         return Performance(
-            sample_period_s=1.0 / self._card.rate_hz,
+            sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
-            channels=self._channels(computer),
-            blocks=_sample(volts, self.sampler(Stream.CARD.generator(seed))),
+            channels=_channels(card, computer, scenario.program),
+            blocks=_sample(volts, Sampler(card, Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(
-                scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(self._card))
+                scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(card))
             ),
         )
 
     def perform_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
         return self._repeat(scenario, seeds) or super().perform_all(scenario, seeds)
 
+    def perform_in_steps(
+        self,
+        set_up: SetUp,
+        program: Program,
+        seed: int,
+        lengths: Iterable[int],
+        probes: Sequence[str],
+        alter: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    ) -> Performance:
+        """Play a set-up without its changes, in blocks of these lengths, each drawn when its block is requested.
+
+        Between two blocks the caller operates ``set_up.computer``, whose ``probed`` has the volts of the nodes
+        ``probes``. ``alter`` changes the volts on their way to the card. The hindsight knows the lamps alone.
+
+        :raises ConfigurationError: the rig cannot be played in steps.
+        """
+        if self._description.computer.noise:
+            raise ConfigurationError(f"{self._description.name}: computer.noise: a play in steps has no such noise")
+        computer, card = set_up.computer, self.card(program)
+        with emulator_errors():
+            machine = _SteppedMachine(computer, lengths, probes_per_sample(card), probes)
+            volts = acquired(machine, card, set_up.excitation, 0, rng=Stream.APERTURE.generator(seed))
+        return Performance(
+            sample_period_s=1.0 / card.rate_hz,
+            time_scale=computer.scales.time,
+            channels=_channels(card, computer, program),
+            blocks=_sample(map(alter, volts), Sampler(card, Stream.CARD.generator(seed))),
+            hindsight=lambda: Hindsight((), _lit_lamps(computer.machine.lamps, probes_per_sample(card))),
+        )
+
     def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
         """Prepared data of the scenario; the last set is reused for the same key."""
         key = (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
         if self._last_prepared is None or self._last_prepared.key != key:
             computer, excitation, changes = self.set_up(scenario, seed)
+            card = self.card(scenario.program)
             with emulator_errors(f"scenario {scenario.name}: "):
                 excitation.edges(0, 1, computer.sample_rate_hz)
-                able = self._draws_offsets_alone and is_repeatable(computer, changes)
+                able = self._draws_offsets_alone(card) and is_repeatable(computer, changes)
                 play = RepeatedPlay(computer, scenario.samples, changes) if able else None
-            self._last_prepared = _Prepared(key, computer, play, self._channels(computer), scenario.segments())
+            channels = _channels(card, computer, scenario.program)
+            self._last_prepared = _Prepared(key, computer, card, play, channels, scenario.segments())
         return self._last_prepared
 
-    @property
-    def _draws_offsets_alone(self) -> bool:
-        drawn, card = self._description.computer, self._card
+    def _draws_offsets_alone(self, card: Card) -> bool:
+        drawn = self._description.computer
         is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm and not drawn.noise
         is_nominal &= drawn.specimen is None and drawn.values is None
         is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
@@ -395,7 +459,7 @@ class EmulatorRig(Rig):
 
         return [
             Performance(
-                sample_period_s=1.0 / self._card.rate_hz,
+                sample_period_s=1.0 / prepared.card.rate_hz,
                 time_scale=prepared.computer.scales.time,
                 channels=prepared.channels,
                 blocks=blocks(i),
@@ -414,35 +478,68 @@ class EmulatorRig(Rig):
         phases = np.array([scenario.draw_phase(Stream.EXCITATION.generator(seed)) for seed in seeds])
         with emulator_errors(as_error=RigError):
             for seed, (volts, lamps) in zip(seeds, play.play_all(scenario.excitation, phases, offsets_v), strict=True):
-                codes, clipped = self.sampler(Stream.CARD.generator(seed)).sample(volts)
+                codes, clipped = Sampler(prepared.card, Stream.CARD.generator(seed)).sample(volts)
                 yield Block(0, volts, codes, clipped), _lit_lamps(lamps, 1)
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
-        rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
-        computer = self._description.computer.machine(scenario.plant.set, seed, rate_hz)
-        start = settings_of(computer, scenario.plant.overrides())
-        computer.set(**self._pot_settings({**computer.program.values, **start}, scenario.plant.set))
+        card = self.card(scenario.program)
+        rate_hz = card.true_rate_hz * probes_per_sample(card)
+        computer = _drawn_machine(self._description.computer, scenario.program.circuit, seed, rate_hz, anew=True)
+        computer.set(**self.pot_settings(scenario.plant, scenario.program.parameters))
         return computer
 
-    def _pot_settings(self, settings: dict[str, float], program: str) -> dict[str, float]:
-        """Pot settings for these parameters, as coefficients or as dials."""
-        if self._description.computer.pots == "coefficient":
-            return settings
-        dials = _nominal(program).dials_for(**settings)
-        return {f"{pot}_dial": dial for pot, dial in dials.items()}
+    def pot_settings(self, plant: Plant, changed: Iterable[str]) -> dict[str, float]:
+        """Pot settings for a plant in which these parameters have changed, as coefficients or as dials.
 
-    def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
-        return {
-            name: Channel(
-                low_v=self._card.ranges_v[i][0],
-                lsb_v=float(self._card.lsb_v[i]),
-                unit=CHANNEL_UNITS[name],
-                unit_per_v=1.0 / computer.scales.volts(name),
-                noise_lsb=self._card.noise_lsb[i],
-                codes=1 << self._card.bits,
-            )
-            for i, name in enumerate(CHANNELS)
-        }
+        :raises PotError: a pot cannot show them.
+        """
+        names = {plant.program.names[name] for name in changed}
+        values = plant.parameters()
+        if self._description.computer.pots == "coefficient":
+            return {name: value for name, value in values.items() if name in names}
+        dials = _nominal(plant.program).dials_for(**values)
+        pots = plant.program.circuit.pots
+        return {f"{pot}_dial": dial for pot, dial in dials.items() if names.intersection(pots[pot].settings)}
+
+
+def _channels(card: Card, computer: SuspensionComputer, program: Program) -> dict[str, Channel]:
+    return {
+        name: Channel(
+            low_v=card.ranges_v[i][0],
+            lsb_v=float(card.lsb_v[i]),
+            unit=program.unit(name),
+            unit_per_v=1.0 / computer.scales.volts(name),
+            noise_lsb=card.noise_lsb[i],
+            codes=1 << card.bits,
+        )
+        for i, name in enumerate(program.channels)
+    }
+
+
+@dataclass(frozen=True)
+class _SteppedMachine:
+    """Computer that is played in steps, for ``acquired``."""
+
+    computer: SuspensionComputer
+    lengths: Iterable[int]
+    """Samples of the card in each block."""
+    probes_per_sample: int
+    nodes: Sequence[str]
+
+    @property
+    def sample_rate_hz(self) -> float:
+        return self.computer.sample_rate_hz
+
+    def play(
+        self,
+        excitation: Excitation,
+        samples: int,  # noqa: ARG002 - the lengths decide
+        changes: Sequence[PotTurn] = (),  # noqa: ARG002 - the caller makes them
+        block_samples: int = 0,  # noqa: ARG002
+        ahead_ticks: int = 0,
+    ) -> Iterator[NDArray[np.float64]]:
+        lengths = (length * self.probes_per_sample for length in self.lengths)
+        return self.computer.play_in_steps(excitation, lengths, self.nodes, ahead_ticks)
 
 
 def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
@@ -473,15 +570,40 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         raise as_error(f"{prefix}{error}") from error
 
 
-@functools.cache
-def _nominal(program: str) -> SuspensionComputer:
+_last_machine: tuple[tuple[object, ...], SuspensionComputer] | None = None
+"""Machine drawn last, with what it was drawn from."""
+
+
+def _drawn_machine(
+    computer: ComputerDescription, program: ProgramCircuit, seed: int, rate_hz: float, *, anew: bool = False
+) -> SuspensionComputer:
+    """Machine of a seed; the last one unless ``anew``. Courses leave a machine as it is, and drawing takes long."""
+    global _last_machine  # noqa: PLW0603 - a cache of one entry
+    key, last = (computer, program, seed, rate_hz), _last_machine
+    if anew or last is None or last[0] != key:
+        last = _last_machine = key, computer.machine(program, seed, rate_hz)  # another thread may draw at this time
+    return last[1]
+
+
+def nominal_courses(scenario: Scenario) -> Courses:
+    """Noise-free courses of the output on a nominal machine at 20,000 samples/s, with the scenario's own phase.
+
+    :raises EmulatorError: the machine cannot play the excitation.
+    """
+
+    def wired(gain: float) -> Wired:
+        machine = SuspensionComputer(_with_gain(scenario.program, gain))
+        return Wired(machine, machine)
+
+    return Courses(wired, Card(), scenario.excitation, scenario.samples, OUTPUT)
+
+
+@functools.lru_cache(maxsize=8)
+def _nominal(program: Program, gain: float = 1.0) -> SuspensionComputer:
     """Nominal machine, used only to compute dials."""
-    return SuspensionComputer(program, opamp="ideal")
+    return SuspensionComputer(_with_gain(program, gain), opamp="ideal")
 
 
-def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
-    """Parameter settings, renamed from the scenario's names to the program's."""
-    names = {
-        field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)
-    }
-    return {names[name]: value for name, value in given.items()}
+def _with_gain(program: Program, gain: float) -> ProgramCircuit:
+    """Circuit whose pots feed inputs of so many times the gain."""
+    return program.circuit if gain == 1.0 else WideProgram(program.circuit, gain)

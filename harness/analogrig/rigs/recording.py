@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
-from analogrig.run import CHANNELS, Run
+from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.trust import FiledName
 
@@ -90,10 +90,8 @@ class RecordingRig(Rig):
                 yield Block(first, self._volts(codes), codes, self.run.clipped[samples], record)
 
     def _volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
-        """Volts that codes stand for; both are (n, 4)."""
-        channels = self.run.conditions.channels
+        """Volts that codes stand for; both are (n, c)."""
+        channels, names = self.run.conditions.channels, self.run.conditions.program.channels
         unmeasured = np.full(len(codes), np.nan)
-        volts = [
-            channels[name].volts(codes[:, i]) if name in channels else unmeasured for i, name in enumerate(CHANNELS)
-        ]
+        volts = [channels[name].volts(codes[:, i]) if name in channels else unmeasured for i, name in enumerate(names)]
         return np.stack(volts, axis=1)

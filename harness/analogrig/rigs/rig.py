@@ -18,36 +18,32 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Samples
 from analogrig.plant import Segment
-from analogrig.run import CHANNELS, Channel, missing_samples
+from analogrig.run import INPUT, OUTPUT, Channel, missing_samples
 from analogrig.scenario import Scenario
 from analogrig.trust import Thing
 
 BLOCK_SAMPLES = 256
 """Block length in samples from rig to device: long enough to be fast, short enough to show progress and lose little."""
 
-_FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
-
-CHANNEL_UNITS = {"force": "N", "displacement": "m", "velocity": "m/s", "net_force": "N"}
-
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Consecutive samples, each taken on all channels at the same instant; columns as ``CHANNELS``."""
+    """Consecutive samples, each taken on all channels at the same instant; one column for each of the program."""
 
     first: int
     """Index of the first sample."""
     volts: NDArray[np.float64]
-    """(n, 4): volts at the computer's outputs; NaN in channels that are not measured, whose codes are 0."""
+    """(n, c): volts at the computer's outputs; NaN in channels that are not measured, whose codes are 0."""
     codes: NDArray[np.uint16]
-    """(n, 4): codes of the card."""
+    """(n, c): codes of the card."""
     clipped: NDArray[np.bool_]
-    """(n, 4): True if the code is the end of the range, not a measurement."""
+    """(n, c): True if the code is the end of the range, not a measurement."""
     record: int = 0
     """Number of the gap-free record that holds the block; nothing was sampled between two records."""
 
     def samples(self, record_start: int = 0) -> Samples:
         """Samples as the device takes them; ``record_start`` is the first sample of the record."""
-        u, y = self.codes[:, _FORCE], self.codes[:, _DISPLACEMENT]
+        u, y = self.codes[:, INPUT], self.codes[:, OUTPUT]
         return Samples(self.first - record_start, u, y, ~missing_samples(self.clipped))
 
 
@@ -72,10 +68,15 @@ class Performance:
     sample_period_s: float
     time_scale: float
     channels: Mapping[str, Channel]
-    """Channels that are measured: force and displacement at least."""
+    """Channels that are measured, input and output first: these at least."""
     blocks: Iterator[Block]
     hindsight: Callable[[], Hindsight]
     """Function to call when the blocks have been taken, or no more of them come."""
+
+    @property
+    def of_device(self) -> dict[str, Channel]:
+        """Channels of the samples that a device takes, ``u`` and ``y``."""
+        return dict(zip(("u", "y"), self.channels.values(), strict=False))
 
 
 class Rig(Protocol):

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from analogrig.judging.bursts import BURST, Design, bound_rate
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChangeVerdict, Verdict, judge
+from analogrig.reporting.summary import bound_text
 from analogrig.run import Run
 from analogrig.scenario import Statement
 from analogrig.testing.statement import Arguments, Finding, register, statement_of
@@ -39,7 +40,7 @@ def _statement(
         if played.verdict.valid:
             finding = judge(played, *args, **kwargs)
         else:
-            finding = Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}")
+            finding = Finding(holds=False, why=f"{played.verdict.outcome.upper()}: {played.verdict.reasons[0]}")
         statement = statement_of(judge_and_note, played, *args, **kwargs)
         finding = dataclasses.replace(finding, statement=statement, run=played.run)
         played.note(finding)
@@ -53,8 +54,8 @@ def _statement(
 class Played:
     """One play of a scenario, its verdict, and statements about it, each of which returns a Finding.
 
-    No statement holds for a play that is INCONCLUSIVE. ``hil_play`` fails the test instead of returning such a play,
-    unless called with ``allow_inconclusive=True``. ValueError: a limit of a statement is not finite.
+    No statement holds for a play that is INCONCLUSIVE or UNJUDGED. ``hil_play`` fails the test instead of returning
+    such a play, unless called with ``allow_inconclusive=True``. ValueError: a limit of a statement is not finite.
     """
 
     run: Run
@@ -89,11 +90,17 @@ class Played:
         """
         if not self.verdict.tweaks:
             return Finding(holds=False, why="nothing has changed, so nothing could be detected")
-        seeable = [tweak for tweak in self.verdict.tweaks if tweak.bound_n is not None and not tweak.unseen]
+        seeable = [
+            tweak
+            for tweak in self.verdict.tweaks
+            if (tweak.bound_n is not None or not tweak.is_bounded) and not tweak.unseen
+        ]
         if not seeable:
             return Finding(holds=False, why="no change could be seen: none carried enough information before the next")
         wrong = [why for tweak in seeable if (why := _detection_failure(tweak, within))]
-        latencies = ", ".join(f"{tweak.what} after {tweak.latency_text} (bound {tweak.bound_n})" for tweak in seeable)
+        latencies = ", ".join(
+            f"{tweak.what} after {tweak.latency_text} (bound {bound_text(tweak)})" for tweak in seeable
+        )
         return Finding(not wrong, "; ".join(wrong) or latencies)
 
     @_statement
@@ -110,7 +117,7 @@ class Played:
     def isolates(self) -> Finding:
         """Finding: every parameter diagnosed as changed has changed. A missing diagnosis is allowed."""
         if DIAGNOSES in self.verdict.not_judged:
-            return Finding(holds=False, why="not judged: the device does not report diagnoses")
+            return Finding(holds=False, why="not judged: no diagnoses of the program's parameters")
         judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
         said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
         wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
@@ -121,13 +128,13 @@ class Played:
 
     @_statement
     def estimates(self, within: float) -> Finding:
-        """Finding: M, B and K at the end of every stretch have a relative error of at most ``within``."""
+        """Finding: estimates at the end of every stretch have a relative error of at most ``within``."""
         if ESTIMATES in self.verdict.not_judged:
-            return Finding(holds=False, why="not judged: the device does not report estimates of M, B, K")
+            return Finding(holds=False, why="not judged: no estimates of the program's parameters")
         off = []
         for segment in self.verdict.estimates:
             if segment.estimate is None:
-                off.append(f"samples {segment.start} to {segment.end}: no mass, damper and spring")
+                off.append(f"samples {segment.start} to {segment.end}: no plant of the program")
             off += [
                 f"{name} is off by {error:+.2%} at sample {segment.end}"
                 for name, error in segment.error.items()
@@ -176,11 +183,11 @@ def _detection_failure(tweak: ChangeVerdict, within: float | None) -> str:
 
 def _failure_at_instant(tweak: ChangeVerdict, within: float | None) -> str:
     """Reason why a change at a known instant was missed or late; empty if it was detected in time."""
-    if tweak.latency_n is None and tweak.bound_n is None:
+    if tweak.latency_n is None and not tweak.missed:
         return ""
     if tweak.latency_n is None:
-        return f"{tweak.what} at {tweak.sample} was missed (bound {tweak.bound_n})"
-    if within is None:
+        return f"{tweak.what} at {tweak.sample} was missed (bound {bound_text(tweak)})"
+    if within is None or not tweak.is_bounded:
         late, allowed = tweak.late, f"{tweak.deadline_n}"
     else:
         bound_n = tweak.bound_n or 0

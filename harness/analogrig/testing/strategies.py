@@ -18,13 +18,13 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, assume, settings
 from hypothesis import strategies as st
 
-from analogrig.plant import PARAMETERS, Plant
+from analogrig.plant import Plant
+from analogrig.program import Program
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
-from analogrig.scenario import PLANTS, Expectations, PlantChoice, PotChange, Scenario
+from analogrig.scenario import DEFAULT_PROGRAM, Expectations, PotChange, Scenario
 from analogrig.testing import profiles
-from analogrig_emulator import PROGRAMS, Excitation
+from analogrig_emulator import Excitation
 
-FIELDS = {"M": "mass_kg", "B": "damping_n_s_per_m", "K": "stiffness_n_per_m"}
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}
 DAMPING_RATIO = (0.4, 1.2)
 """The plants that the default device is held to, all of which the pots can show. It raises false alarms on slower ones
@@ -83,28 +83,32 @@ def _number(low: float, high: float, digits: int = 3) -> st.SearchStrategy[float
 # ------------------------------------------------------------------------------------------------------ what is played
 
 
-def suspensions() -> st.SearchStrategy[PlantChoice]:
+def suspensions() -> st.SearchStrategy[Plant]:
     """Front suspensions with any mass, damping and stiffness that the pots can show."""
-    front = PLANTS["front"].parameters()
+    front = _front().parameters()
     mass, stiffness = (_usually(front[name], _number(*REACH[name])) for name in ("M", "K"))
     return st.builds(_suspension, mass, stiffness, _usually(None, _number(*DAMPING_RATIO, 2)))
 
 
-def random_suspensions(count: int, seed: int) -> list[PlantChoice]:
+def random_suspensions(count: int, seed: int) -> list[Plant]:
     """Random suspensions, drawn evenly: for statistics over plants, where hypothesis would look for the extreme."""
     rng = np.random.default_rng(seed)
     drawn = (rng.uniform(*ends, count).tolist() for ends in (REACH["M"], REACH["K"], DAMPING_RATIO))
     return [_suspension(_round(m), _round(k), zeta) for m, k, zeta in zip(*drawn, strict=True)]
 
 
-def _suspension(mass_kg: float, stiffness_n_per_m: float, damping_ratio: float | None) -> PlantChoice:
+def _front() -> Plant:
+    return Plant.of(Program.load(DEFAULT_PROGRAM))
+
+
+def _suspension(mass_kg: float, stiffness_n_per_m: float, damping_ratio: float | None) -> Plant:
     """Suspension with these parameters; without a damping ratio, that of the front suspension."""
-    front = PLANTS["front"]
+    front = _front()
     critical = 2.0 * math.sqrt(mass_kg * stiffness_n_per_m)
-    damping = front.damping_n_s_per_m if damping_ratio is None else _round(damping_ratio * critical)
+    damping = front.parameters()["B"] if damping_ratio is None else _round(damping_ratio * critical)
     if not DAMPING_RATIO[0] <= damping / critical <= DAMPING_RATIO[1]:
         damping = _round(0.8 * critical)
-    return PlantChoice("front", mass_kg, damping, stiffness_n_per_m)
+    return front.changed({"M": mass_kg, "B": damping, "K": stiffness_n_per_m})
 
 
 def _round(value: float) -> float:
@@ -120,13 +124,14 @@ def _within_reach(plant: Plant) -> bool:
 
 
 def _damping_ratio(plant: Plant) -> float:
-    return plant.damping_n_s_per_m / (2.0 * math.sqrt(plant.stiffness_n_per_m * plant.mass_kg))
+    mass_kg, damping, stiffness = plant.values
+    return damping / (2.0 * math.sqrt(stiffness * mass_kg))
 
 
 @st.composite
 def changes(
     draw: st.DrawFn,
-    plant: PlantChoice | None = None,
+    plant: Plant | None = None,
     *,
     parameters: Sequence[str] = ("K", "B", "M"),
     sizes: tuple[float, float] = (0.1, 0.3),
@@ -142,7 +147,7 @@ def changes(
     :param together: so many parameters may change at once.
     :param longest_ramp_n: 0: only jumps.
     """
-    changed = (plant or PlantChoice()).plant()
+    changed = plant or _front()
     count = draw(st.integers(1, together))
     names = draw(st.lists(st.sampled_from(parameters), min_size=count, max_size=count, unique=True))
     for name in names:
@@ -152,9 +157,9 @@ def changes(
         assume(able)
         changed = draw(st.sampled_from(able))
     values = changed.parameters()
-    turned = {FIELDS[name]: _round(values[name]) for name in names}
+    turned = {name: _round(values[name]) for name in names}
     sample = WARM_UP_N if at is None else draw(at)
-    return PotChange(sample=sample, ramp_n=draw(st.integers(0, longest_ramp_n)), **turned)
+    return PotChange(sample, turned, draw(st.integers(0, longest_ramp_n)))
 
 
 def excitations(*, free: bool = False) -> st.SearchStrategy[Excitation]:
@@ -199,11 +204,13 @@ def _within_range(excitation: Excitation, plants: Sequence[Plant]) -> Excitation
     About the middle of the levels the displacement swings by at most half their difference, over K, times what the
     impulse response of such a plant adds up to in magnitude: coth(pi zeta / (2 sqrt(1 - zeta^2))).
     """
-    volts_per_m = PROGRAMS["front"].scales.volts("displacement")
-    n_per_v = 1.0 / PROGRAMS["front"].scales.volts("force")
+    scales = plants[0].program.circuit.scales
+    n_per_v, volts_per_m = (
+        scales.volts(name) ** power for name, power in zip(plants[0].program.measured, (-1, 1), strict=True)
+    )
     low, high = excitation.low_v, excitation.high_v
     for plant in plants:
-        v_per_v = n_per_v * volts_per_m / plant.stiffness_n_per_m
+        v_per_v = n_per_v * volts_per_m / plant.parameters()["K"]
         zeta = _damping_ratio(plant)
         swing = 1.0 if zeta >= 1.0 else 1.0 / math.tanh(0.5 * math.pi * zeta / math.sqrt(1.0 - zeta * zeta))
         # low + high, over two, and (high - low) over two times the swing, are at most MOST_DISPLACEMENT_V together
@@ -295,20 +302,15 @@ def scenarios(
         sample += draw(st.integers(0, 60))
         tweak = draw(changes(now, sizes=sizes, at=st.just(sample), together=together, longest_ramp_n=longest_ramp_n))
         tweaks.append(tweak)
-        now = PlantChoice(set="front", **_after(now, tweak))
+        now = now.changed(tweak.set)
         passed.append(now)
         sample += tweak.ramp_n + SETTLING_N
-    plants = [each.plant() for each in passed]
     return Scenario(
         samples=sample if tweaks else QUIET_N,
-        excitation=_within_range(excitation, plants),
-        plant=plant,
+        excitation=_within_range(excitation, passed),
+        program=plant.program,
+        set=plant.overrides,
         tweaks=tuple(tweaks),
         expect=expect or Expectations(),
         name="drawn",
     )
-
-
-def _after(plant: PlantChoice, tweak: PotChange) -> dict[str, float]:
-    before = plant.plant().parameters()
-    return {FIELDS[name]: tweak.overrides().get(FIELDS[name], before[name]) for name in PARAMETERS}

@@ -1,6 +1,6 @@
 """Tests of the device that --hil-dut names: `pytest --hil-dut inproc`."""
 
-from analogrig import Excitation, Expectations, PlantChoice, PotChange, Scenario
+from analogrig import Excitation, Expectations, PotChange, Scenario
 
 
 def test_changes_are_detected_in_time(hil_play):
@@ -18,8 +18,7 @@ def test_a_scenario_of_our_own(hil_play):
         name="softer",
         samples=900,
         excitation=Excitation(shape="square", low_v=0.1, high_v=9.9, frequency_hz=200.0),
-        plant=PlantChoice(set="front"),
-        tweaks=(PotChange(sample=600, stiffness_n_per_m=20000.0),),
+        tweaks=(PotChange(sample=600, set={"K": 20000.0}),),
         expect=Expectations(missed=0, false_alarms=0),
     )
     assert hil_play(scenario, seed=1).passes()

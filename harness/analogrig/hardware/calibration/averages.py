@@ -11,13 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigError
+from analogrig.hardware.instrument import MEASURED
+from analogrig.program import Program
 from analogrig.rigs.rig import Rig
-from analogrig.run import CHANNELS, MEASURED, Channel
-from analogrig.scenario import PlantChoice, Scenario
+from analogrig.run import INPUT, OUTPUT, Channel
+from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
 
 Vector = NDArray[np.float64]
-Program = Literal["front", "shock"]
+ProgramName = Literal["front", "shock"]
 
 SAMPLES = 1400
 SETTLING_N = 400
@@ -29,7 +31,7 @@ RATE_HZ = 20e3
 FORCE, DISPLACEMENT = range(2)
 """Columns of a recording, as in MEASURED."""
 
-_COLUMNS = [CHANNELS.index(name) for name in MEASURED]
+_COLUMNS = [INPUT, OUTPUT]
 
 _Plant = tuple[float, float, float]
 _PLAYS: tuple[tuple[_Plant, _Plant, tuple[float, float, int]], ...] = (
@@ -51,21 +53,22 @@ _PLAYS: tuple[tuple[_Plant, _Plant, tuple[float, float, int]], ...] = (
 (samples). No amplifier is overloaded, and the displacement stays within -1..9 V. The last play is the check."""
 
 
-def scenarios(program: Program) -> tuple[Scenario, ...]:
+def scenarios(program: ProgramName) -> tuple[Scenario, ...]:
     """Scenarios that the twin is fitted to."""
     return tuple(_scenario(program, play, f"calibration-{play + 1}") for play in range(len(_PLAYS) - 1))
 
 
-def check_scenario(program: Program) -> Scenario:
+def check_scenario(program: ProgramName) -> Scenario:
     """Scenario to validate the twin; its pots, levels and frequency differ from all ``scenarios``."""
     return _scenario(program, -1, "calibration-check")
 
 
-def _scenario(program: Program, play: int, name: str) -> Scenario:
+def _scenario(program: ProgramName, play: int, name: str) -> Scenario:
     front, shock, (low_v, high_v, half_n) = _PLAYS[play]
-    plant = PlantChoice(program, *(front if program == "front" else shock))
+    wired = Program.load(program)
+    values = dict(zip(wired.parameters, front if program == "front" else shock, strict=True))
     excitation = Excitation(low_v=low_v, high_v=high_v, frequency_hz=RATE_HZ / (2 * half_n))
-    return Scenario(samples=SAMPLES, excitation=excitation, plant=plant, name=name)
+    return Scenario(samples=SAMPLES, excitation=excitation, program=wired, set=values, name=name)
 
 
 @dataclass(frozen=True, eq=False)

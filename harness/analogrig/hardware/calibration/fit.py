@@ -36,6 +36,7 @@ from analogrig.hardware.calibration.averages import (
     estimate_noise,
     rounding_variance,
 )
+from analogrig.plant import Plant
 from analogrig.rigs.emulator import (
     CardDescription,
     ComputerDescription,
@@ -43,9 +44,9 @@ from analogrig.rigs.emulator import (
     EmulatorRig,
     MeasuredValues,
 )
-from analogrig.run import CHANNELS, MEASURED
-from analogrig.scenario import PlantChoice, Scenario
-from analogrig_emulator import OP_AMP_GRADES, Excitation, Sampler, SuspensionComputer
+from analogrig.run import INPUT, OUTPUT
+from analogrig.scenario import Scenario
+from analogrig_emulator import CHANNELS, OP_AMP_GRADES, Excitation, Sampler, SuspensionComputer
 
 Stock = Literal["nominal", "polyester", "polypropylene"]
 Pots = Literal["coefficient", "dial"]
@@ -369,17 +370,16 @@ class EmulatorModel:
 
 
 @functools.cache
-def _settings(plant: PlantChoice) -> Mapping[tuple[int, float], float]:
+def _settings(plant: Plant) -> Mapping[tuple[int, float], float]:
     """Relative error of each pot's coefficient, rms, by pot and value; dial errors are uniform within half a step."""
-    computer = SuspensionComputer(plant.set, opamp="ideal")
-    values = list(plant.plant().parameters().values())
-    computer.set(**dict(zip(computer.program.values, values, strict=False)))
+    computer = SuspensionComputer(plant.program.circuit, opamp="ideal")
+    computer.set(**plant.parameters())
     dials, coefficients = computer.dials, computer.coefficients
     computer.set(**{f"{pot}_dial": dial - POT_RESOLUTION for pot, dial in dials.items()})
     missed = computer.coefficients
     return {
         (i, value): (coefficients[pot] - missed[pot]) / (math.sqrt(12.0) * coefficients[pot])
-        for i, (pot, value) in enumerate(zip(dials, values, strict=True))
+        for i, (pot, value) in enumerate(zip(dials, plant.values, strict=True))
     }
 
 
@@ -391,7 +391,7 @@ def _late_displacement(computer: SuspensionComputer, wave: Excitation, samples: 
     by = (1.0 - late_n) * wave.frequency_hz / computer.sample_rate_hz
     later = dataclasses.replace(wave, clock="free", phase=(wave.phase - by) % 1.0)
     volts = np.concatenate(list(computer.play(later, samples + 1)))
-    return np.asarray(volts[1:, CHANNELS.index("displacement")])
+    return np.asarray(volts[1:, OUTPUT])
 
 
 class _Fit(NamedTuple):
@@ -504,11 +504,11 @@ def noise_free_lsb(description: EmulatorDescription, scenario: Scenario, seed: i
     :raises ConfigurationError: the emulator cannot play the scenario.
     :raises RigError: the emulator failed.
     """
-    card = description.card.card()
+    card = description.card.card(scenario.program.channels)
     silent = dataclasses.replace(card, noise_lsb=(0.0,) * card.channels)
     volts = np.concatenate([block.volts for block in EmulatorRig(description).perform(scenario, seed).blocks])
     lsb = Sampler(silent, np.random.default_rng(0)).seen_lsb(volts)
-    return np.asarray(lsb[:, [CHANNELS.index(name) for name in MEASURED]])
+    return np.asarray(lsb[:, [INPUT, OUTPUT]])
 
 
 def difference_lsb(recording: SquareWaveRecording, twin: EmulatorDescription, noise_lsb: float) -> float:

@@ -2,8 +2,8 @@
 
 A pot that an operator or a slow command sets changes the plant at unknown samples. The plant before the change explains
 the samples up to it, the plant after it those that follow (``analogrig.hardware.dating.two_filter``). Other unknowns
-are estimated jointly: M, B, K before and after, since a real rig deviates from its nominal values by some per cent; the
-offsets of both channels; the place of the force's edges in a sample period.
+are estimated jointly: the parameters before and after, since a real rig deviates from its nominal values by some per
+cent; the offsets of both channels; the place of the force's edges in a sample period.
 
 ``date_jump`` dates a change at once, ``date_turn`` one that takes time: a pot that is turned by hand, or two pots that
 jump in succession. Intervals hold every instant that the likelihood-ratio test accepts, and at least the requested
@@ -37,7 +37,7 @@ from analogrig.hardware.dating.two_filter import (
     join,
     scan,
 )
-from analogrig.plant import PARAMETERS, Plant
+from analogrig.plant import Plant
 
 CONFIDENCE = 0.95
 
@@ -46,10 +46,10 @@ WINDOW_N = 500
 
 # Standard deviations of the unknowns before any sample is seen.
 _NOMINAL = 0.1
-"""Deviation of log M, B, K before the change from their set values: components, gains."""
+"""Deviation of the logarithms of parameters before the change from their set values: components, gains."""
 _CHANGED, _UNCHANGED, _UNKNOWN = 0.1, 0.005, 0.5
-"""Deviation of each ratio of M, B, K after to before from its set value: if it is to change; if not, for what one mass,
-damper and spring do not explain of a rig; if the plant after the change is unknown."""
+"""Deviation of each ratio of a parameter after to before from its set value: if it is to change; if not, for what the
+plant does not explain of a rig; if the plant after the change is unknown."""
 _OFFSET = 100.0
 """Offset of either channel, in rms of its noise."""
 _OFFSET_CHANGE = 2.0
@@ -66,9 +66,9 @@ _EXCESS = 1.5
 
 _ROUNDS = 8
 _CONVERGED = 5e-3
-"""Largest change of log M, B, K that counts as linear: the error is 0.02 of the noise."""
+"""Largest change of the logarithms of parameters that counts as linear: the error is 0.02 of the noise."""
 _LARGEST_STEP = 0.3
-"""Largest change of log M, B, K per iteration."""
+"""Largest change of the logarithms of parameters per iteration."""
 
 _LEAST_NOISE, _LEAST_NOISE_FORCE = 8e-4, 2.5e-4
 """Least noise of displacement and force, rms, in parts of their swing: about that of 12 bits at full range. Real
@@ -240,8 +240,8 @@ class _Guess:
 
     unknowns: Array
     """(10,): offset of the displacement in rms of its noise; mean place of the edges less 0.5; then, for the plant
-    before and for that after, the offset of the force in rms of its noise and the logarithms of M, B, K over their set
-    values."""
+    before and for that after, the offset of the force in rms of its noise and the logarithms of the parameters over
+    their set values."""
     half_width: float = _ANYWHERE
     sample: int = 0
     """Instant of the change, as an index of the window."""
@@ -300,8 +300,10 @@ class _Problem:
             raise ValueError(f"{search} leaves {alone}, in which the plant changes no other time")
         first = max(search.start - WINDOW_N, alone.start, 0)
         changed = before.changes_to(after or before)
-        changes = [_UNKNOWN if after is None else _CHANGED if name in changed else _UNCHANGED for name in PARAMETERS]
-        deviations = [_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS), _OFFSET_CHANGE, *changes]
+        changes = [
+            _UNKNOWN if after is None else _CHANGED if name in changed else _UNCHANGED for name in before.parameters()
+        ]
+        deviations = [_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * (OWN - 1), _OFFSET_CHANGE, *changes]
         rows = np.eye(len(deviations))
         rows[COMMON + OWN :, COMMON : COMMON + OWN] = -np.eye(OWN)  # the plant after is known by its change
         return cls(
@@ -328,7 +330,7 @@ class _Problem:
         return min(anywhere, locked, key=lambda each: float(each.cost.min()))
 
     def fit(self, guess: _Guess) -> _ProfileLikelihood:
-        """Iterate ``profile`` from ``guess`` until M, B, K have converged."""
+        """Iterate ``profile`` from ``guess`` until the parameters have converged."""
         for _ in range(_ROUNDS):
             last, fit = guess, self.profile(guess)
             guess = fit.guess
@@ -353,7 +355,7 @@ class _Problem:
         fit = form[:, 0, 0] + (form[:, 0, 1:] * steps).sum(axis=1)
         *cost, unchanged = (fit + log + old.log[at] + new.log[at]).tolist()
         best = int(np.argmin(cost))
-        limits = np.array([np.inf, np.inf, *[np.inf, *[_LARGEST_STEP] * len(PARAMETERS)] * 2])
+        limits = np.array([np.inf, np.inf, *[np.inf, *[_LARGEST_STEP] * (OWN - 1)] * 2])
         return _ProfileLikelihood(
             dataclasses.replace(guess, unknowns=unknowns + np.clip(steps[best], -limits, limits), sample=int(at[best])),
             np.array(cost),
@@ -443,8 +445,8 @@ def _course(old: Motion, new: Motion, sample: int) -> Array:
 
 
 def _deviate(plant: Plant, own: Array) -> Plant:
-    """Plant with the logarithms of M, B, K raised by ``own[1:]``."""
-    for name, log in zip(PARAMETERS, own[1:].tolist(), strict=True):
+    """Plant with the logarithms of the parameters raised by ``own[1:]``."""
+    for name, log in zip(plant.parameters(), own[1:].tolist(), strict=True):
         plant = plant.scaled(name, math.exp(log))
     return plant
 
@@ -501,7 +503,7 @@ class _Path:
             offsets = np.linspace(before[0], after[0], _POINTS)
         else:
             # Each parameter of the middle plant has its old or its new deviation.
-            changed = [name in problem.plants[0].changes_to(middle) for name in PARAMETERS]
+            changed = [name in problem.plants[0].changes_to(middle) for name in middle.parameters()]
             plants = [_deviate(middle, np.where([False, *changed], after, before))] * _POINTS
             offsets = np.full(_POINTS, 0.5 * (before[0] + after[0]))
         models = PlantModel.of(plants, guess.edges, problem.signals)

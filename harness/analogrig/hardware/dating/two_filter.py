@@ -4,8 +4,9 @@ A Kalman filter with the plant before the change runs forwards; an information f
 backwards. At each instant both are joined by the state (displacement and velocity), which is continuous at a change.
 
 Unknowns enter linearly, about their best values so far, as columns that the filters carry. Both plants share the offset
-of the displacement and the place of the edges; each has its own offset of the force and logarithms of M, B, K. The
-sampled force does not show where between two samples an edge lies: the deviation from its mean place is process noise.
+of the displacement and the place of the edges; each has its own offset of the force and logarithms of parameters.
+The sampled force does not show where between two samples an edge lies: the deviation from its mean place is process
+noise.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.plant import PARAMETERS, Plant, discretise
-from analogrig.run import CHANNELS, MEASURED, Channel, missing_samples
+from analogrig.plant import Plant, discretise
+from analogrig.run import INPUT, OUTPUT, Channel, missing_samples
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ DIFFUSE = 1e6
 """Variance of the state at the first sample, in units of the noise variance."""
 _NEGLIGIBLE = 1e-14
 _STEP, _PLACE_STEP = 1e-4, 1e-2
-"""Steps of the difference quotients: in a logarithm of M, B or K, and in the place of the edges."""
+"""Steps of the difference quotients: in a logarithm of a parameter, and in the place of the edges."""
 _PLACES = (np.arange(8) + 0.5) / 4.0 - 1.0
 """Middles of eight parts of the range -1..1."""
 
@@ -55,14 +56,13 @@ class Signals:
     def of(
         cls, codes: NDArray[np.uint16], clipped: NDArray[np.bool_], channels: Mapping[str, Channel], period_s: float
     ) -> Self:
-        """Signals from ``codes`` and ``clipped``, both (n, 4) with columns as CHANNELS."""
-        columns = {name: channels[name].physical(codes[:, CHANNELS.index(name)]) for name in MEASURED}
+        """Signals from ``codes`` and ``clipped``, both (n, c); ``channels``: input and output first."""
+        force, displacement = list(channels.values())[:2]
         noise_n, noise_m = (
-            (channels[name].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2) ** 0.5 * abs(channels[name].lsb)
-            for name in MEASURED
+            (each.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) ** 0.5 * abs(each.lsb) for each in (force, displacement)
         )
-        valid = ~missing_samples(clipped)
-        return cls(columns["force"], columns["displacement"], valid, period_s, noise_n, noise_m)
+        force_n, displacement_m = force.physical(codes[:, INPUT]), displacement.physical(codes[:, OUTPUT])
+        return cls(force_n, displacement_m, ~missing_samples(clipped), period_s, noise_n, noise_m)
 
     def part(self, first: int, end: int) -> Signals:
         """Return the samples first <= k < end."""
@@ -103,11 +103,13 @@ class PlantModel:
     @classmethod
     def of(cls, plants: Sequence[Plant], edges: EdgePlace, signals: Signals) -> list[Self]:
         """Models for the period and the noise of ``signals``."""
-        parameters = np.array([tuple(plant.parameters().values()) for plant in plants])
+        program, parameters = plants[0].program, np.array([plant.values for plant in plants])
         period_s, noise_m = signals.period_s, signals.noise_m
         units = np.array([[1.0, 1.0 / period_s, 1.0 / noise_m], [period_s, 1.0, period_s / noise_m]])
         places = np.clip(edges.mean + edges.half_width * _PLACES, 0.0, 1.0).tolist()
-        whole, *late = (units * discretise(parameters, part * period_s) for part in (1.0, *(1.0 - at for at in places)))
+        whole, *late = (
+            units * discretise(program, parameters, part * period_s) for part in (1.0, *(1.0 - at for at in places))
+        )
         edge = np.array(late)[:, :, :, 2]
         off = edge - edge.mean(axis=0)
         covariance = np.einsum("pmi,pmj->mij", off, off) / len(places)
@@ -129,7 +131,7 @@ class Motion:
 
     model: PlantModel
     moved: tuple[PlantModel, ...]
-    """Models with log M, B, K raised by one step each."""
+    """Models with the logarithm of a parameter raised by one step each."""
     edge_by_place: Array  # (2,)
     signals: Signals
     offsets: tuple[float, float]
@@ -140,7 +142,7 @@ class Motion:
         """Motion of ``plant`` by the force of ``signals``."""
         step = _PLACE_STEP if edges.mean < 0.5 else -_PLACE_STEP
         model, *moved = PlantModel.of(
-            [plant, *(plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS)], edges, signals
+            [plant, *(plant.scaled(name, 1.0 + _STEP) for name in plant.parameters())], edges, signals
         )
         (later,) = PlantModel.of([plant], edges._replace(mean=edges.mean + step), signals)
         return cls(model, tuple(moved), (later.edge - model.edge) / step, signals, offsets)

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.config import check_range
-from analogrig.hardware.instrument import DialChange
-from analogrig.run import MEASURED
+from analogrig.hardware.instrument import MEASURED, DialChange
 from analogrig_emulator import CHANNELS, SOURCE, TICKS_PER_SAMPLE, Edges, Excitation, Mode, SuspensionComputer
 
 MEASURED_AT = tuple(CHANNELS.index(name) for name in MEASURED)

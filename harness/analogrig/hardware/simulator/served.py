@@ -46,8 +46,9 @@ from analogrig.hardware.simulator.records import (
 )
 from analogrig.hardware.simulator.scpi import HERTZ, VOLTS, Call, Command, DropOut, Response, ScpiError
 from analogrig.links.wire import Clock
+from analogrig.program import Program
 from analogrig.rigs.emulator import EmulatorDescription, Stream, emulator_errors
-from analogrig_emulator import Card, EmulatorError, Excitation, SuspensionComputer
+from analogrig_emulator import CHANNELS, Card, EmulatorError, Excitation, SuspensionComputer
 
 MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4
@@ -348,7 +349,7 @@ class ServedDescription(EmulatorDescription):
             table = _merge(table, {"instrument": _parse(defect)})
         return config.build(cls, table, str(path))
 
-    def set_up(self, program: str, seed: int, clock: Clock | None = None) -> ServedRedPitaya:
+    def set_up(self, program: Program, seed: int, clock: Clock | None = None) -> ServedRedPitaya:
         """The instrument with the computer that an EmulatorRig plays with the same seed.
 
         With a ``clock`` its records take their real time.
@@ -361,7 +362,7 @@ class ServedDescription(EmulatorDescription):
             except ValueError as error:
                 raise ConfigurationError(f"{self.name}: card and instrument together: {error}") from error
             return ServedRedPitaya(
-                lambda rate_hz: self.computer.machine(program, seed, rate_hz),
+                lambda rate_hz: self.computer.machine(program.circuit, seed, rate_hz),
                 Stream.CARD.generator(seed),
                 described,
                 clock,
@@ -372,7 +373,7 @@ class ServedDescription(EmulatorDescription):
 
         :raises ValueError: together they are too large.
         """
-        card, own, acquisition = self.card.card(), self.instrument.inputs, self.instrument.acquisition
+        card, own, acquisition = self.card.card(CHANNELS), self.instrument.inputs, self.instrument.acquisition
         measured = list(MEASURED_AT)
         gain_error, skew_s = card.per_channel("gain_error")[measured], card.per_channel("skew_s")[measured]
         offset_v, noise_v = ((card.per_channel(name) * card.lsb_v)[measured] for name in ("offset_lsb", "noise_lsb"))
@@ -389,7 +390,7 @@ class ServedDescription(EmulatorDescription):
     @property
     def unsupported(self) -> tuple[str, ...]:
         """Keys of the description that the served instrument does not simulate."""
-        card = self.card.card()
+        card = self.card.card(CHANNELS)
         others = [each for each in fields(Card) if each.name not in _ON_BOTH | _OF_THE_CARD]
         of_card = tuple(f"card.{each.name}" for each in others if getattr(card, each.name) != each.default)
         return (*of_card, "computer.noise") if self.computer.noise else of_card

@@ -39,13 +39,13 @@ class Stimulus:
     def of_plant(cls, seed: int) -> Self:
         """Samples of the emulated computer, whose plant changes after the warm-up of most devices."""
         scenario = Scenario.load("healthy")
-        changes = (PotChange(CHANGE_AT, mass_kg=60.0, stiffness_n_per_m=18_000.0),)
+        changes = (PotChange(CHANGE_AT, {"M": 60.0, "K": 18_000.0}),)
         scenario = dataclasses.replace(scenario, samples=SAMPLES_N, tweaks=changes)
         with open_rig("emulator") as rig:
             performance = rig.perform(scenario, seed)
             parts = [block.samples() for block in performance.blocks]
         u, y, valid = (np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "y", "valid"))
-        return cls(performance.channels, performance.sample_period_s, u, y, valid)
+        return cls(performance.of_device, performance.sample_period_s, u, y, valid)
 
     def replaced(self, **arrays: Any) -> Stimulus:
         """The same with other arrays."""
@@ -54,7 +54,7 @@ class Stimulus:
     @property
     def full_scale(self) -> int:
         """Largest code of both channels."""
-        return min(self.channels[name].codes for name in ("force", "displacement")) - 1
+        return min(channel.codes for channel in self.channels.values()) - 1
 
     def blocks(self, *lengths: int) -> Iterator[Samples]:
         """The samples in blocks of these lengths, over and over."""

@@ -111,7 +111,7 @@ class Player:
         record_of(self.item).plays.append(played)
         raise_if_interrupted(run)  # the session ends, as pytest ends at Ctrl-C
         if not played.verdict.valid and not allow_inconclusive:
-            pytest.fail(f"INCONCLUSIVE: {played.verdict.reasons[0]}", pytrace=False)
+            pytest.fail(f"{played.verdict.outcome.upper()}: {played.verdict.reasons[0]}", pytrace=False)
         return played
 
     def _check_equipment(self, scenario: Scenario) -> None:

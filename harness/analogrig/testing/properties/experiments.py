@@ -149,7 +149,7 @@ def false_alarms_of_plants_rarer(
 
     bench = _direct_bench(play, f"takes {plants * samples_each} samples: analogrig campaign")
     scenario = dataclasses.replace(scenario, samples=samples_each)
-    drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
+    drawn = [scenario.with_plant(plant) for plant in random_suspensions(plants, seed)]
     alarms, shown = zip(*(_count_alarms(bench, each, seed) for each in drawn), strict=True)
     if nothing := next((each.lack_of_evidence for each in shown if each.lack_of_evidence), ""):
         raise Inconclusive(nothing)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analogrig.judging.bursts import Design
-from analogrig.scenario import PlantChoice, Scenario
+from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.properties.experiments import (
     device_with_faults,
@@ -29,7 +29,7 @@ FAULTS_EACH, LEAST_VALID_KINDS = 4, 4
 CERTIFIED = Design(rate=1e-5, confidence=0.999, allowed=10)
 CERTIFIED_RUN_N = 100_000
 PLANTS_N, PLANTS_RUN_N = 40, 60_000
-HEAVY = PlantChoice("front", mass_kg=150.0, damping_n_s_per_m=1668.5, stiffness_n_per_m=29_000.0)
+HEAVY = {"M": 150.0, "B": 1668.5, "K": 29_000.0}
 HEAVY_RATE, HEAVY_ESTIMATES_N, HEAVY_BRANCHES_N = 0.1 * CERTIFIED.rate, 32, 1000
 """A tenth of the promise: where innovations are white, the trigger's bound leaves a hundredth (7e-8 here). A prefilter
 that is not taken from this plant, of a damping ratio of 0.4, leaves them coloured, and 2.7e-6."""
@@ -98,7 +98,7 @@ def test_false_alarms_stay_rare_on_a_plant_that_the_prefilter_has_to_follow(hil_
     excitation = dataclasses.replace(healthy.excitation, high_v=8.0)
     assert rare_false_alarms_rarer(
         hil_play,
-        dataclasses.replace(healthy, plant=HEAVY, excitation=excitation),
+        dataclasses.replace(healthy, set=HEAVY, excitation=excitation),
         0,
         rate=HEAVY_RATE,
         confidence=SURELY,

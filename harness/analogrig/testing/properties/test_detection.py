@@ -46,9 +46,9 @@ SINGLE_MISS, SINGLE_FALSE_FAILURE = 1e-3, 1e-7
 MOST_SINGLE_PLAYS_N, SILENT_N = 300, 5
 
 _TURNED = {
-    "stiffness_n_per_m": (24500.0, (0.8,)),
-    "damping_n_s_per_m": (3021.0, (0.8, 1.2)),
-    "mass_kg": (115.0, (0.8, 1.2)),
+    "K": (24500.0, (0.8,)),
+    "B": (3021.0, (0.8, 1.2)),
+    "M": (115.0, (0.8, 1.2)),
 }
 _SETTINGS: list[dict[str, Any]] = [
     {name: value * each} for name, (value, factors) in _TURNED.items() for factor in factors for each in (factor, 1.0)
@@ -58,7 +58,7 @@ SINGLY = Scenario(
     samples=WARM_UP_N + _EACH_N * len(_SETTINGS),
     excitation=Excitation(low_v=0.1, high_v=9.0),
     random_phase=True,
-    tweaks=tuple(PotChange(WARM_UP_N + _EACH_N * i, **setting) for i, setting in enumerate(_SETTINGS)),
+    tweaks=tuple(PotChange(WARM_UP_N + _EACH_N * i, setting) for i, setting in enumerate(_SETTINGS)),
     name="singly",
     description="front suspension: one parameter at a time, by 20 % and back; K does not rise, for want of pot",
 )

@@ -22,7 +22,7 @@ from analogrig.testing.strategies import profile, rigs, scenarios, seeds
 from analogrig_emulator import Excitation
 
 WITHIN = 0.1
-"""Largest relative error of each of M, B and K: six times the rms error of the worst plant drawn."""
+"""Largest relative error of each estimate: six times the rms error of the worst plant drawn."""
 
 PAUSED = Scenario(
     samples=16_000,

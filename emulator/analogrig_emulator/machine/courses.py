@@ -1,0 +1,209 @@
+"""Noise-free courses of one channel of a machine, from any sample on and with its parameters at any values.
+
+A judge compares such courses with and without a change. Pots stand between windings here. A coefficient beyond 1 is
+taken into an input of ten times the gain, because rivals of a plant may exceed its pots.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig_emulator.card.acquisition import on_card_clock, probe_of_channel, probes_per_sample
+from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.card.sampler import Card
+from analogrig_emulator.circuit.circuit import Element, Resistor
+from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
+from analogrig_emulator.errors import PotError
+from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scales
+from analogrig_emulator.machine.suspension import SuspensionComputer
+
+Matrix = NDArray[np.float64]
+
+_WIDE_GAIN = 10.0
+
+_MOST_STEPS = 256
+"""Steps in which pots turn during a ramp; a step is at least a sample long, and shows its middle."""
+
+
+class Wired(NamedTuple):
+    """Machine to play, and the one whose pots show the dials: a nominal one where pots are digital."""
+
+    machine: SuspensionComputer
+    dials: SuspensionComputer
+
+
+class Moment(NamedTuple):
+    """Voltages of a machine's states at a sample."""
+
+    sample: int
+    state: Matrix
+
+
+class Course:
+    """Course of the channel from the sample after a moment on."""
+
+    def __init__(
+        self, courses: Courses, start: Moment, turns: Sequence[tuple[int, PiecewiseLinear]], probe: int
+    ) -> None:
+        """turns: circuits and the probes after which they begin, the first at once. Samples are taken at a probe."""
+        self._courses, self._start, self._turns, self._probe = courses, start, turns, probe
+        self._edges = courses.edges_from(start.sample)
+        self._engine = courses.engine(turns[0][1])
+        self._engine.state = start.state
+        self._coming = list(turns[1:])
+        self._run(1 + probe)
+
+    def advance(self, samples: int) -> Matrix:
+        """Voltages of the next samples, (samples,). Raises EngineError."""
+        probes = self._courses.probes
+        return self._courses.sign * self._run(samples * probes)[probes - 1 :: probes, 0]
+
+    def moment(self) -> Moment:
+        """Moment of the last sample. Raises EngineError."""
+        samples = (self._engine.recorded - 1) // self._courses.probes
+        if not self._probe:
+            return Moment(self._start.sample + samples, self._engine.state)
+        course = Course(self._courses, self._start, self._turns, 0)
+        course.advance(samples)
+        return course.moment()
+
+    def _run(self, probes: int) -> Matrix:
+        until = self._engine.recorded + probes
+        now = [turn for turn in self._coming if turn[0] < until]
+        del self._coming[: len(now)]
+        edges = {SOURCE: self._edges.within(*self._engine.window(probes))}
+        return self._engine.run_changing(probes, now, edges) if now else self._engine.run(probes, edges)
+
+
+class Courses:
+    """Courses of one channel of a machine under one excitation.
+
+    wire: machines whose pots feed inputs of a gain, to be called with 1, and with 10 where a coefficient exceeds 1.
+    samples: length of the run; channel: index of the card's channel. Raises ExcitationError, SamplerError.
+    """
+
+    def __init__(
+        self, wire: Callable[[float], Wired], card: Card, excitation: Excitation, samples: int, channel: int
+    ) -> None:
+        self._wire = functools.cache(wire)
+        self._machine = self._wire(1.0).machine
+        self.probes, self._probe = probes_per_sample(card), probe_of_channel(card, channel)
+        program = self._machine.program
+        self._nodes = (program.channel_nodes[channel],)
+        self.sign = float(program.channel_signs[channel])
+        self._edges = on_card_clock(card, excitation).edges(0, self._tick(samples), self._machine.sample_rate_hz)
+        self._later: dict[int, Edges] = {}
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Parameters that pots show, with their values in the program."""
+        return self._machine.program.values
+
+    def at_rest(self, values: Mapping[str, float]) -> Moment:
+        """Moment of sample 0, after a start from rest."""
+        ((_, circuit),) = self._turns(values, values, 0)
+        return Moment(0, np.zeros(len(circuit.states)))
+
+    def course(self, start: Moment, before: Mapping[str, float], after: Mapping[str, float], ramp_n: int = 0) -> Course:
+        """Course from a moment on, with pots that turn there from one set of values to another.
+
+        Raises PotError for values beyond pots and gains, and EngineError.
+        """
+        return Course(self, start, self._turns(before, after, ramp_n), self._probe)
+
+    def engine(self, circuit: PiecewiseLinear) -> Engine:
+        """Engine of the machine, at rest before a first sample."""
+        return Engine(circuit, self._nodes, self._machine.sample_rate_hz)
+
+    def edges_from(self, sample: int) -> Edges:
+        """Edges after a sample, counted from there, with the level at the sample first."""
+        if sample not in self._later:
+            tick = self._tick(sample)
+            level_v = self._edges.levels_v[np.searchsorted(self._edges.ticks, tick, "right") - 1]
+            later = self._edges.after(tick).shifted(-tick)
+            self._later = {sample: Edges(np.append(0, later.ticks), np.append(level_v, later.levels_v))}
+        return self._later[sample]
+
+    def _turns(
+        self, before: Mapping[str, float], after: Mapping[str, float], ramp_n: int
+    ) -> list[tuple[int, PiecewiseLinear]]:
+        """Circuits and the probes after which they begin. During a ramp the dials turn in even steps."""
+        try:
+            return self._turns_at_gain(1.0, before, after, ramp_n)
+        except PotError:
+            return self._turns_at_gain(_WIDE_GAIN, before, after, ramp_n)
+
+    def _turns_at_gain(
+        self, gain: float, before: Mapping[str, float], after: Mapping[str, float], ramp_n: int
+    ) -> list[tuple[int, PiecewiseLinear]]:
+        machine, shown = self._wire(gain)
+        goal = shown.dials_between(after)
+        last = (ramp_n * self.probes, machine.machine.operating(goal))
+        if not ramp_n:
+            return [last]
+        start, step_n = shown.dials_between(before), -(-ramp_n // _MOST_STEPS)
+        places = [(first, min(first + step_n, ramp_n)) for first in range(0, ramp_n, step_n)]
+        turns = [(first * self.probes, _between(start, goal, (first + end) / (2 * ramp_n))) for first, end in places]
+        return [*((probe, machine.machine.operating(dials)) for probe, dials in turns), last]
+
+    def _tick(self, sample: int) -> int:
+        return sample * self.probes * TICKS_PER_SAMPLE
+
+
+def _between(start: Mapping[str, float], goal: Mapping[str, float], part: float) -> dict[str, float]:
+    """Dials at a fraction of the way."""
+    return {pot: start[pot] + part * (dial - start[pot]) for pot, dial in goal.items()}
+
+
+@dataclass(frozen=True)
+class WideProgram(ProgramCircuit):
+    """Program whose pots feed inputs of so many times the gain, with as much smaller coefficients."""
+
+    program: ProgramCircuit
+    gain: float
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.program.name
+
+    @property
+    def scales(self) -> Scales:
+        return self.program.scales
+
+    @property
+    def amplifiers(self) -> int:
+        return self.program.amplifiers
+
+    @property
+    def integrators(self) -> tuple[str, ...]:
+        return self.program.integrators
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return self.program.channels
+
+    @property
+    def values(self) -> dict[str, float]:
+        return self.program.values
+
+    @property
+    def pots(self) -> Mapping[str, PotRow]:
+        return self.program.pots
+
+    def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
+        loads = {row.load for row in self.pots.values()}
+        return [
+            replace(each, ohm=each.ohm / self.gain) if isinstance(each, Resistor) and each.name in loads else each
+            for each in self.program.netlist(models)
+        ]
+
+    def pot_coefficient(self, pot: str, values: Mapping[str, float]) -> float:
+        return self.program.pot_coefficient(pot, values) / self.gain

@@ -1,0 +1,136 @@
+"""``analogrig bench``: a rig and a device on a local page, operated by hand while they run."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analogrig.cli.options import (
+    add_command,
+    add_dut,
+    add_json,
+    add_what_to_play,
+    changes_of_dut,
+    open_what_to_play,
+    trust_of,
+)
+from analogrig.cli.serve import port
+from analogrig.cli.terminal import PASSED, show, show_json
+
+if TYPE_CHECKING:
+    from analogrig.devices.device import Device
+    from analogrig.live.session import LiveSession
+
+TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
+"""Environment variable with the token of the address; by default a random one."""
+
+REPORT_INTERVAL_N = 64
+"""Samples between estimates from a device of our catalogue: the page shows ten states a second."""
+
+
+def add(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "bench",
+        "operate a rig and a device by hand, live, on a local page",
+        "bench",
+        "bench --program shock --dut host",
+        "bench --rig bench --dut serial:/dev/ttyACM0 --no-open",
+    )
+    add_what_to_play(command)
+    add_dut(
+        command, default=os.environ.get("ANALOGRIG_DUT", ""), shown="$ANALOGRIG_DUT, that of the scenario, or inproc"
+    )
+    command.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)"
+    )
+    command.add_argument("--port", type=port, default=0, metavar="N", help="TCP port; 0: any free one (default: 0)")
+    command.add_argument(
+        "--origin",
+        action="append",
+        default=[],
+        metavar="URL",
+        help="origin of another page that may use the endpoint for viewers; may be repeated",
+    )
+    command.add_argument("--no-open", action="store_true", help="leave the browser alone, and print the address")
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("build/bench"),
+        metavar="DIR",
+        help="folder for the recordings (default: %(default)s)",
+    )
+    add_json(command)
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    import asyncio
+
+    from analogrig.errors import ConfigurationError
+    from analogrig.identity import Identity
+    from analogrig.live.session import LiveSession
+
+    if arguments.real_time is not None:
+        raise ConfigurationError("--real-time: the page sets the time factor")
+    with (
+        open_what_to_play(arguments) as (rig, scenario, seed),
+        _open_device(arguments.dut or scenario.dut or "inproc", arguments) as device,
+    ):
+        identity = Identity.here(arguments.command_line, arguments.started, device.files())
+        session = LiveSession(rig, scenario, device, seed, folder=arguments.out, identity=identity)
+        return asyncio.run(_serve(session, arguments))
+
+
+def _open_device(name: str, arguments: argparse.Namespace) -> Device:
+    """Open the device. One of our catalogue takes blocks, and reports an estimate now and then, unless told otherwise.
+
+    :raises ConfigurationError, LinkError, DeviceError: as ``open_dut``.
+    """
+    from analogrig.devices.opening import open_dut
+    from analogrig.devices.registry import trusted
+
+    trust, changes = trust_of(arguments), changes_of_dut(arguments)
+    description = trusted(name, trust)
+    if "pace" in description.capabilities and "report_interval_n" in vars(description):
+        changes["report_interval_n"] = changes["report_interval_n"] or REPORT_INTERVAL_N
+        if description.kind != "can":
+            changes["exchange"] = changes["exchange"] or "block"
+    return open_dut(name, allow=trust, **changes)
+
+
+async def _serve(session: LiveSession, arguments: argparse.Namespace) -> int:
+    """Serve the page, and play in another thread, until a signal ends the command."""
+    import asyncio
+    import webbrowser
+
+    from analogrig.live.server import BenchServer
+    from analogrig.signals import signal_future
+
+    ended = signal_future()
+    server = BenchServer(session, token=os.environ.get(TOKEN_VARIABLE, ""), origins=arguments.origin)
+    await server.listen(arguments.host, arguments.port)
+    playing = asyncio.ensure_future(_play(session))
+    try:
+        if arguments.json:
+            show_json({"address": server.address, "out": str(arguments.out)})
+        else:
+            show(f"bench: {server.address}")
+        if not arguments.no_open:
+            await asyncio.to_thread(webbrowser.open, server.address)
+        await asyncio.wait((ended, playing), return_when=asyncio.FIRST_COMPLETED)
+        return (playing if playing.done() else ended).result()
+    finally:
+        session.close()
+        await server.close()
+        await asyncio.gather(playing, return_exceptions=True)
+
+
+async def _play(session: LiveSession) -> int:
+    """Play in another thread until the session is closed. Return the exit status."""
+    import asyncio
+
+    await asyncio.to_thread(session.run)
+    return PASSED

@@ -1,0 +1,151 @@
+"""``analogrig import``: measured data of other tools becomes a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analogrig.cli.options import FILE, RIG_NAMES, SCENARIO, add_command, add_json, add_rig, files_read, trust_of
+from analogrig.cli.terminal import PASSED, show, show_result, show_work
+
+if TYPE_CHECKING:
+    from analogrig.recordings.imported import ImportDescription
+    from analogrig.run import Run
+    from analogrig.scenario import Scenario
+
+_SIDES = ("input", "output")
+
+
+def add(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "import",
+        "make a recording of measured data: CSV, NumPy, MATLAB, MF4, Parquet or WAV",
+        "import SNLS80mV.csv --input V1 --output V2 --rate 610.3515625 --out build/silverbox.npz",
+        "import bench.mat --map bench.toml --scenario mine.toml --out build/bench.npz",
+        "import build/signals.csv --scenario thesis --out build/again.npz",
+    )
+    command.add_argument(
+        "file", type=Path, metavar=FILE, help=".csv, .tsv, .txt, .npy, .npz, .mat, .mf4, .parquet or .wav"
+    )
+    command.add_argument("--out", type=Path, required=True, metavar="FILE.npz", help="file of the recording")
+    command.add_argument("--map", type=Path, metavar="FILE.toml", help="the settings below as a file")
+    for side in _SIDES:
+        command.add_argument(f"--{side}", metavar="COLUMN", help=f"column of the plant's {side}")
+        command.add_argument(f"--{side}-unit", metavar="UNIT", help="its unit (default: V)")
+        command.add_argument(f"--{side}-scale", type=float, metavar="X", help="units per number in it (default: 1)")
+        command.add_argument(
+            f"--{side}-range",
+            nargs=2,
+            type=float,
+            metavar=("LOW", "HIGH"),
+            help="range of its converter in units (default: one that holds all values)",
+        )
+    command.add_argument("--rate", type=float, metavar="HZ", help="sample rate (default: that of the file)")
+    command.add_argument("--time", metavar="COLUMN", help="column of the instants in seconds, instead of --rate")
+    command.add_argument("--bits", type=int, metavar="N", help="bits of the converter (default: 16)")
+    command.add_argument("--first", type=int, metavar="N", help="first row (default: 0)")
+    command.add_argument("--samples", type=int, metavar="N", help="number of rows (default: all)")
+    command.add_argument("--skip-lines", type=int, metavar="N", help="lines of text before the header (default: 0)")
+    command.add_argument(
+        "--scenario", metavar=SCENARIO, help="scenario with the truth: shipped name or .toml file (default: unknown)"
+    )
+    add_rig(command, f"rig of a file of analogrig emulate: {RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)")
+    add_json(command)
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from analogrig.errors import ConfigurationError
+    from analogrig.identity import Identity
+    from analogrig.output import move_aside
+    from analogrig.scenario import Scenario
+
+    if arguments.out.suffix != ".npz":
+        raise ConfigurationError(f"--out {arguments.out}: the file's name must end with .npz")
+    move_aside(arguments.out, (*files_read(arguments), *([arguments.map] if arguments.map else [])))
+    scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    with show_work("reading"):
+        run = _import(arguments, scenario)
+        run = run.with_identity(Identity.here(arguments.command_line, arguments.started))
+        run.save(arguments.out)
+    table = _as_json(run, arguments)
+    if arguments.json:
+        show_result(table, arguments)
+    else:
+        show("\n".join(_lines(run, arguments)))
+    return PASSED
+
+
+def _import(arguments: argparse.Namespace, scenario: Scenario | None) -> Run:
+    from analogrig.cli.options import DEFAULT_SCENARIO
+    from analogrig.errors import RecordingError
+    from analogrig.recordings.columns import read_columns
+    from analogrig.recordings.imported import import_columns, import_signals, is_emulated
+    from analogrig.rigs.description import open_rig
+    from analogrig.scenario import Scenario
+
+    table = _table(arguments)
+    if not table:
+        names = read_columns(arguments.file).names
+        if not is_emulated(arguments.file, names):
+            shown = ", ".join(name[:40] for name in names[:20]) + (", ..." if len(names) > 20 else "") or "none"
+            raise RecordingError(f"{arguments.file}: name the columns with --input and --output: there are {shown}")
+        with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
+            return import_signals(arguments.file, rig, scenario, scenario or Scenario.load(DEFAULT_SCENARIO))
+    return import_columns(arguments.file, _described(table, arguments), scenario)
+
+
+def _table(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Settings of --map, with those of the command line in their place."""
+    from analogrig.config import read_toml
+
+    table = read_toml(arguments.map) if arguments.map else {}
+    given = {"rate_hz": arguments.rate} | {
+        name: getattr(arguments, name) for name in ("time", "bits", "first", "samples", "skip_lines")
+    }
+    table |= {name: value for name, value in given.items() if value is not None}
+    for side in _SIDES:
+        names = {"column": side, **{name: f"{side}_{name}" for name in ("unit", "scale", "range")}}
+        found = {key: value for key, name in names.items() if (value := getattr(arguments, name)) is not None}
+        if found:
+            own = table.get(side, {})
+            table[side] = (own if isinstance(own, dict) else {}) | found
+    return table
+
+
+def _described(table: dict[str, Any], arguments: argparse.Namespace) -> ImportDescription:
+    from analogrig.config import build
+    from analogrig.errors import ConfigurationError
+    from analogrig.recordings.imported import ImportDescription
+
+    where = str(arguments.map) if arguments.map else "the command line"
+    for side in _SIDES:
+        if side not in table:
+            raise ConfigurationError(f"{where}: the column of the {side} is not named: pass --{side} COLUMN")
+    return build(ImportDescription, table, where)
+
+
+def _as_json(run: Run, arguments: argparse.Namespace) -> dict[str, Any]:
+    conditions = run.conditions
+    return {
+        "file": str(arguments.out),
+        "samples": run.samples,
+        "missing": int(run.missing.sum()),
+        "rate_hz": 1.0 / conditions.sample_period_s,
+        "channels": {name: vars(channel) for name, channel in conditions.channels.items()},
+        "truth": bool(conditions.segments),
+    }
+
+
+def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
+    conditions = run.conditions
+    rate_hz = 1.0 / conditions.sample_period_s
+    lines = [f"{arguments.out}: {run.samples} samples at {rate_hz:.6g} Hz, {int(run.missing.sum())} of them missing"]
+    for name, channel in conditions.channels.items():
+        high = channel.low_v + channel.codes * channel.lsb_v
+        low, high = (volts * channel.unit_per_v for volts in (channel.low_v, high))
+        lines.append(f"{name.replace('_', ' ')}: {channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}")
+    known = f"that of scenario {conditions.scenario['name']}" if conditions.segments else "unknown: UNJUDGED"
+    return [*lines, f"truth: {known}", f"next: analogrig replay {arguments.out} --dut inproc"]

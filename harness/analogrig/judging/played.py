@@ -1,0 +1,100 @@
+"""Courses from noise-free plays of the machine of a run: any program, with its real components."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.judging.courses import Values
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors, nominal_courses
+from analogrig.run import Run
+from analogrig.scenario import Scenario
+from analogrig_emulator import Course, Courses, Moment
+
+_PREFIX = "no bound from a play of the machine: "
+
+
+class _Played:
+    """Course in LSB."""
+
+    def __init__(self, played: Course, lsb_v: float) -> None:
+        self._played, self._lsb_v = played, lsb_v
+
+    def advance(self, samples: int) -> NDArray[np.float64]:
+        with emulator_errors(_PREFIX):
+            return self._played.advance(samples) / self._lsb_v
+
+    def moment(self) -> Moment:
+        with emulator_errors(_PREFIX):
+            return self._played.moment()
+
+
+class Machine:
+    """Machine of a run, as a model of its plant."""
+
+    def __init__(self, courses: Courses, lsb_v: float) -> None:
+        self._courses, self._lsb_v = courses, lsb_v
+
+    def at_rest(self, start: int, values: Values) -> Moment:  # noqa: ARG002 - a machine plays one record
+        with emulator_errors(_PREFIX):
+            return self._courses.at_rest(values)
+
+    def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _Played:
+        with emulator_errors(_PREFIX):
+            return _Played(self._courses.course(moment, before, after, ramp_n), self._lsb_v)
+
+    def rival(self, moment: Moment, values: Values) -> _Played | None:
+        try:
+            return self.course(moment, values, values, 0)
+        except ConfigurationError:
+            return None
+
+
+class _Recorded(NamedTuple):
+    """Rig and scenario of a run, with the tables that describe them."""
+
+    tables: tuple[Mapping[str, Any], Mapping[str, Any]]
+    rig: EmulatorRig
+    scenario: Scenario
+
+
+_last: _Recorded | None = None
+"""Those of the last run: consecutive runs of a bench share their tables."""
+
+
+def machine_of(run: Run) -> Machine | None:
+    """Machine that played a run; None unless the rig was an emulator.
+
+    :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
+    """
+    conditions = run.conditions
+    if conditions.rig.get("kind") != "emulator" or len(conditions.records) > 1:
+        return None
+    recorded = _recorded(conditions.rig, conditions.scenario)
+    with emulator_errors(_PREFIX):
+        courses = recorded.rig.courses(recorded.scenario, conditions.seed, run.samples)
+    return Machine(courses, conditions.output.lsb_v)
+
+
+def nominal(scenario: Scenario, lsb_v: float) -> Machine:
+    """Machine with nominal components, sampled at the rate of the emulated card.
+
+    :raises ConfigurationError: it cannot play the excitation of the scenario.
+    """
+    with emulator_errors(f"scenario {scenario.name}: "):
+        return Machine(nominal_courses(scenario), lsb_v)
+
+
+def _recorded(rig: Mapping[str, Any], scenario: Mapping[str, Any]) -> _Recorded:
+    global _last  # noqa: PLW0603 - a cache of one entry
+    if _last is None or _last.tables[0] is not rig or _last.tables[1] is not scenario:
+        description = config.build(EmulatorDescription, config.plain(rig), "the recorded rig")
+        with emulator_errors("the recorded rig: "):
+            opened = EmulatorRig(description)
+        _last = _Recorded((rig, scenario), opened, Scenario.from_table(config.plain(scenario), "the recorded scenario"))
+    return _last

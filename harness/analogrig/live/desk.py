@@ -1,0 +1,211 @@
+"""Desk: the rig of a live session, as a hand operates it.
+
+An emulated computer is played in steps: between two blocks pots turn, relays switch and faults come and go. Any other
+rig plays one record after another, and what the hand does takes effect in the next one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.errors import ConfigurationError
+from analogrig.judging.played import Machine
+from analogrig.live.commands import Fault, Mode
+from analogrig.live.faults import ChannelFaults, labels
+from analogrig.live.knobs import Knob, knobs_of
+from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
+from analogrig.rigs.rig import Performance, Rig
+from analogrig.run import OUTPUT
+from analogrig.scenario import Scenario
+from analogrig_emulator import Mode as Relays
+from analogrig_emulator import Moment, probes_per_sample
+from analogrig_emulator.machine.patching import patches
+
+RECORD_N = 4000
+"""Samples of a record of a rig that plays records."""
+CHANGE_N = 2000
+"""Sample of a record after which the pots turn, if the hand has turned them."""
+MOST_MOMENTS = 50
+"""Turns of pots whose moments are kept."""
+
+Lengths = Callable[[], Iterator[int]]
+"""Function that yields the length of each next block when it is due."""
+
+
+class Desk(Rig):
+    """Rig of a session. The defaults are those of a rig that plays records."""
+
+    is_stepped = False
+    """True if pots turn between two blocks, and not between two records."""
+    faults: Mapping[Fault, str] = {}
+    """Faults that can be injected, with their labels."""
+    amplifiers: tuple[str, ...] = ()
+    """Amplifiers whose outputs are read."""
+    nodes: tuple[str, ...] = ()
+    """Nodes of their outputs."""
+
+    def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
+        """:raises ConfigurationError: the rig cannot play the scenario."""
+        self._rig = rig
+        self._seed = seed
+        self.performance: Performance | None = None
+        """Play under way; None before the first."""
+        self.scenario = dataclasses.replace(scenario, samples=RECORD_N, tweaks=(), random_phase=False)
+        self.capabilities = rig.capabilities
+        self.program = scenario.program
+        self.knobs: Mapping[str, Knob] = knobs_of(self.scenario.plant)
+        self.check(self.scenario)
+
+    def check(self, scenario: Scenario) -> None:
+        """:raises ConfigurationError: the rig cannot play this scenario; nothing moves."""
+        self._rig.perform(scenario, self._seed)
+
+    def check_values(self, values: Mapping[str, float]) -> None:
+        """:raises ConfigurationError: the rig's pots cannot show these values."""
+        self.check(self.scenario.with_plant(self.scenario.plant.changed(values)))
+
+    def description(self) -> Mapping[str, Any]:
+        return self._rig.description()
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        self.performance = self._rig.perform(scenario, seed)
+        return self.performance
+
+    def probed(self, samples: int) -> NDArray[np.float64]:
+        """Volts of the amplifiers in the last block, (samples, amplifiers)."""
+        return np.empty((samples, 0))
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the computer."""
+        return "OPERATE"
+
+    @property
+    def lamps(self) -> Sequence[str]:
+        """Amplifiers with a lit overload lamp."""
+        return ()
+
+
+class SteppedDesk(Desk):
+    """Emulated computer that is operated between two blocks."""
+
+    is_stepped = True
+
+    def __init__(self, rig: EmulatorRig, scenario: Scenario, seed: int, lengths: Lengths) -> None:
+        """:raises ConfigurationError: the rig cannot play the scenario."""
+        self._emulated = rig
+        self._lengths = lengths
+        self._faults: ChannelFaults | None = None
+        self._card = rig.card(scenario.program)
+        super().__init__(rig, scenario, seed)
+        self._probes_per_sample = probes_per_sample(self._card)
+        self._playing = self.scenario
+        self.moments: dict[int, Moment] = {}
+        """State of the machine at the last turns of pots, by sample."""
+        self.faults = labels(scenario.program.channels[OUTPUT].replace("_", " "))
+        self.computer = rig.set_up(self.scenario, seed).computer
+        found = patches(self.computer.circuit)
+        self.amplifiers = tuple(found)
+        self.nodes = tuple(patch.out for patch in found.values())
+
+    def check(self, scenario: Scenario) -> None:
+        set_up = self._emulated.set_up(scenario, self._seed)
+        with emulator_errors():
+            set_up.excitation.period_ticks(self._card.rate_hz)
+
+    def check_values(self, values: Mapping[str, float]) -> None:
+        with emulator_errors():
+            self.computer.dials_for(**self._emulated.pot_settings(self.scenario.plant.changed(values), values))
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        set_up = self._emulated.set_up(scenario, seed)
+        on = self.injected
+        self._playing, self.computer, self.moments = scenario, set_up.computer, {}
+        self._faults = ChannelFaults(float(self._card.lsb_v[OUTPUT]), self._card.rate_hz, np.random.default_rng(seed))
+        for fault in on:
+            self._faults.switch(fault, on=True)
+        self.performance = self._emulated.perform_in_steps(
+            set_up, self.program, seed, self._lengths(), self.nodes, self._faults.alter
+        )
+        return self.performance
+
+    def machine(self, samples: int, lsb_v: float) -> Machine:
+        """Machine of the play as a model of its plant, for so many samples.
+
+        :raises ConfigurationError: it cannot be.
+        """
+        with emulator_errors():
+            return Machine(self._emulated.courses(self._playing, self._seed, samples), lsb_v)
+
+    def probed(self, samples: int) -> NDArray[np.float64]:
+        return self.computer.probed[:: self._probes_per_sample][:samples]
+
+    def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:
+        """Turn pots after the last sample taken, to values of which these parameters have changed.
+
+        :raises ConfigurationError: a pot cannot show a value; none is turned then.
+        """
+        with emulator_errors():
+            settings = self._emulated.pot_settings(self.scenario.plant.changed(values), names)
+            self.computer.set(ramp_n * self._probes_per_sample, **settings)
+        if self.mode == "OPERATE":
+            self.moments[sample] = Moment(sample, self.computer.machine.state)
+        if len(self.moments) > MOST_MOMENTS:
+            del self.moments[min(self.moments)]
+
+    @property
+    def is_turning(self) -> bool:
+        """True while a pot turns."""
+        return self.computer.machine.is_turning
+
+    def inject(self, fault: Fault, *, on: bool) -> None:
+        """Switch a fault on or off, from the next sample on."""
+        if self._faults is not None:
+            self._faults.switch(fault, on=on)
+
+    @property
+    def injected(self) -> set[Fault]:
+        """Faults in force."""
+        return set() if self._faults is None else self._faults.on
+
+    @property
+    def mode(self) -> Mode:
+        return self.computer.machine.mode.value
+
+    def switch(self, mode: Mode) -> None:
+        """Switch the relays, through the modes between.
+
+        :raises ConfigurationError: the circuit has no solution in that mode.
+        """
+        machine, goal = self.computer.machine, Relays(mode)
+        if goal is machine.mode:
+            return
+        self.moments.clear()  # no course passes through another mode
+        is_far = {goal, machine.mode} in ({Relays.OPERATE, Relays.POT_SET}, {Relays.HOLD, Relays.POT_SET})
+        with emulator_errors():
+            if is_far:
+                machine.switch(Relays.INITIAL_CONDITION)
+            machine.switch(goal)
+
+    @property
+    def lamps(self) -> Sequence[str]:
+        return [name for name, sample in self.computer.machine.lamps.items() if sample is not None]
+
+    def clear_lamps(self) -> None:
+        """Put the overload lamps out."""
+        self.computer.machine.clear_lamps()
+
+
+def open_desk(rig: Rig, scenario: Scenario, seed: int, lengths: Lengths) -> Desk:
+    """Desk of a rig.
+
+    :raises ConfigurationError: the rig plays its own scenario only, or cannot play this one.
+    """
+    if rig.recorded is not None:
+        raise ConfigurationError("a recording has no pots to turn: name an emulated or a real rig")
+    return SteppedDesk(rig, scenario, seed, lengths) if is_emulated(rig) else Desk(rig, scenario, seed)

@@ -1,0 +1,241 @@
+"""Endpoint of other viewers, such as Foxglove, Lichtblick and PlotJuggler.
+
+The subprotocol is foxglove.websocket.v1 (github.com/foxglove/ws-protocol, docs/spec.md): channels are JSON with a
+schema, the pots are parameters. A parameter can be set while no client of the page drives.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import struct
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from websockets.exceptions import ConnectionClosed
+
+from analogrig.errors import AnalogrigError, ConfigurationError
+from analogrig.live.commands import Turn
+from analogrig.live.scope import read_signal, signals_of
+from analogrig.wording import one_line
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+
+    from analogrig.live.session import LiveSession
+
+SUBPROTOCOL = "foxglove.websocket.v1"
+
+_MESSAGE_DATA = 1
+_PERIOD_S = 0.02
+_ROWS = 8
+"""Samples of the signals that are sent in each period."""
+_MOST_SUBSCRIPTIONS = 64
+_SLOW_S = 10.0
+_WARNING, _ERROR = 1, 2
+
+_NUMBER: Mapping[str, Any] = {"type": "number"}
+_TEXT: Mapping[str, Any] = {"type": "string"}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Topic of messages in JSON."""
+
+    number: int
+    topic: str
+    properties: Mapping[str, Any]
+
+    def advertisement(self) -> dict[str, Any]:
+        """Entry of the message ``advertise``."""
+        schema = {"type": "object", "properties": self.properties}
+        return {
+            "id": self.number,
+            "topic": self.topic,
+            "encoding": "json",
+            "schemaName": f"analogrig{self.topic.replace('/', '.')}",
+            "schemaEncoding": "jsonschema",
+            "schema": json.dumps(schema),
+        }
+
+
+def channels_of(session: LiveSession) -> dict[int, Topic]:
+    """Channels of a session by number."""
+    signals = dict.fromkeys(signals_of(session), _NUMBER)
+    alarm = {"take": _NUMBER, "sample": _NUMBER, "what": _TEXT, "latency_n": _NUMBER, "bound_n": _NUMBER}
+    state = {"mode": _TEXT, "samples": _NUMBER, "speed": _NUMBER, "take": _NUMBER}
+    tables = {"/signals": {"sample": _NUMBER, **signals}, "/alarms": alarm, "/state": state}
+    return {number: Topic(number, topic, table) for number, (topic, table) in enumerate(tables.items(), 1)}
+
+
+class Viewer:
+    """One viewer at its connection."""
+
+    def __init__(self, socket: ServerConnection, session: LiveSession, *, may_set: Callable[[], bool]) -> None:
+        """:param may_set: true while a viewer may set parameters."""
+        self._socket = socket
+        self._session = session
+        self._may_set = may_set
+        self._channels = channels_of(session)
+        self._subscribed: dict[int, int] = {}
+        """Channels by number of the subscription."""
+        self._watched: set[str] = set()
+        """Parameters whose changes are reported."""
+
+    async def serve(self) -> None:
+        """Serve until the connection closes."""
+        name = f"analogrig bench: {self._session.desk.program.name}"
+        capabilities = ["parameters", "parametersSubscribe"]
+        info = {"name": name, "capabilities": capabilities, "metadata": {}, "sessionId": str(id(self._session))}
+        await self._tell("serverInfo", **info)
+        await self._tell("advertise", channels=[channel.advertisement() for channel in self._channels.values()])
+        publishing = asyncio.create_task(self._publish())
+        try:
+            async for message in self._socket:
+                await self._receive(message)
+        finally:
+            publishing.cancel()
+            await asyncio.gather(publishing, return_exceptions=True)
+
+    async def _receive(self, message: str | bytes) -> None:
+        """Carry out one message; a wrong one is answered by a status."""
+        try:
+            table = json.loads(message) if isinstance(message, str) else None
+            operation = table["op"] if isinstance(table, dict) else None
+            if not isinstance(operation, str) or operation not in _OPERATIONS:
+                await self._tell("status", level=_WARNING, message="this server has no such operation")
+                return
+            await _OPERATIONS[operation](self, table)
+        except AnalogrigError as error:
+            await self._tell("status", level=_ERROR, message=one_line(str(error)))
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+            await self._tell("status", level=_ERROR, message="the message is not as the protocol describes it")
+
+    async def _subscribe(self, table: Mapping[str, Any]) -> None:
+        for each in table["subscriptions"]:
+            number, channel = int(each["id"]), int(each["channelId"])
+            if channel not in self._channels or not 0 <= number < 1 << 32:
+                raise ValueError(channel)
+            if len(self._subscribed) < _MOST_SUBSCRIPTIONS:
+                self._subscribed[number] = channel
+
+    async def _unsubscribe(self, table: Mapping[str, Any]) -> None:
+        for number in table["subscriptionIds"]:
+            self._subscribed.pop(number, None)
+
+    async def _get_parameters(self, table: Mapping[str, Any]) -> None:
+        await self._tell_parameters(self._named(table), table.get("id"))
+
+    async def _set_parameters(self, table: Mapping[str, Any]) -> None:
+        if not self._may_set():
+            raise ConfigurationError("the page drives: close it to set parameters here")
+        names = []
+        for each in table["parameters"]:
+            name, value = str(each["name"]), each["value"]
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise TypeError(name)
+            self._session.do(Turn(name, float(value)))
+            names.append(name)
+        if table.get("id") is not None:
+            await asyncio.sleep(2 * _PERIOD_S)  # the pots turn before the next block
+            await self._tell_parameters(names, table["id"])
+
+    async def _watch_parameters(self, table: Mapping[str, Any]) -> None:
+        self._watched |= self._named(table)
+
+    async def _unwatch_parameters(self, table: Mapping[str, Any]) -> None:
+        self._watched -= self._named(table)
+
+    def _named(self, table: Mapping[str, Any]) -> set[str]:
+        """Parameters that a message names; all if it names none."""
+        known = set(self._session.knobs)
+        return known & set(map(str, table["parameterNames"])) if table["parameterNames"] else known
+
+    async def _tell_parameters(self, names: Collection[str], number: Any = None) -> None:
+        values = [
+            {"name": name, "value": value, "type": "float64"}
+            for name, value in self._session.values.items()
+            if name in names
+        ]
+        await self._tell("parameterValues", parameters=values, **({} if number is None else {"id": str(number)}))
+
+    # ---- messages of channels
+
+    async def _publish(self) -> None:
+        """Publish what is subscribed to."""
+        told: dict[str, float] = {}
+        sent_alarms, end, take = self._session.notes.alarm_count, 0, 0
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            while True:
+                await asyncio.sleep(_PERIOD_S)
+                session = self._session
+                if session.take_number != take:
+                    take, end = session.take_number, 0
+                last, end = end, session.ring.end
+                for row in self._rows(last, end) if "/signals" in self._topics() else ():
+                    await self._send("/signals", row)
+                fresh = min(session.notes.alarm_count - sent_alarms, len(session.notes.alarms))
+                sent_alarms = session.notes.alarm_count
+                for alarm in list(session.notes.alarms)[-fresh:] if fresh else ():
+                    table = {"take": alarm.take, "sample": alarm.sample, "what": alarm.what}
+                    await self._send("/alarms", table | {"latency_n": alarm.latency_n, "bound_n": alarm.bound_n})
+                if end != last:
+                    state = {"mode": session.mode, "samples": end, "speed": session.speed_hz, "take": take}
+                    await self._send("/state", state)
+                changed = {name: value for name, value in session.values.items() if told.get(name) != value}
+                told |= changed
+                if self._watched & set(changed):
+                    await self._tell_parameters(self._watched & set(changed))
+
+    def _topics(self) -> set[str]:
+        return {self._channels[number].topic for number in self._subscribed.values()}
+
+    def _rows(self, first: int, end: int) -> list[dict[str, Any]]:
+        """Samples between two ends, evenly spaced."""
+        first = max(first, end - int(self._session.sample_rate_hz), self._session.ring.start)
+        if end <= first:
+            return []
+        stride = max(1, (end - first) // _ROWS)
+        try:
+            read = {name: read_signal(self._session, name, first, end)[::stride] for name in signals_of(self._session)}
+        except LookupError:
+            return []
+        samples = range(first, end, stride)
+        return [
+            {"sample": sample, **{name: _finite(float(values[i])) for name, values in read.items()}}
+            for i, sample in enumerate(samples)
+        ]
+
+    async def _send(self, topic: str, table: Mapping[str, Any]) -> None:
+        payload = json.dumps(table, allow_nan=False).encode()
+        for number, channel in list(self._subscribed.items()):
+            if self._channels[channel].topic == topic:
+                await self._put(struct.pack("<BIQ", _MESSAGE_DATA, number, time.time_ns()) + payload)
+
+    async def _tell(self, operation: str, **table: Any) -> None:
+        await self._put(json.dumps({"op": operation, **table}))
+
+    async def _put(self, message: str | bytes) -> None:
+        try:
+            async with asyncio.timeout(_SLOW_S):
+                await self._socket.send(message)
+        except TimeoutError:
+            self._socket.transport.abort()
+            raise
+
+
+def _finite(value: float) -> float | None:
+    return value if abs(value) < float("inf") else None
+
+
+_OPERATIONS: Mapping[str, Any] = {
+    "subscribe": Viewer._subscribe,  # noqa: SLF001 - its own table
+    "unsubscribe": Viewer._unsubscribe,  # noqa: SLF001
+    "getParameters": Viewer._get_parameters,  # noqa: SLF001
+    "setParameters": Viewer._set_parameters,  # noqa: SLF001
+    "subscribeParameterUpdates": Viewer._watch_parameters,  # noqa: SLF001
+    "unsubscribeParameterUpdates": Viewer._unwatch_parameters,  # noqa: SLF001
+}

@@ -1,0 +1,181 @@
+"""Notes of a live session on what its device says: alarms with latency and bound, diagnosis, misfit, estimates."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.answers import Answers
+from analogrig.catalogue import Cause, Change
+from analogrig.devices.device import Device
+from analogrig.errors import ConfigurationError
+from analogrig.judging import information
+from analogrig.judging.courses import Model, PlantChange, first_at_level
+from analogrig.judging.linear import LinearPlant
+from analogrig.judging.verdict import DIAGNOSABLE
+from analogrig.live.desk import Desk, SteppedDesk
+from analogrig.live.ring import Ring
+from analogrig.live.take import Take
+from analogrig.plant import estimated_parameters
+from analogrig.rigs.rig import Block
+from analogrig.run import INPUT, OUTPUT, missing_samples
+
+_BOUND_AFTER_N = (64, 256, 1024)
+"""Samples after a change at which its bound is looked for."""
+_MOST_NOTED = 50
+
+
+@dataclass
+class NotedAlarm:
+    """Alarm of the device, with its latency."""
+
+    take: int
+    sample: int
+    what: str = ""
+    """Names of the changed parameters; empty: no change explains the alarm."""
+    change: int = 0
+    """Sample of the change."""
+    latency_n: int | None = None
+    bound_n: int | None = None
+    searched: int = 0
+    """Number of searches for the bound."""
+
+
+class Notes:
+    """Notes on the device's answers, written by the thread that plays."""
+
+    def __init__(self, desk: Desk, device: Device, ring: Ring, seed: int) -> None:
+        self._desk = desk
+        self._device = device
+        self._ring = ring
+        self._seed = seed
+        self._take = Take(desk.scenario)
+        self._number = 0
+        self._unfelt: list[tuple[int, float]] = []
+        """Samples that feel a turn of a pot, and the times of the turns."""
+        self.felt_s: deque[float] = deque(maxlen=1000)
+        """Times from a turn of a pot to the first answered sample that feels it."""
+        self.alarms: deque[NotedAlarm] = deque(maxlen=_MOST_NOTED)
+        self.alarm_count = 0
+        self.diagnosis = ""
+        self.misfit = ""
+        self.missing_n = 0
+
+    def begin(self, take: Take, number: int) -> None:
+        """Begin a take."""
+        self._take, self._number = take, number
+        self._unfelt = []
+        self.diagnosis, self.misfit = "", ""
+
+    def await_turn(self, sample: int, times_s: Sequence[float]) -> None:
+        """Await the first sample that feels a turn of pots, ordered at these times."""
+        self._unfelt += [(sample, at_s) for at_s in times_s]
+
+    def watch(self, block: Block, answers: Answers, now_s: float) -> bool:
+        """Take note of an answered block that is in the ring. Return True if there is news."""
+        end = self._ring.end
+        self.missing_n += int(np.count_nonzero(~block.samples().valid))
+        self.felt_s.extend(now_s - at_s for sample, at_s in self._unfelt if sample < end)
+        self._unfelt = [each for each in self._unfelt if each[0] >= end]
+        for alarm in answers.alarms:
+            self._note_alarm(alarm.index)
+        for diagnosis in answers.diagnoses:
+            named = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
+            self.diagnosis = self._desk.program.diagnosed.get(named, named)
+        for misfit in answers.misfits:
+            self.misfit = "" if misfit.cause == Cause.NONE else Cause(misfit.cause).name.lower().replace("_", " ")
+        has_searched = self._search_bounds(end)
+        return has_searched or bool(answers.alarms or answers.diagnoses or answers.misfits)
+
+    def _note_alarm(self, sample: int) -> None:
+        alarm = NotedAlarm(self._number, sample)
+        earlier = [segment for segment in self._take.segments() if segment.start < sample][-2:]
+        start, ramp_n = earlier[-1].start, earlier[-1].ramp_n
+        seen = any(each.take == self._number and each.what and each.change == start for each in self.alarms)
+        if len(earlier) > 1 and (sample <= start + ramp_n or not seen):
+            alarm.what = ", ".join(earlier[0].plant.changes_to(earlier[1].plant))
+            alarm.change = start
+            alarm.latency_n = sample - start
+        self.alarms.append(alarm)
+        self.alarm_count += 1
+
+    def _search_bounds(self, end: int) -> bool:
+        """Look for the information bounds of the changes that were detected. Return True if a search was made."""
+        has_searched = False
+        for alarm in self.alarms:
+            is_open = alarm.take == self._number and alarm.what and alarm.bound_n is None
+            if not is_open or alarm.searched >= len(_BOUND_AFTER_N):
+                continue
+            if end >= alarm.change + _BOUND_AFTER_N[alarm.searched]:
+                alarm.searched += 1
+                alarm.bound_n = self._bound(alarm.change, min(end, alarm.change + _BOUND_AFTER_N[-1]))
+                has_searched = True
+        return has_searched
+
+    def _bound(self, change: int, end: int) -> int | None:
+        """Information bound of the change at a sample, from the samples before ``end``; None: not reached, or unknown.
+
+        The course starts from the machine's own state at the change; that of a linear plant follows the input of the
+        record, which begins at rest.
+        """
+        segments, performance = self._take.segments(), self._desk.performance
+        number = next(i for i, segment in enumerate(segments) if segment.start == change)
+        end = min([end, *(segment.start for segment in segments[number + 1 :])])
+        before, after = (segment.plant.parameters() for segment in segments[number - 1 : number + 1])
+        if performance is None:
+            return None
+        program, output = self._desk.program, performance.channels[self._desk.program.channels[OUTPUT]]
+        try:
+            clipped: Any = self._ring.read("clipped", change, end)
+            model: Model
+            moment: Any
+            if isinstance(self._desk, SteppedDesk):
+                model, moment = self._desk.machine(end, output.lsb_v), self._desk.moments[change]
+            elif program.is_linear:
+                codes: Any = self._ring.read("codes", 0, end)
+                driven = performance.channels[program.channels[INPUT]].physical(codes[:, INPUT])
+                period_s = performance.sample_period_s * performance.time_scale
+                model = LinearPlant(program, driven, output.lsb, period_s)
+                unchanged = model.course(model.at_rest(0, before), before, before, 0)
+                unchanged.advance(change)
+                moment = unchanged.moment()
+            else:
+                return None
+            course_lsb = model.course(moment, before, after, segments[number].ramp_n).advance(end - change - 1)
+            weight = information.weights(missing_samples(clipped), output.noise_lsb)
+            found = information.information_of(model, PlantChange(0, before, after, moment, course_lsb), weight)
+        except (LookupError, ConfigurationError):  # no longer in the ring; or a machine that cannot play so
+            return None
+        return first_at_level(found, self._device.datasheet.log_arl0(self._take.scenario.expect.arl0))
+
+    def estimated(self, theta: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Parameters ``program.estimates`` (n, m) of estimates theta; NaN if they describe no such plant."""
+        program, sheet, performance = self._desk.program, self._device.datasheet, self._desk.performance
+        if sheet.model is None or performance is None:
+            return np.full((len(theta), len(program.estimates)), np.nan)
+        input_per_code, output_per_code = (performance.channels[name].lsb for name in program.measured)
+        period_s = performance.sample_period_s * performance.time_scale
+        return estimated_parameters(program, theta, sheet.model, input_per_code, output_per_code, period_s)
+
+    @property
+    def estimate_names(self) -> tuple[str, ...]:
+        """Parameters that the device estimates."""
+        return self._desk.program.estimates if self._device.datasheet.model is not None else ()
+
+    def estimates(self) -> dict[str, float | None]:
+        """Last estimates by parameter."""
+        end = self._ring.end
+        if not self.estimate_names or not end:
+            return {}
+        try:
+            theta: Any = self._ring.read("theta", end - 1, end)
+        except LookupError:
+            return {}
+        found = zip(self.estimate_names, self.estimated(theta)[0].tolist(), strict=True)
+        return {name: None if math.isnan(value) else value for name, value in found}

@@ -1,0 +1,763 @@
+"use strict";
+// The live bench: draws frames and states of the server, and sends what the hand does.
+(() => {
+  const COLOURS = ["first", "second", "third", "truth", "missing", "false", "ink"];
+  const BASES_S = [0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2];
+  const DIVISIONS = 5; // above and below the middle
+  const SCALES = [1, 2, 2.5, 5];
+  const KEPT = 12; // frames of the persistence
+  const RETRY_MS = 500;
+  const HAND_MS = 40; // time between two messages of a hand that turns a pot
+  const SVG = "http://www.w3.org/2000/svg";
+  const $ = (id) => document.getElementById(id);
+  const ink = plotting.inks();
+
+  let socket = null;
+  let bench = null;
+  let state = null;
+  let frame = null;
+  let frames = 0;
+  let shown = [];
+  let current = "";
+  const scales = new Map(); // of each signal: volts per division, and volts at the middle
+  let plot = null;
+  let plotKey = "";
+  let kept = [];
+  let arm = 0;
+  let number = 0;
+  const knobs = new Map();
+
+  // ---- messages
+
+  function connect() {
+    const token = new URLSearchParams(location.search).get("token") ?? "";
+    socket = new WebSocket(`ws://${location.host}/live?token=${encodeURIComponent(token)}`);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => (typeof data === "string" ? told(JSON.parse(data)) : drawn(data));
+    socket.onclose = () => {
+      document.documentElement.removeAttribute("data-connected");
+      complain("The bench does not answer. Trying again; if it was started anew, open the address that it prints.");
+      setTimeout(connect, RETRY_MS);
+    };
+  }
+
+  function send(name, table = {}) {
+    if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ do: name, id: ++number, ...table }));
+  }
+
+  function told(message) {
+    if (message.bench) {
+      bench = message.bench;
+      complain("");
+      build();
+      look();
+      document.documentElement.setAttribute("data-connected", "");
+    } else if (message.state) {
+      state = message.state;
+      show();
+    } else if (message.error) {
+      complain(message.error);
+      if (state) show();
+    } else {
+      complain("");
+    }
+  }
+
+  function complain(text) {
+    $("trouble").textContent = text;
+    $("trouble").hidden = !text;
+  }
+
+  // ---- numbers
+
+  function short(value, digits = 4) {
+    if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+    if (Math.abs(value) >= 1e6) return value.toExponential(digits - 1);
+    return String(Number(value.toPrecision(digits)));
+  }
+
+  function withPrefix(value, unit) {
+    if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+    const [prefix, factor] = Math.abs(value) >= 1 ? ["", 1] : Math.abs(value) >= 1e-3 ? ["m", 1e3] : ["µ", 1e6];
+    return Math.abs(value) >= 1e3 ? `${short(value / 1e3)} k${unit}` : `${short(value * factor)} ${prefix}${unit}`;
+  }
+
+  function signal(id) {
+    return bench.signals.find((each) => each.id === id) ?? { id, label: id, unit: "", per_volt: 1, group: "device" };
+  }
+
+  function unitOf(id) {
+    const { unit, group } = signal(id);
+    if (group === "device") return "";
+    return $("units").value === "problem" && unit ? unit : "V";
+  }
+
+  function factorOf(id) {
+    const { unit, per_volt: perVolt, group } = signal(id);
+    return group !== "device" && $("units").value === "problem" && unit ? perVolt : 1;
+  }
+
+  function reading(id, value) {
+    const unit = unitOf(id);
+    return value === null ? "–" : `${short(value * factorOf(id))}${unit ? ` ${unit}` : ""}`;
+  }
+
+  function scaleOf(id) {
+    if (!scales.has(id)) scales.set(id, { per: signal(id).group === "device" ? 0 : 2.5, middle: 0 });
+    return scales.get(id);
+  }
+
+  function colourOf(id) {
+    return COLOURS[shown.indexOf(id) % COLOURS.length];
+  }
+
+  // ---- the page, built once for each bench
+
+  function option(select, value, text) {
+    const made = new Option(text, value);
+    select.append(made);
+    return made;
+  }
+
+  function build() {
+    $("what").textContent = `${bench.program} on ${bench.rig}, device ${bench.dut}`;
+    shown = shown.filter((id) => bench.signals.some((each) => each.id === id));
+    if (!shown.length) shown = bench.signals.slice(0, 2).map(({ id }) => id);
+    if (!shown.includes(current)) [current] = shown;
+    if (!$("source").value) $("level").value = short(bench.level);
+    const base = $("base").value;
+    $("base").replaceChildren();
+    for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")} per division`);
+    $("base").value = base || "0.02";
+    const source = $("source").value;
+    $("source").replaceChildren();
+    for (const { id, label } of bench.signals) option($("source"), id, label);
+    $("source").value = source || shown[0];
+    buildKnobs();
+    buildModes();
+    buildFaults();
+    buildPatch();
+    buildSignals();
+  }
+
+  function buildKnobs() {
+    knobs.clear();
+    $("knobs").replaceChildren();
+    for (const knob of bench.knobs) {
+      const made = new Knob(knob);
+      knobs.set(knob.name, made);
+      $("knobs").append(made.element);
+    }
+  }
+
+  function buildModes() {
+    $("machine").hidden = !bench.modes.length;
+    $("step").hidden = !bench.stepped;
+    $("tempo").disabled = !bench.stepped;
+    $("modes").replaceChildren();
+    for (const mode of bench.modes) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = mode.toLowerCase();
+      button.dataset.mode = mode;
+      button.onclick = () => send("operate", { mode });
+      $("modes").append(button);
+    }
+  }
+
+  function buildFaults() {
+    const names = Object.entries(bench.faults);
+    $("fault-section").hidden = !names.length;
+    $("faults").replaceChildren();
+    for (const [fault, label] of names) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = label;
+      button.dataset.fault = fault;
+      button.onclick = () => send("inject", { fault, on: button.getAttribute("aria-pressed") !== "true" });
+      $("faults").append(button);
+    }
+  }
+
+  function cell(row, text, kind = "") {
+    const made = row.insertCell();
+    made.textContent = text;
+    made.className = kind;
+    return made;
+  }
+
+  function buildSignals() {
+    const body = $("signals").tBodies[0];
+    body.replaceChildren();
+    for (const id of shown) {
+      const { label } = signal(id);
+      const row = body.insertRow();
+      row.dataset.signal = id;
+      const head = document.createElement("th");
+      head.scope = "row";
+      const swatch = document.createElement("span");
+      swatch.className = "swatch";
+      swatch.style.borderTopColor = `var(--${colourOf(id)})`;
+      const name = document.createElement("button");
+      name.type = "button";
+      name.textContent = label;
+      name.title = "axis and cursors show this signal";
+      name.onclick = () => {
+        current = id;
+        buildSignals();
+        redraw();
+      };
+      const remove = document.createElement("button");
+      remove.type = "button";
+      remove.textContent = "×";
+      remove.setAttribute("aria-label", `remove ${label}`);
+      remove.onclick = () => toggle(id);
+      head.append(swatch, name, " ", remove);
+      row.append(head);
+      row.setAttribute("aria-current", String(id === current));
+      cell(row, "").append(field(id, "per", `${label}: per division`), ` ${unitOf(id)}`);
+      cell(row, "").append(field(id, "middle", `${label}: at the middle`), ` ${unitOf(id)}`);
+      for (let i = 0; i < 6; i++) cell(row, "–", "number");
+    }
+    $("add").replaceChildren();
+    option($("add"), "", "choose");
+    for (const { id, label } of bench.signals) if (!shown.includes(id)) option($("add"), id, label);
+    document.querySelectorAll("#patch g[role=button]").forEach((each) => {
+      each.setAttribute("aria-pressed", String(shown.includes(each.dataset.probe)));
+    });
+  }
+
+  function field(id, key, label) {
+    const input = document.createElement("input");
+    input.type = "number";
+    input.step = "any";
+    input.className = "short";
+    input.setAttribute("aria-label", label);
+    input.value = short(scaleOf(id)[key] * factorOf(id), 5);
+    input.onchange = () => {
+      const value = Number(input.value) / factorOf(id);
+      if (Number.isFinite(value) && (key === "middle" || value > 0)) scaleOf(id)[key] = value;
+      input.value = short(scaleOf(id)[key] * factorOf(id), 5);
+      redraw();
+    };
+    return input;
+  }
+
+  function toggle(id) {
+    if (shown.includes(id)) {
+      if (shown.length === 1) return;
+      shown = shown.filter((each) => each !== id);
+    } else {
+      shown = [...shown, id].slice(-16);
+    }
+    if (!shown.includes(current)) [current] = shown;
+    buildSignals();
+    look();
+  }
+
+  // ---- pots
+
+  class Knob {
+    constructor(knob) {
+      this.knob = knob;
+      this.value = knob.low;
+      this.held = false;
+      this.due = 0;
+      const { name, unit, pots } = knob;
+      this.element = document.createElement("div");
+      this.element.className = "knob";
+      this.slider = document.createElement("div");
+      this.slider.setAttribute("role", "slider");
+      this.slider.tabIndex = 0;
+      this.slider.dataset.parameter = name;
+      const attributes = { label: `parameter ${name}`, valuemin: knob.low, valuemax: knob.high, orientation: "vertical" };
+      for (const [name, value] of Object.entries(attributes)) this.slider.setAttribute(`aria-${name}`, value);
+      this.slider.innerHTML = `<svg viewBox="-50 -50 100 100" aria-hidden="true"><path class="track"/><path class="value"/><circle class="cap" r="30"/><line class="hand" x1="0" y1="-14" x2="0" y2="-27"/></svg>`;
+      this.slider.querySelector(".track").setAttribute("d", arc(1));
+      const title = document.createElement("label");
+      this.input = document.createElement("input");
+      this.input.type = "number";
+      this.input.step = "any";
+      title.append(`${name}${unit ? `, ${unit}` : ""}`, this.input);
+      const limits = document.createElement("small");
+      limits.textContent = `${short(knob.low, 3)} to ${short(knob.high, 3)}, pot ${pots.join(", ")}`;
+      this.element.append(this.slider, title, limits);
+      this.slider.onkeydown = (event) => this.key(event);
+      this.slider.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+      this.slider.onpointerdown = (event) => this.grasp(event);
+      this.input.onchange = () => {
+        const value = Number(this.input.value);
+        if (this.input.value !== "" && Number.isFinite(value)) this.turn(value);
+        else this.show(this.value);
+      };
+    }
+
+    get fraction() {
+      return Math.log(this.value / this.knob.low) / Math.log(this.knob.high / this.knob.low);
+    }
+
+    show(value) {
+      this.value = value;
+      const { unit, name } = this.knob;
+      this.slider.setAttribute("aria-valuenow", String(value));
+      this.slider.setAttribute("aria-valuetext", `${name} ${short(value, 5)} ${unit}`.trimEnd());
+      this.slider.querySelector(".value").setAttribute("d", arc(this.fraction));
+      this.slider.querySelector(".hand").setAttribute("transform", `rotate(${-135 + 270 * this.fraction})`);
+      if (document.activeElement !== this.input) this.input.value = short(value, 6);
+    }
+
+    turn(value, ramp = 0) {
+      const { low, high, name } = this.knob;
+      const within = Math.min(Math.max(value, low), high);
+      this.input.blur();
+      this.show(within);
+      send("turn", { name, value: within, ramp_n: ramp });
+    }
+
+    key(event) {
+      const steps = { ArrowUp: 1, ArrowRight: 1, ArrowDown: -1, ArrowLeft: -1, PageUp: 10, PageDown: -10 };
+      const ends = { Home: this.knob.low, End: this.knob.high };
+      if (event.key in steps) this.turn(this.value * 1.01 ** (steps[event.key] * (event.shiftKey ? 0.1 : 1)));
+      else if (event.key in ends) this.turn(ends[event.key]);
+      else return;
+      event.preventDefault();
+    }
+
+    wheel(event) {
+      event.preventDefault();
+      this.turn(this.value * 1.01 ** (event.deltaY < 0 ? 1 : -1));
+    }
+
+    // A ramp lasts until the next message of the hand, so that the pot follows it evenly.
+    grasp(event) {
+      if (this.slider.getAttribute("aria-disabled") === "true") return;
+      this.held = true;
+      this.slider.setPointerCapture(event.pointerId);
+      let [y, fraction, sent] = [event.clientY, this.fraction, 0];
+      const { low, high } = this.knob;
+      const move = (moved, last = false) => {
+        fraction = Math.min(1, Math.max(0, fraction + (y - moved.clientY) / (moved.shiftKey ? 2000 : 250)));
+        y = moved.clientY;
+        const value = low * (high / low) ** fraction;
+        this.show(value);
+        if (last || performance.now() - sent >= HAND_MS) {
+          sent = performance.now();
+          const ramp = bench.stepped && state ? Math.round((state.rate / state.factor) * (HAND_MS / 1000)) : 0;
+          this.turn(value, Math.min(ramp, 100000));
+        }
+      };
+      this.slider.onpointermove = (moved) => moved.clientY !== y && move(moved);
+      this.slider.onpointerup = this.slider.onpointercancel = (moved) => {
+        this.slider.onpointermove = null;
+        if (sent) move(moved, true);
+        this.held = false;
+      };
+    }
+  }
+
+  function arc(fraction) {
+    const at = (part) => {
+      const angle = ((-225 + 270 * part) * Math.PI) / 180;
+      return `${(42 * Math.cos(angle)).toFixed(2)} ${(42 * Math.sin(angle)).toFixed(2)}`;
+    };
+    return `M${at(0)}A42 42 0 ${fraction > 2 / 3 ? 1 : 0} 1 ${at(Math.max(fraction, 0.002))}`;
+  }
+
+  // ---- the patch
+
+  function svg(parent, name, attributes, text = "") {
+    const made = document.createElementNS(SVG, name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    made.textContent = text;
+    parent.append(made);
+    return made;
+  }
+
+  function buildPatch() {
+    $("patch-section").hidden = !bench.patch.length;
+    const drawing = $("patch");
+    drawing.replaceChildren();
+    let y = 12;
+    for (const row of bench.patch) {
+      const height = 30 * Math.max(1, row.inputs.length);
+      const label = `${row.name}, ${row.kind}${row.quantity ? `, ${row.quantity}` : ""}`;
+      const group = svg(drawing, "g", { role: "button", tabindex: 0, "data-probe": row.name, "aria-label": `probe ${label}` });
+      svg(group, "rect", { x: 0, y: y - 6, width: 620, height: height + 12, fill: "transparent" });
+      row.inputs.forEach((input, i) => {
+        const middle = y + 30 * i + 15;
+        svg(group, "text", { x: 8, y: middle + 4 }, input.node);
+        svg(group, "path", { class: "wire", d: `M60 ${middle}H240` });
+        if (input.pot) {
+          svg(group, "circle", { class: "body", cx: 110, cy: middle, r: 12 });
+          svg(group, "text", { x: 110, y: middle + 4, "text-anchor": "middle" }, input.pot);
+        }
+        svg(group, "text", { x: 150, y: middle - 4, class: "small" }, withPrefix(input.ohm, "Ω"));
+      });
+      svg(group, "path", { class: "body", d: `M240 ${y}L310 ${y + height / 2}L240 ${y + height}Z` });
+      if (row.farad) svg(group, "rect", { class: "body", x: 234, y, width: 6, height });
+      svg(group, "path", { class: "wire", d: `M310 ${y + height / 2}H340` });
+      svg(group, "text", { x: 248, y: y + height / 2 + 4, class: "small" }, row.name);
+      svg(group, "text", { x: 348, y: y + height / 2 + 4 }, `${row.node}${row.quantity ? `: ${row.quantity}` : ""}`);
+      svg(group, "text", { x: 540, y: y + height / 2 + 4, "data-volts": row.name, "text-anchor": "end" }, "–");
+      group.onclick = () => toggle(row.name);
+      group.onkeydown = (event) => {
+        if (event.key !== "Enter" && event.key !== " ") return;
+        event.preventDefault();
+        toggle(row.name);
+      };
+      y += height + 18;
+    }
+    drawing.setAttribute("width", 620);
+    drawing.setAttribute("height", y);
+  }
+
+  // ---- the state
+
+  function show() {
+    if (!bench) return;
+    const drives = state.drives;
+    $("role").textContent = drives
+      ? `This page drives the bench.${state.generator.on ? "" : " The generator is off: switch it on."}`
+      : state.driven
+        ? "This page watches: another one drives."
+        : "Nobody drives the bench.";
+    $("drive").hidden = state.driven;
+    document.documentElement.dataset.role = drives ? "drives" : "watches";
+    const mine = "#play, #step, #restart, #tempo, #record, #generator *, #modes button, #faults button, #clear-lamps";
+    for (const each of document.querySelectorAll(mine)) each.disabled = !drives;
+    if (!bench.stepped) $("tempo").disabled = true;
+    pressed("play", state.playing, state.playing ? "Pause" : "Run");
+    pressed("record", state.recording, state.recording ? "End the recording" : "Record");
+    pressed("generator-on", state.generator.on, state.generator.on ? "Switch off" : "Switch on");
+    if (document.activeElement !== $("tempo")) $("tempo").value = String(state.factor);
+    $("clock").textContent = `take ${state.take}, ${withPrefix(state.samples / state.rate, "s")}, ${state.samples} samples`;
+    for (const [name, knob] of knobs) {
+      knob.input.disabled = !drives;
+      knob.slider.setAttribute("aria-disabled", String(!drives));
+      if (!knob.held && state.values[name] !== undefined) knob.show(state.values[name]);
+    }
+    for (const each of document.querySelectorAll("#generator [data-key]")) {
+      const value = state.generator[each.dataset.key];
+      if (document.activeElement !== each) each.value = typeof value === "number" ? short(value, 6) : value;
+      if (each.dataset.key === "duty") each.disabled ||= state.generator.shape !== "pulse";
+    }
+    for (const each of $("modes").children) each.setAttribute("aria-pressed", String(each.dataset.mode === state.mode));
+    for (const each of $("faults").children) each.setAttribute("aria-pressed", String(state.faults.includes(each.dataset.fault)));
+    $("lamps").textContent = state.lamps.length ? state.lamps.join(", ") : "none";
+    $("lamps").classList.toggle("lit", state.lamps.length > 0);
+    for (const [name, volts] of Object.entries(state.volts)) {
+      const text = $("patch").querySelector(`[data-volts="${name}"]`);
+      if (text) text.textContent = `${volts.toFixed(2)} V`;
+    }
+    showDevice();
+    const notices = state.notices.map(([, text]) => text).reverse();
+    const files = state.saved.map(({ run }) => `analogrig replay ${run}`);
+    list($("notices"), [...notices, ...files.map((text) => `to play it again: ${text}`)]);
+  }
+
+  function pressed(id, on, text) {
+    $(id).setAttribute("aria-pressed", String(on));
+    if ($(id).textContent !== text) $(id).textContent = text;
+  }
+
+  function list(parent, texts) {
+    const wanted = texts.length ? texts : ["none"];
+    if (wanted.join("\n") === parent.dataset.texts) return;
+    parent.dataset.texts = wanted.join("\n");
+    parent.replaceChildren(...wanted.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  }
+
+  function showDevice() {
+    const alarms = [...state.alarms].reverse();
+    const [last] = alarms;
+    const place = last && (last.what ? `${last.what} changed: alarm ${last.latency_n} samples later` : "no change explains it");
+    const bound = last && last.bound_n !== null ? `, bound ${last.bound_n}` : "";
+    const text = last ? `alarm at sample ${last.sample}: ${place}${bound}` : "no alarm yet";
+    if ($("alarm").textContent !== text) $("alarm").textContent = text;
+    rows($("alarms"), alarms, (row, alarm) => {
+      cell(row, alarm.take);
+      cell(row, alarm.sample, "number");
+      cell(row, alarm.what || "none", alarm.what ? "text" : "text bad");
+      cell(row, alarm.latency_n ?? "–", "number");
+      cell(row, alarm.bound_n ?? "–", "number");
+    });
+    $("estimates").hidden = !state.estimates.length;
+    rows($("estimates"), state.estimates, (row, { name, estimate, truth }) => {
+      const head = document.createElement("th");
+      head.scope = "row";
+      head.textContent = name;
+      row.append(head);
+      cell(row, short(estimate, 5), "number");
+      cell(row, short(truth, 5), "number");
+      const error = truth && estimate !== null ? 100 * (estimate / truth - 1) : null;
+      cell(row, error === null ? "–" : `${error.toFixed(2)} %`, "number");
+    });
+    const ceiling = bench.ceiling;
+    $("statistic").textContent = ceiling === null ? short(state.statistic) : `${short(state.statistic)} of ${short(ceiling)}`;
+    const part = ceiling ? Math.min(1, Math.max(0, state.statistic / ceiling)) : 0;
+    $("meter").style.width = `${100 * part}%`;
+    $("meter").classList.toggle("high", part >= 1);
+    $("diagnosis").textContent = bench.diagnoses ? state.diagnosis || "none" : "not reported";
+    $("misfit").textContent = bench.misfits ? state.misfit || "none" : "not reported";
+    $("speed").textContent = short(state.speed, 5);
+    $("overruns").textContent = state.overruns;
+    $("missing").textContent = state.missing;
+    $("felt").textContent = state.felt_ms === null ? "–" : `${state.felt_ms} ms`;
+    const counters = Object.entries(state.counters).map(([name, count]) => `${count} ${name.replaceAll("_", " ")}`);
+    $("counters").textContent = counters.join(", ") || "–";
+  }
+
+  function rows(table, items, fill) {
+    const key = JSON.stringify(items);
+    if (table.dataset.key === key) return;
+    table.dataset.key = key;
+    table.tBodies[0].replaceChildren();
+    for (const item of items) fill(table.tBodies[0].insertRow(), item);
+  }
+
+  // ---- the screen
+
+  function look() {
+    const rate = state?.rate ?? 20000;
+    const samples = Math.min(65536, Math.max(16, Math.round(Number($("base").value) * rate)));
+    const trigger = {
+      source: $("source").value,
+      slope: $("slope").value,
+      level: Number($("level").value) / factorOf($("source").value),
+      mode: $("mode").value,
+      position: Number($("position").value),
+    };
+    const columns = Math.min(4000, Math.max(200, Math.round($("screen").clientWidth || 800)));
+    const kind = $("kind").value;
+    kept = [];
+    $("arm").hidden = $("mode").value !== "single";
+    $("level-unit").textContent = unitOf($("source").value);
+    $("screen").hidden = kind === "xy";
+    $("xy").hidden = kind !== "xy";
+    $("cursor-panel").hidden = !$("cursors").checked || kind === "xy";
+    $("screen").setAttribute("aria-label", kind === "fft" ? "Spectrum of the signals" : "Signals over time");
+    send("view", { signals: shown, samples, columns, kind, trigger, arm });
+  }
+
+  function drawn(buffer) {
+    const length = new DataView(buffer).getUint32(0, true);
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+    const values = {};
+    header.signals.forEach((id, i) => {
+      values[id] = new Float32Array(buffer, 4 + length + 4 * i * header.points, header.points);
+    });
+    frame = { ...header, values };
+    frames += 1;
+    if ($("persist").checked) kept = [...kept.slice(1 - KEPT), frame];
+    requestAnimationFrame(redraw);
+  }
+
+  function redraw() {
+    if (!frame || !frame.signals.every((id) => shown.includes(id))) return;
+    for (const id of frame.signals) if (!scaleOf(id).per) fit(id);
+    if (frame.kind === "xy") drawXy();
+    else drawPlot();
+    showMeasures();
+    if (!$("cursor-panel").hidden) showCursors();
+    $("triggered").textContent = frame.kind === "fft" ? "" : frame.trigger === null ? "no trigger" : "triggered";
+    document.documentElement.setAttribute("data-drawn", "");
+    document.documentElement.dataset.frames = frames;
+  }
+
+  function fit(id) {
+    let [low, high] = [Infinity, -Infinity];
+    for (const value of frame.values[id]) {
+      if (Number.isFinite(value)) [low, high] = [Math.min(low, value), Math.max(high, value)];
+    }
+    if (low > high) return;
+    const least = Math.max(high - low, 0.02 * Math.abs(high), 1e-9) / 8;
+    const decade = 10 ** Math.floor(Math.log10(least));
+    const per = [...SCALES, 10].map((step) => step * decade).find((step) => step >= least);
+    scales.set(id, { per, middle: Math.round((low + high) / 2 / per) * per });
+  }
+
+  function times(of) {
+    const [step, zero] = of.kind === "fft" ? [of.step, 0] : [1000 / of.rate, of.first - (of.trigger ?? of.first)];
+    return Array.from({ length: of.points }, (_, i) => (zero + i * of.per) * step);
+  }
+
+  function heights(of, id) {
+    const { per, middle } = of.kind === "fft" ? { per: 20, middle: -60 } : scaleOf(id);
+    return Array.from(of.values[id], (value) => (Number.isFinite(value) ? (value - middle) / per : null));
+  }
+
+  function drawPlot() {
+    const box = $("screen");
+    const key = [frame.kind, frame.signals.join(), box.clientWidth, box.clientHeight, current, $("units").value, dark()].join(";");
+    const data = [times(frame), ...frame.signals.map((id) => heights(frame, id))];
+    if (key === plotKey) {
+      plot.setData(data, false);
+      plot.setScale("x", { min: data[0][0], max: data[0][data[0].length - 1] });
+      return;
+    }
+    plotKey = key;
+    plot?.destroy();
+    box.replaceChildren();
+    const isSpectrum = frame.kind === "fft";
+    const title = isSpectrum ? "dB of 1 V rms" : `${signal(current).label}${unitOf(current) ? `, ${unitOf(current)}` : ""}`;
+    const ticks = (_, splits) =>
+      splits.map((at) => {
+        const { per, middle } = isSpectrum ? { per: 20, middle: -60 } : scaleOf(current);
+        return short((at * per + middle) * (isSpectrum ? 1 : factorOf(current)), 3);
+      });
+    const vertical = Array.from({ length: 2 * DIVISIONS + 1 }, (_, i) => i - DIVISIONS);
+    const curves = frame.signals.map((id) => plotting.curve(id, ink(colourOf(id)), { unit: "", width: id === current ? 2 : 1.5 }));
+    plot = new uPlot(
+      {
+        width: box.clientWidth,
+        height: box.clientHeight,
+        cursor: { show: false },
+        legend: { show: false },
+        scales: { x: { time: false }, y: { range: [-DIVISIONS, DIVISIONS] } },
+        series: [{}, ...curves],
+        axes: [
+          plotting.axis("x", isSpectrum ? "frequency, Hz" : "time, ms", 2, ink, {}),
+          plotting.axis("y", title, 3, ink, { size: 70, splits: () => vertical, values: ticks }),
+        ],
+        hooks: { drawAxes: [drawKept], draw: [drawMarks] },
+      },
+      data,
+      box,
+    );
+  }
+
+  function dark() {
+    return matchMedia("(prefers-color-scheme: dark)").matches;
+  }
+
+  function drawKept(u) {
+    u.ctx.save();
+    u.ctx.globalAlpha = 0.25;
+    u.ctx.lineWidth = devicePixelRatio;
+    for (const old of kept.slice(0, -1)) {
+      if (old.signals.join() !== frame.signals.join() || old.kind !== frame.kind) continue;
+      const at = times(old);
+      for (const id of old.signals) {
+        u.ctx.strokeStyle = ink(colourOf(id));
+        u.ctx.beginPath();
+        heights(old, id).forEach((y, i) => y !== null && u.ctx.lineTo(u.valToPos(at[i], "x", true), u.valToPos(y, "y", true)));
+        u.ctx.stroke();
+      }
+    }
+    u.ctx.restore();
+  }
+
+  function drawMarks(u) {
+    if (frame.kind === "yt" && frame.trigger !== null) {
+      plotting.verticals(u, [{ at: 0 }], { colour: ink("muted"), width: 1, dash: [2, 4] });
+    }
+    if (!$("cursors").checked) return;
+    const at = times(frame);
+    for (const [id, dash] of [["cursor-a", [6, 3]], ["cursor-b", [2, 3]]]) {
+      const place = at[0] + Number($(id).value) * (at[at.length - 1] - at[0]);
+      plotting.verticals(u, [{ at: place }], { colour: ink("ink"), width: 1.5, dash });
+    }
+  }
+
+  function showCursors() {
+    const at = times(frame);
+    const places = ["cursor-a", "cursor-b"].map((id) => Math.round(Number($(id).value) * (at.length - 1)));
+    const [a, b] = places.map((i) => frame.values[current][i]);
+    const apart = at[places[1]] - at[places[0]];
+    if (frame.kind === "fft") {
+      $("cursor-text").textContent = `A ${short(a)} dB, B ${short(b)} dB; B − A: ${withPrefix(apart, "Hz")}, ${short(b - a)} dB`;
+      return;
+    }
+    const pace = apart ? `, 1/Δt ${withPrefix(Math.abs(1000 / apart), "Hz")}` : "";
+    $("cursor-text").textContent =
+      `${signal(current).label}: A ${reading(current, a)}, B ${reading(current, b)}; ` +
+      `B − A: ${withPrefix(apart / 1000, "s")}${pace}, ${reading(current, b - a)}`;
+  }
+
+  function drawXy() {
+    const canvas = $("xy");
+    const px = devicePixelRatio;
+    [canvas.width, canvas.height] = [canvas.clientWidth * px, canvas.clientHeight * px];
+    const context = canvas.getContext("2d");
+    const [x, y] = [frame.signals[0], frame.signals[1] ?? frame.signals[0]];
+    const size = Math.min(canvas.width, canvas.height);
+    const place = (value, length, sign) => length / 2 + (sign * value * size) / (2 * DIVISIONS);
+    context.strokeStyle = ink("line");
+    for (let i = -DIVISIONS; i <= DIVISIONS; i++) {
+      context.strokeRect(place(i, canvas.width, 1), place(-DIVISIONS, canvas.height, 1), 0, size);
+      context.strokeRect(place(-DIVISIONS, canvas.width, 1), place(i, canvas.height, 1), size, 0);
+    }
+    for (const each of kept.length ? kept.filter(({ kind }) => kind === "xy") : [frame]) {
+      const [h, v] = [heights(each, x), heights(each, y)];
+      context.globalAlpha = each === frame ? 1 : 0.25;
+      context.strokeStyle = ink("first");
+      context.lineWidth = 1.5 * px;
+      context.beginPath();
+      h.forEach((value, i) => {
+        if (value !== null && v[i] !== null) context.lineTo(place(value, canvas.width, 1), place(v[i], canvas.height, -1));
+      });
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+    context.fillStyle = ink("muted");
+    context.font = `${12 * px}px system-ui, sans-serif`;
+    context.fillText(`X ${signal(x).label}, Y ${signal(y).label}`, 8 * px, 16 * px);
+  }
+
+  function showMeasures() {
+    for (const row of $("signals").tBodies[0].rows) {
+      const id = row.dataset.signal;
+      const found = frame.measures?.[id];
+      if (!found) continue;
+      const texts = ["min", "max", "mean", "rms"].map((key) => reading(id, found[key]));
+      texts.push(withPrefix(found.frequency, "Hz"), found.overshoot === null ? "–" : `${(100 * found.overshoot).toFixed(1)} %`);
+      texts.forEach((text, i) => (row.cells[3 + i].textContent = text));
+    }
+  }
+
+  // ---- the hand
+
+  function listen() {
+    $("play").onclick = () => send("play", { on: !state.playing });
+    $("step").onclick = () => send("step", { samples: 1 });
+    $("drive").onclick = () => send("drive");
+    $("restart").onclick = () => send("restart");
+    $("tempo").onchange = () => send("tempo", { factor: Number($("tempo").value) });
+    $("record").onclick = () => send("record", { on: !state.recording });
+    $("generator-on").onclick = () => send("generate", { on: !state.generator.on });
+    $("clear-lamps").onclick = () => send("clear lamps");
+    for (const each of document.querySelectorAll("#generator [data-key]")) {
+      each.onchange = () => {
+        const value = each.type === "number" ? Number(each.value) : each.value;
+        each.blur();
+        send("generate", { [each.dataset.key]: value });
+      };
+    }
+    for (const id of ["kind", "base", "source", "slope", "level", "mode", "position", "cursors"]) $(id).onchange = look;
+    $("mode").onchange = $("arm").onclick = () => {
+      arm += 1;
+      look();
+    };
+    $("units").onchange = () => {
+      buildSignals();
+      look();
+      redraw();
+    };
+    $("add").onchange = () => $("add").value && toggle($("add").value);
+    $("persist").onchange = () => {
+      kept = [];
+    };
+    $("cursor-a").oninput = $("cursor-b").oninput = redraw;
+    $("autoscale").onclick = () => {
+      if (!frame) return;
+      for (const id of frame.signals) fit(id);
+      buildSignals();
+      redraw();
+    };
+    new ResizeObserver(() => bench && look()).observe($("screen"));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  }
+
+  listen();
+  connect();
+})();

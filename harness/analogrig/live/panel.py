@@ -1,0 +1,124 @@
+"""Panel of a live bench: what does not change, and the state, as plain values for clients."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from analogrig.live.desk import SteppedDesk
+from analogrig.live.scope import signals_of
+from analogrig.live.session import LiveSession
+from analogrig_emulator import Capacitor, Pot, Resistor
+from analogrig_emulator.machine.patching import patches
+
+
+def bench_table(session: LiveSession) -> dict[str, Any]:
+    """Names, limits and drawing of the bench."""
+    desk, device = session.desk, session.device
+    return {
+        "rig": str(desk.description().get("name", "")),
+        "program": desk.program.name,
+        "dut": device.name,
+        "link": device.link_name,
+        "time_scale": desk.program.circuit.scales.time,
+        "stepped": desk.is_stepped,
+        "modes": ["POT SET", "INITIAL CONDITION", "HOLD", "OPERATE"] if desk.is_stepped else [],
+        "faults": dict(desk.faults),
+        "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
+        "level": (session.excitation.low_v + session.excitation.high_v) / 2.0,
+        "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
+        "patch": patch_rows(session),
+        "ceiling": device.datasheet.ceiling,
+        "diagnoses": device.datasheet.diagnoses and bool(desk.program.diagnosed),
+        "misfits": device.datasheet.misfits,
+    }
+
+
+def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
+    """Amplifiers of the patch: kind, output node and quantity, and for each input its node, pot and resistor."""
+    desk = session.desk
+    if not isinstance(desk, SteppedDesk):
+        return []
+    circuit = desk.computer.circuit
+    pots = {pot.wiper: pot for pot in circuit.of(Pot)}
+    resistors = {each.name: each for each in circuit.of(Resistor)}
+    quantities = {scale.node: (name, scale.sign) for name, scale in desk.computer.program.scales.quantities.items()}
+    out = []
+    for name, patch in patches(circuit).items():
+        inputs = []
+        for element in patch.inputs:
+            if (resistor := resistors.get(element)) is None:
+                continue
+            node = resistor.b if resistor.a == patch.junction else resistor.a
+            pot = pots.get(node)
+            source = node if pot is None else pot.top
+            inputs.append({"node": source, "pot": "" if pot is None else pot.name, "ohm": resistor.ohm})
+        farad = sum(each.farad for each in circuit.of(Capacitor) if each.name in patch.capacitors)
+        is_integrator = name in desk.computer.program.integrators
+        quantity, sign = quantities.get(patch.out, ("", 1.0))
+        out.append(
+            {
+                "name": name,
+                "kind": "integrator" if is_integrator else "summer" if len(inputs) > 1 else "inverter",
+                "farad": farad if is_integrator else 0.0,
+                "node": patch.out,
+                "quantity": f"{'-' if sign < 0 else ''}{quantity.replace('_', ' ')}",
+                "inputs": inputs,
+            }
+        )
+    return out
+
+
+def state_table(session: LiveSession) -> dict[str, Any]:
+    """State of the bench."""
+    take = session.take
+    truth = take.segments()[-1].plant.parameters()
+    estimates = session.notes.estimates()
+    end = session.ring.end
+    return {
+        "version": session.version,
+        "take": session.take_number,
+        "samples": end,
+        "playing": session.is_playing,
+        "factor": session.factor,
+        "speed": session.speed_hz,
+        "rate": session.sample_rate_hz,
+        "overruns": session.overruns_n,
+        "missing": session.notes.missing_n,
+        "mode": session.mode,
+        "lamps": list(session.lamps),
+        "values": dict(session.values),
+        "generator": {"on": session.is_on, **dataclasses.asdict(session.excitation)},
+        "faults": sorted(session.injected),
+        "estimates": [{"name": name, "estimate": value, "truth": truth.get(name)} for name, value in estimates.items()],
+        "statistic": _last(session, "statistic"),
+        "volts": _volts(session),
+        "diagnosis": session.notes.diagnosis,
+        "misfit": session.notes.misfit,
+        "counters": {name: count for name, count in session.counters.items() if count},
+        "alarms": [dataclasses.asdict(alarm) for alarm in list(session.notes.alarms)[-12:]],
+        "alarm_count": session.notes.alarm_count,
+        "recording": session.is_recording,
+        "saved": [{"run": str(each.run), "scenario": str(each.scenario)} for each in list(session.saved)[-3:]],
+        "notices": list(session.notices)[-3:],
+        "felt_ms": round(1e3 * session.notes.felt_s[-1], 1) if session.notes.felt_s else None,
+    }
+
+
+def _last(session: LiveSession, column: str) -> float | None:
+    """Last value of a column of the ring."""
+    end = session.ring.end
+    try:
+        return float(session.ring.read(column, end - 1, end)[0])
+    except LookupError:
+        return None
+
+
+def _volts(session: LiveSession) -> dict[str, float]:
+    """Last volts of the amplifiers."""
+    end = session.ring.end
+    try:
+        row = session.ring.read("probed", end - 1, end)[0]
+    except LookupError:
+        return {}
+    return dict(zip(session.desk.amplifiers, row.astype(float).round(3).tolist(), strict=True))

@@ -1,0 +1,322 @@
+"""Web server of a live session: one page, its frames and commands, and the endpoint of other viewers.
+
+    GET /?token=T         the page
+    /live?token=T         WebSocket of the page: frames and states out, views and commands in
+    /foxglove?token=T     WebSocket with the subprotocol foxglove.websocket.v1 (foxglove.py)
+
+One client of the page drives, the others watch. When the driver is gone, the generator is switched off.
+
+Limits of a client:
+
+    address  the token, a Host of this server, an Origin of the page (viewers outside a browser have none)
+    memory   messages of MOST_MESSAGE_BYTES, one frame on its way, the buffers of the connection
+    time     a client that takes nothing for SLOW_S is dropped
+    place    one of MOST_CLIENTS
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import secrets
+import socket as socketlib
+import time
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from analogrig import config
+from analogrig.errors import AnalogrigError, ConfigurationError
+from analogrig.live import foxglove
+from analogrig.live.commands import command_of
+from analogrig.live.panel import bench_table, state_table
+from analogrig.live.scope import Screen, View, signals_of
+from analogrig.pages import PLOTS, assemble_page
+from analogrig.wording import one_line
+
+if TYPE_CHECKING:
+    from analogrig.live.session import LiveSession
+
+MOST_CLIENTS = 16
+MOST_MESSAGE_BYTES = 8192
+BUFFERED_BYTES = 262_144
+SLOW_S = 10.0
+FRAME_S = 1.0 / 45.0
+"""Time between two frames."""
+STATE_S = 0.1
+"""Time between two states while the session plays."""
+_PAGE = Path(__file__).parent / "page"
+_LIVE, _FOXGLOVE = "/live", "/foxglove"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class _PageClient:
+    """Client of the page."""
+
+    socket: ServerConnection
+    screen: Screen = field(default_factory=Screen)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when it must get the state at once."""
+
+
+class BenchServer:
+    """Server of one session for the clients of its page and for other viewers."""
+
+    def __init__(
+        self, session: LiveSession, *, token: str = "", origins: Collection[str] = (), slow_s: float = SLOW_S
+    ) -> None:
+        """Prepare the page.
+
+        :param token: by default a random one.
+        :param origins: origins of other pages that may use the endpoint of viewers.
+        :raises RecordingError: uPlot is not installed by the build.
+        """
+        self.session = session
+        self.token = token or secrets.token_urlsafe(16)
+        self._origins = frozenset(origins)
+        self._slow_s = slow_s
+        self._clients: list[_PageClient] = []
+        self._viewers = 0
+        self._driver: _PageClient | None = None
+        self._server: Server | None = None
+        self._hosts: frozenset[str] = frozenset()
+        self._page = page()
+
+    @property
+    def address(self) -> str:
+        """URL of the page."""
+        return f"http://{self._host}/?token={self.token}"
+
+    async def listen(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        """Listen at an address of this machine; port 0: any free one.
+
+        :raises ConfigurationError: listening there failed.
+        """
+        try:
+            self._server = await serve(
+                self._serve_socket,
+                host,
+                port,
+                process_request=self._answer_request,
+                subprotocols=[foxglove.SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
+                select_subprotocol=_select_subprotocol,
+                compression=None,
+                max_size=MOST_MESSAGE_BYTES,
+                max_queue=4,
+                open_timeout=5,
+                close_timeout=2,
+                server_header=None,
+            )
+        except OSError as error:
+            raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror or error}") from error
+        for listening in self._server.sockets:  # accepted connections inherit the options
+            listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_RCVBUF, BUFFERED_BYTES)
+            listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_SNDBUF, BUFFERED_BYTES)
+        number = next(iter(self._server.sockets)).getsockname()[1]
+        name = f"[{host}]" if ":" in host else host
+        self._host = f"{name}:{number}"
+        self._hosts = frozenset(f"{each}:{number}" for each in (name, "127.0.0.1", "localhost", "[::1]"))
+
+    async def close(self) -> None:
+        """Close all connections."""
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    # ---- requests
+
+    def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Page, refusal, or None for a WebSocket that may open."""
+        refusal = self._refusal(request)
+        if refusal is not None:
+            return connection.respond(*refusal)
+        return _page_response(self._page) if urlsplit(request.path).path == "/" else None
+
+    def _refusal(self, request: Request) -> tuple[HTTPStatus, str] | None:
+        """Status and reason if the request is refused."""
+        url = urlsplit(request.path)
+        token = parse_qs(url.query).get("token", [""])[0]
+        if _one(request.headers, "Host") not in self._hosts:
+            return HTTPStatus.FORBIDDEN, "this Host is not served\n"
+        if url.path not in ("/", _LIVE, _FOXGLOVE):
+            return HTTPStatus.NOT_FOUND, "there is nothing here\n"
+        if not secrets.compare_digest(token.encode(), self.token.encode()):
+            return HTTPStatus.FORBIDDEN, "open the address that analogrig bench has printed\n"
+        if url.path != "/" and not self._is_welcome(_one(request.headers, "Origin"), url.path):
+            return HTTPStatus.FORBIDDEN, "this Origin is not served\n"
+        if url.path != "/" and len(self._clients) + self._viewers >= MOST_CLIENTS:
+            return HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MOST_CLIENTS} clients already\n"
+        return None
+
+    def _is_welcome(self, origin: str | None, path: str) -> bool:
+        own = {f"http://{host}" for host in self._hosts}
+        return origin in own or (path == _FOXGLOVE and (origin is None or origin in self._origins))
+
+    async def _serve_socket(self, socket: ServerConnection) -> None:
+        path = "" if socket.request is None else urlsplit(socket.request.path).path
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            if path == _FOXGLOVE:
+                self._viewers += 1
+                try:
+                    await foxglove.Viewer(socket, self.session, may_set=lambda: self._driver is None).serve()
+                finally:
+                    self._viewers -= 1
+            else:
+                await self._serve_client(_PageClient(socket))
+
+    # ---- clients of the page
+
+    async def _serve_client(self, client: _PageClient) -> None:
+        self._clients.append(client)
+        self._appoint(client)
+        sending = asyncio.create_task(self._send_all(client))
+        sending.add_done_callback(lambda _: client.socket.transport.abort())
+        try:
+            async for message in client.socket:
+                await self._send(client, json.dumps(self._reply(client, message)))
+        finally:
+            sending.cancel()
+            for error in await asyncio.gather(sending, return_exceptions=True):
+                if isinstance(error, Exception):
+                    _log.error("frames have ended", exc_info=error)
+            self._clients.remove(client)
+            if client is self._driver:
+                self._driver = None
+                self.session.make_safe()
+            self._call_all()
+
+    def _appoint(self, client: _PageClient) -> None:
+        """Let a client drive if nobody does."""
+        if self._driver is None:
+            self._driver = client
+        self._call_all()
+
+    def _call_all(self) -> None:
+        for client in self._clients:
+            client.changed.set()
+
+    def _reply(self, client: _PageClient, message: str | bytes) -> dict[str, Any]:
+        """Carry a message out, and return the answer."""
+        number: Any = None
+        try:
+            table = _table_of(message)
+            number = table.pop("id", None)
+            self._carry_out(client, table.pop("do", None), table)
+        except AnalogrigError as error:
+            return {"re": number, "error": one_line(str(error))}
+        return {"re": number, "ok": True}
+
+    def _carry_out(self, client: _PageClient, name: object, table: dict[str, Any]) -> None:
+        """:raises ConfigurationError: the message is wrong, or this client does not drive."""
+        if name == "view":
+            view = config.build(View, table, "view")
+            known = signals_of(self.session)
+            for signal in (*view.signals, view.trigger.source):
+                if signal not in known:
+                    raise ConfigurationError(f"no signal is called {signal!r}: there are {', '.join(known)}")
+            client.screen.change(view)
+        elif name == "drive":
+            if self._driver not in (None, client):
+                raise ConfigurationError("another client drives")
+            self._appoint(client)
+        elif client is not self._driver:
+            raise ConfigurationError("this page watches: another client drives")
+        else:
+            self.session.do(command_of(name, table))
+            self._call_all()
+
+    async def _send_all(self, client: _PageClient) -> None:
+        """Send the bench, then frames and states as fast as the client takes them."""
+        try:
+            await self._send(client, json.dumps({"bench": bench_table(self.session)}))
+            told_s, version = 0.0, -1
+            while True:
+                frame = client.screen.frame(self.session)
+                if frame is not None:
+                    await self._send(client, frame)
+                is_due = self.session.is_playing and time.monotonic() - told_s >= STATE_S
+                if is_due or client.changed.is_set() or version != self.session.version:
+                    client.changed.clear()
+                    told_s, version = time.monotonic(), self.session.version
+                    await self._send(client, json.dumps({"state": self._state(client)}))
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(FRAME_S):
+                        await client.changed.wait()
+        except ConnectionClosed:
+            pass
+        except TimeoutError:
+            _log.info("a client takes nothing: dropped")
+
+    def _state(self, client: _PageClient) -> dict[str, Any]:
+        roles = {"drives": client is self._driver, "driven": self._driver is not None, "clients": len(self._clients)}
+        return state_table(self.session) | roles
+
+    async def _send(self, client: _PageClient, message: str | bytes) -> None:
+        """:raises TimeoutError: the client takes nothing."""
+        async with asyncio.timeout(self._slow_s):
+            await client.socket.send(message)
+
+
+def page() -> bytes:
+    """Page of the bench.
+
+    :raises RecordingError: uPlot is not installed by the build.
+    """
+    text = assemble_page(
+        _PAGE / "bench.html",
+        (*PLOTS, _PAGE / "bench.js"),
+        title="analogrig bench",
+        more_styles=(_PAGE / "bench.css",),
+        connect="'self'",
+    )
+    return text.encode()
+
+
+def _page_response(body: bytes) -> Response:
+    headers = Headers(
+        {
+            "Content-Type": "text/html; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-store",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Connection": "close",
+        }
+    )
+    return Response(HTTPStatus.OK.value, HTTPStatus.OK.phrase, headers, body)
+
+
+def _one(headers: Headers, name: str) -> str | None:
+    """Value of a header; a text that nothing equals if it comes several times."""
+    values = headers.get_all(name)
+    return None if not values else values[0] if len(values) == 1 else "\0"
+
+
+def _select_subprotocol(socket: ServerConnection, offered: Any) -> Any:
+    """Subprotocol of an endpoint: that of viewers has one, that of the page has none."""
+    path = "" if socket.request is None else urlsplit(socket.request.path).path
+    return foxglove.SUBPROTOCOL if path == _FOXGLOVE and foxglove.SUBPROTOCOL in offered else None
+
+
+def _table_of(message: str | bytes) -> dict[str, Any]:
+    """:raises ConfigurationError: a message is not one JSON object."""
+    try:
+        table = json.loads(message) if isinstance(message, str) else None
+    except (ValueError, RecursionError):
+        table = None
+    if not isinstance(table, dict):
+        raise ConfigurationError("a message is one JSON object")
+    return table

@@ -1,0 +1,448 @@
+"""Live session: a rig and a device that run while a hand operates them. Knows nothing of browsers.
+
+One thread calls ``run``, which plays one take after another through the bench. Any other thread passes commands and
+reads the ring and the state. Commands take effect between two blocks; the session knows the sample.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from analogrig import config
+from analogrig.answers import Answers
+from analogrig.bench import Bench
+from analogrig.devices.device import Device
+from analogrig.errors import AnalogrigError, ConfigurationError
+from analogrig.identity import Identity
+from analogrig.live import commands
+from analogrig.live.clock import LiveClock, WallClock
+from analogrig.live.commands import Command
+from analogrig.live.desk import CHANGE_N, SteppedDesk, open_desk
+from analogrig.live.notes import Notes
+from analogrig.live.ring import Ring
+from analogrig.live.take import MOST_RECORDED_N, Take, TakeBuilder
+from analogrig.plant import MAX_CHANGES
+from analogrig.rigs.emulator import emulator_errors
+from analogrig.rigs.rig import Block, Performance, Rig
+from analogrig.run import Run
+from analogrig.scenario import PotChange, Scenario
+from analogrig.storage import replace_file
+from analogrig_emulator import EmulatorError
+
+BLOCK_S = 0.0125
+"""Wall-clock length of a block: a hand is felt within two of them."""
+MOST_BLOCK_N = 1024
+LATE_S = 0.25
+"""Lag behind real time at which the session gives up the lost time."""
+MOST_WAITING = 256
+"""Commands that may wait for the next block."""
+
+_MOST_NOTED = 50
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Saved:
+    """Files of one recording."""
+
+    run: Path
+    scenario: Path
+    samples: int
+    alarms: int
+
+
+class LiveSession:
+    """Rig, device, generator, pots and time of one bench, operated by commands."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        scenario: Scenario,
+        device: Device,
+        seed: int,
+        *,
+        folder: Path,
+        clock: LiveClock | None = None,
+        identity: Identity | None = None,
+    ) -> None:
+        """Prepare; nothing is played before ``run``.
+
+        :param folder: receives the recordings.
+        :raises ConfigurationError: the rig cannot be operated by hand, or cannot play the scenario.
+        """
+        self.desk = open_desk(rig, scenario, seed, self._lengths)
+        self.device = device
+        self.seed = seed
+        self.knobs = self.desk.knobs
+        self._folder = folder
+        self._identity = identity
+        self.clock = clock or WallClock()
+        self._lock = threading.Lock()
+        self._woken = threading.Event()
+        self._waiting: deque[tuple[Command, float]] = deque()
+        parameters = self.desk.scenario.plant.parameters()
+        self.values = {name: parameters[name] for name in self.knobs}
+        """Values of the parameters with knobs."""
+        self.excitation = self.desk.scenario.excitation
+        self.is_on = self.desk.is_stepped
+        """True while the generator is on."""
+        self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
+        """Mode and lit lamps after the last block. The machine itself belongs to the thread that plays."""
+        self.is_playing = True
+        self.factor = 1.0
+        """Wall-clock time per machine time."""
+        self.overruns_n = 0
+        """Samples by which the session has fallen behind real time."""
+        self.take_number = 0
+        self.take = Take(self.desk.scenario)
+        self.ring = Ring(len(self.desk.program.channels), len(self.desk.amplifiers), device.datasheet.theta_n)
+        self.notes = Notes(self.desk, device, self.ring, seed)
+        self.notices: deque[tuple[int, str]] = deque(maxlen=_MOST_NOTED)
+        self.saved: deque[Saved] = deque(maxlen=_MOST_NOTED)
+        self.counters: Mapping[str, int] = {}
+        self.speed_hz = 0.0
+        """Samples per second of wall-clock time, over the last second."""
+        self.is_recording = False
+        self.version = 0
+        """Number that grows with every change of the state, apart from samples."""
+        self._notice_numbers = itertools.count(1)
+        self._steps = 0
+        self._ends_take = False
+        self._is_closed = False
+        self._is_made_safe = False
+        self._pace: tuple[float, int] | None = None
+        """Time and sample from which the pace is counted."""
+        self._speed_from = (0.0, 0)
+        self._turns: dict[str, float] = {}
+        self._ramp_n = 0
+        self._turned_at: list[float] = []
+        self._taken = 0
+        """Samples of this take that the rig has been asked for."""
+
+    # ---- from other threads
+
+    def do(self, command: Command) -> None:
+        """Check a command, and let it take effect before the next block.
+
+        :raises ConfigurationError: it is not possible on this bench, or too many commands wait.
+        """
+        self._check(command)
+        with self._lock:
+            if len(self._waiting) >= MOST_WAITING:
+                raise ConfigurationError("too many commands at once: wait for the next block")
+            self._waiting.append((command, self.clock()))
+        self._woken.set()
+
+    def make_safe(self) -> None:
+        """Switch the generator off before the next block; a recording under way is saved."""
+        self._is_made_safe = True
+        self._woken.set()
+
+    def close(self) -> None:
+        """End ``run``; a recording under way is saved."""
+        self._is_closed = True
+        self._woken.set()
+
+    def notify(self, text: str) -> None:
+        """Add a line for people."""
+        self.notices.append((next(self._notice_numbers), text))
+        self.version += 1
+
+    def _check(self, command: Command) -> None:
+        match command:
+            case commands.Turn():
+                if command.name not in self.knobs:
+                    raise ConfigurationError(f"no pot shows {command.name!r}: there are {', '.join(self.knobs)}")
+                self.knobs[command.name].check(command.value)
+                self.desk.check_values(self.values | {command.name: command.value})
+            case commands.Generate():
+                self._refuse_while_recording("the generator")
+                excitation = self._generated(command)
+                self.desk.check(dataclasses.replace(self.desk.scenario, excitation=excitation))
+            case commands.Operate():
+                self._refuse_while_recording("the mode")
+            case commands.Inject() if command.fault not in self.desk.faults:
+                raise ConfigurationError(f"this rig has no fault {command.fault!r} to inject")
+        if not self.desk.is_stepped and isinstance(command, commands.Operate | commands.Step | commands.ClearLamps):
+            raise ConfigurationError("this rig plays whole records: it has no modes and no single step")
+
+    def _refuse_while_recording(self, what: str) -> None:
+        if self.is_recording:
+            raise ConfigurationError(f"{what} cannot change within a recording, which is one scenario: end it first")
+
+    def _generated(self, command: commands.Generate) -> Any:
+        """Excitation with the settings of a command.
+
+        :raises ConfigurationError: a value is out of range.
+        """
+        wanted = {key: value for key, value in dataclasses.asdict(command).items() if value is not None and key != "on"}
+        if wanted.get("shape", self.excitation.shape) != "pulse":
+            wanted["duty"] = 0.5
+        if "drift_ppm" in wanted:
+            wanted["clock"] = "free" if wanted["drift_ppm"] else "card"
+        with emulator_errors():
+            return dataclasses.replace(self.excitation, **wanted)
+
+    # ---- playing
+
+    def run(self) -> None:
+        """Play takes until ``close``."""
+        while not self._is_closed:
+            self._play_take()
+
+    def _play_take(self) -> None:
+        """Play from rest until something demands a new start."""
+        self._begin_take()
+        keeps = self.take.is_recorded
+        bench = Bench(
+            self.desk,
+            self.device,
+            builder=lambda _, channels, sheet: TakeBuilder(channels, sheet, self._watch, keeps=keeps),
+        )
+        try:
+            run = bench.play(self.take.scenario, self.seed)
+        except AnalogrigError as error:
+            self._stop_after(str(error))
+            return
+        self.counters = {**run.conditions.counters, **run.conditions.link_counters}
+        if keeps:
+            self._conclude(run)
+            self.is_recording = self.is_recording and self.desk.is_stepped  # other rigs record one record
+        if run.conditions.faults and not self._is_closed:
+            self._stop_after(run.conditions.faults[-1])
+
+    def _begin_take(self) -> None:
+        excitation = self.excitation
+        if not self.is_on:
+            excitation = dataclasses.replace(excitation, low_v=0.0, high_v=0.0)
+        if not self.desk.is_stepped:
+            self._wait_to_play()
+        scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))
+        tweaks: tuple[PotChange, ...] = ()
+        if not self.desk.is_stepped and self._turns:
+            tweaks = (PotChange(CHANGE_N, self._turns),)
+            self.values |= self._turns
+            self._turns, self._turned_at = {}, []
+        scenario = dataclasses.replace(scenario, excitation=excitation, tweaks=tweaks, seed=self.seed)
+        self.take_number += 1
+        self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
+        self._ends_take = False
+        self._pace = None
+        self._taken = 0
+        self.ring.restart()
+        self.notes.begin(self.take, self.take_number)
+        self.version += 1
+        for fault in self.injected if self.is_recording else ():
+            self._note_fault(fault)
+
+    @property
+    def injected(self) -> set[commands.Fault]:
+        """Faults in force."""
+        return set(self.desk.injected) if isinstance(self.desk, SteppedDesk) else set()
+
+    def _wait_to_play(self) -> None:
+        """For a rig of whole records: apply the commands, and wait while paused."""
+        while True:
+            self._apply_commands()
+            if (self.is_playing and self.is_on) or self._is_closed:
+                return
+            self._wait(None)
+
+    def _lengths(self) -> Iterator[int]:
+        """Lengths of the blocks, each when it is due; ends with the take."""
+        while True:
+            self._apply_commands()
+            if self._ends_take or self._is_closed:
+                return
+            if self._steps:
+                length = min(self._steps, MOST_BLOCK_N)
+                self._steps -= length
+                self._pace = None
+            elif not self.is_playing:
+                self._wait(None)
+                continue
+            else:
+                length = self._paced_length()
+                if not length:
+                    continue
+            if self.take.is_recorded and self._taken + length > MOST_RECORDED_N:
+                self.notify(f"the recording has reached its limit of {MOST_RECORDED_N} samples")
+                self.is_recording, self._ends_take = False, True
+                return
+            self._taken += length
+            yield length
+
+    def _paced_length(self) -> int:
+        """Length of the next block if it is due; else wait, and return 0."""
+        rate_hz = self.sample_rate_hz / self.factor
+        length = int(min(max(1.0, rate_hz * BLOCK_S), MOST_BLOCK_N))
+        now_s = self.clock()
+        if self._pace is None:
+            self._pace = (now_s, self._taken)
+            self._speed_from = (now_s, self._taken)
+        start_s, start_n = self._pace
+        due_s = start_s + (self._taken + length - start_n) / rate_hz
+        if now_s < due_s:
+            self._wait(due_s - now_s)
+            return 0
+        if now_s - due_s > LATE_S:
+            self.overruns_n += int((now_s - due_s) * rate_hz)
+            self._pace = (now_s, self._taken)
+        return length
+
+    def _wait(self, seconds: float | None) -> None:
+        self.clock.wait(self._woken, seconds)
+        self._woken.clear()
+
+    @property
+    def performance(self) -> Performance | None:
+        """Play under way; None before the first."""
+        return self.desk.performance
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Samples per second of machine time."""
+        return 20e3 if self.performance is None else 1.0 / self.performance.sample_period_s
+
+    # ---- commands
+
+    def _apply_commands(self) -> None:
+        if self._is_made_safe:
+            self._is_made_safe = False
+            self.is_on, self.is_recording, self._ends_take = False, False, True
+            self.version += 1
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    break
+                command, at_s = self._waiting.popleft()
+            try:
+                self._check(command)  # again: the bench may have changed since
+                self._apply(command, at_s)
+            except (AnalogrigError, EmulatorError) as error:
+                self.notify(str(error))
+            self.version += 1
+        if isinstance(self.desk, SteppedDesk):
+            self._turn_pots(self.desk)
+
+    def _apply(self, command: Command, at_s: float) -> None:
+        match command:
+            case commands.Turn():
+                self._turns[command.name] = command.value
+                self._ramp_n = command.ramp_n
+                self._turned_at.append(at_s)
+            case commands.Generate():
+                self.excitation = self._generated(command)
+                self.is_on = self.is_on if command.on is None else command.on
+                self._ends_take = True
+            case commands.SetPlaying():
+                self.is_playing, self._steps, self._pace = command.on, 0, None
+            case commands.Step():
+                self.is_playing, self._steps = False, self._steps + command.samples
+            case commands.Tempo():
+                self.factor, self._pace = command.factor, None
+            case commands.Restart():
+                self._ends_take = True
+            case commands.SetRecording():
+                self._ends_take = self._ends_take or command.on != self.is_recording
+                self.is_recording = command.on
+            case _ if isinstance(self.desk, SteppedDesk):
+                self._operate(self.desk, command)
+
+    def _operate(self, desk: SteppedDesk, command: Command) -> None:
+        """Apply a command that only an emulated computer has."""
+        match command:
+            case commands.Operate():
+                desk.switch(command.mode)
+            case commands.Inject():
+                desk.inject(command.fault, on=command.on)
+                if command.on:
+                    self._note_fault(command.fault)
+            case commands.ClearLamps():
+                desk.clear_lamps()
+        self.mode, self.lamps = desk.mode, tuple(desk.lamps)
+
+    def _note_fault(self, fault: commands.Fault) -> None:
+        self.take.caveats.append(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
+
+    def _turn_pots(self, desk: SteppedDesk) -> None:
+        """Turn the pots that the hand has turned, unless one is still turning."""
+        if not self._turns or desk.is_turning:
+            return
+        if self.take.is_recorded and len(self.take.changes) >= MAX_CHANGES:
+            self.notify(f"the recording has reached its limit of {MAX_CHANGES} changes")
+            self.is_recording, self._ends_take = False, True
+            return
+        sample = self._taken - 1
+        is_fresh = sample > (self.take.changes[-1].sample if self.take.changes else 0)
+        ramp_n = self._ramp_n if is_fresh else 0
+        turns, self._turns = self._turns, {}
+        times_s, self._turned_at = self._turned_at, []
+        turns = {name: value for name, value in turns.items() if value != self.values[name]}
+        if not turns:
+            return
+        try:
+            desk.turn(self.values | turns, turns, sample, ramp_n)
+        except AnalogrigError as error:
+            self.notify(str(error))
+            return
+        self.values |= turns
+        self.take.change(sample, turns, ramp_n)
+        self.notes.await_turn(sample + 1, times_s)
+        self.version += 1
+
+    def _watch(self, block: Block, answers: Answers) -> None:
+        """Take note of an answered block."""
+        now_s = self.clock()
+        self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
+        self.ring.add(block, self.desk.probed(len(block.codes)), answers)
+        if self.notes.watch(block, answers, now_s) or not self.is_playing:
+            self.version += 1
+        since_s, since_n = self._speed_from
+        if now_s - since_s >= 1.0:
+            self.speed_hz, self._speed_from = (self._taken - since_n) / (now_s - since_s), (now_s, self._taken)
+
+    # ---- ends of takes
+
+    def _conclude(self, run: Run) -> None:
+        """Save a recorded take, unless it has no samples."""
+        if not run.samples:
+            return
+        concluded = self.take.concluded(run)
+        if self._identity is not None:
+            concluded = concluded.with_identity(dataclasses.replace(self._identity, devices=self.device.files()))
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            number = next(n for n in itertools.count(1) if not self._file(n, "npz").exists())
+            concluded.save(self._file(number, "npz"))
+            table = {k: v for k, v in concluded.conditions.scenario.items() if v != "" and k not in ("name", "rig")}
+            with replace_file(self._file(number, "toml")) as file:
+                file.write(config.to_toml(table).encode())
+        except (AnalogrigError, OSError) as error:
+            self.notify(f"the recording could not be saved: {error}")
+            return
+        saved = Saved(self._file(number, "npz"), self._file(number, "toml"), run.samples, len(run.alarm_index))
+        self.saved.append(saved)
+        self.notify(f"{saved.run}: {run.samples} samples, {saved.alarms} alarms; scenario: {saved.scenario}")
+
+    def _file(self, number: int, suffix: str) -> Path:
+        return self._folder / f"take-{number}.{suffix}"
+
+    def _stop_after(self, reason: str) -> None:
+        """Pause after a failure, with the device ready for the next take."""
+        self.notify(f"stopped: {reason}")
+        self.is_playing, self._steps, self.is_recording = False, 0, False
+        try:
+            self.device.recover()
+            self.device.configure()
+        except AnalogrigError as error:
+            self.notify(str(error))

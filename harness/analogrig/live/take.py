@@ -1,0 +1,81 @@
+"""Take: one play of a live session, from rest to the next start, and its record if it is recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from analogrig.answers import Answers
+from analogrig.bench import RunBuilder
+from analogrig.datasheet import Datasheet
+from analogrig.plant import Segment
+from analogrig.rigs.rig import Block
+from analogrig.run import Run
+from analogrig.scenario import PotChange, Scenario, segments_of
+
+MOST_RECORDED_N = 2_000_000
+"""Samples of the longest recording: 100 s at 20,000 samples/s, 80 MB."""
+
+Watch = Callable[[Block, Answers], None]
+
+
+@dataclass
+class Take:
+    """One play: its scenario so far, and the changes that were made by hand."""
+
+    scenario: Scenario
+    """Scenario at its first sample."""
+    is_recorded: bool = False
+    changes: list[PotChange] = field(default_factory=list)
+    caveats: list[str] = field(default_factory=list)
+    """Reasons that its recording cannot be judged."""
+
+    def change(self, sample: int, values: Mapping[str, float], ramp_n: int) -> None:
+        """Note a change of parameters after a sample."""
+        if sample < 1:
+            self.scenario = self.scenario.with_plant(self.scenario.plant.changed(values))
+        elif self.changes and self.changes[-1].sample == sample:
+            self.changes[-1] = dataclasses.replace(self.changes[-1], set={**self.changes[-1].set, **values})
+        else:
+            self.changes.append(PotChange(sample, values, ramp_n))
+
+    def segments(self) -> tuple[Segment, ...]:
+        """True plant from the start and after each change."""
+        return segments_of(self.scenario.plant, self.changes)
+
+    def played(self, samples: int) -> Scenario:
+        """Scenario that plays this take again: the first ``samples``, with the changes among them."""
+        changes = [change for change in self.changes if change.sample < samples]
+        if changes:
+            left_n = samples - changes[-1].sample
+            changes[-1] = dataclasses.replace(changes[-1], ramp_n=min(changes[-1].ramp_n, left_n))
+        return dataclasses.replace(self.scenario, samples=samples, tweaks=tuple(changes))
+
+    def concluded(self, run: Run) -> Run:
+        """Run with the scenario that was played by hand, instead of the endless one."""
+        scenario = self.played(run.samples)
+        conditions = dataclasses.replace(
+            run.conditions,
+            samples_asked=run.samples,
+            scenario=scenario.as_table(),
+            segments=run.conditions.segments or scenario.segments(),
+            faults=(*run.conditions.faults, *self.caveats),
+        )
+        return dataclasses.replace(run, conditions=conditions)
+
+
+class TakeBuilder(RunBuilder):
+    """Collector of a take: passes every block on, and keeps the samples only of a take that is recorded."""
+
+    def __init__(self, channels: int, sheet: Datasheet, watch: Watch, *, keeps: bool) -> None:
+        super().__init__(MOST_RECORDED_N if keeps else 0, channels, sheet)
+        self._keeps = keeps
+        self._watch = watch
+
+    def add(self, block: Block, answers: Answers) -> None:
+        if self._keeps:
+            super().add(block, answers)
+        else:
+            self.samples += len(answers)
+        self._watch(block, answers.shifted(self.records[-1]))

@@ -1,0 +1,198 @@
+"""Program: the plant's equations on the computer, with its channels and parameters. A file, or tables of another file.
+
+Nothing in it is executed: formulas are parsed and checked by the emulator's own parser.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig_emulator import EmulatorError, Equations, ProgramError, ProgramParameter, equations_of, wired
+
+if TYPE_CHECKING:
+    from analogrig_emulator import ProgramCircuit
+
+MAX_CHARACTERS = 65_536
+MOST_CHANNELS = 4
+"""Inputs of the card."""
+
+_LINEAR_TO = 1e-9
+"""Largest relative deviation from superposition of equations that count as linear."""
+
+
+@dataclass(frozen=True, repr=False)
+class Program:
+    """Equations of a plant with its channels, scales and parameters; programs with equal files are equal.
+
+    ``load`` reads a shipped program by name or a .toml file, and raises ConfigurationError.
+    """
+
+    source: str
+    """Tables of the file as JSON."""
+
+    def __repr__(self) -> str:
+        return f"Program({self.name!r})"
+
+    @classmethod
+    def load(cls, name: str) -> Program:
+        """Load a shipped program by name, or a user's .toml file.
+
+        :raises ConfigurationError: absent, not TOML, or not a program; names the file, the place and the cure.
+        """
+        path = config.locate("programs", name)
+        return cls.from_table(config.read_toml(path), str(path))
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], where: str) -> Program:
+        """Build a program from the tables of its file; ``where`` leads every error.
+
+        :raises ConfigurationError: not a program.
+        """
+        try:
+            equations = equations_of(table)
+            source = json.dumps(dict(sorted(table.items())))
+            if len(source) > MAX_CHARACTERS:
+                raise ProgramError(f"larger than {MAX_CHARACTERS} characters")
+            _check_channels(equations)
+        except (EmulatorError, RecursionError) as error:
+            raise ConfigurationError(f"{where}: {error}") from error
+        return cls(source)
+
+    @classmethod
+    def of(cls, value: Any, where: str) -> Program:
+        """Program of a scenario's key ``program``: a name, a file, or the tables of one.
+
+        :raises ConfigurationError: it is none of them.
+        """
+        if isinstance(value, str):
+            return cls.load(value)
+        if isinstance(value, Mapping):
+            return cls.from_table(value, where)
+        raise ConfigurationError(f"{where}: must be a name, a .toml file, or a table, not {value!r:.80}")
+
+    def as_value(self) -> str | dict[str, Any]:
+        """Name of a shipped program, or the tables of another one: ``of`` builds an equal program."""
+        if self.name in config.names("programs") and Program.load(self.name) == self:
+            return self.name
+        tables: dict[str, Any] = json.loads(self.source)
+        return tables
+
+    @property
+    def equations(self) -> Equations:
+        """Equations as the file states them."""
+        return _equations(self.source)
+
+    @property
+    def circuit(self) -> ProgramCircuit:
+        """Circuit that solves the equations.
+
+        :raises ConfigurationError: the machine cannot be patched so; names the term and the cure.
+        """
+        try:
+            return wired(self.equations)
+        except EmulatorError as error:
+            raise ConfigurationError(f"program {self.name}: {error}") from error
+
+    @property
+    def name(self) -> str:
+        return self.equations.name
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Quantities on the card's channels: the input of the plant, its output, and any others."""
+        return self.equations.channels
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Input and output of the plant: the channels that every rig measures and every device receives."""
+        return self.channels[:2]
+
+    def unit(self, name: str) -> str:
+        """Unit of a channel or a parameter; empty if the file gives none."""
+        row = self.equations.quantities.get(name) or self.equations.parameters[name]
+        return row.unit.text if row.unit else ""
+
+    @functools.cached_property
+    def parameters(self) -> Mapping[str, ProgramParameter]:
+        """Parameters that pots show, in the order of the file."""
+        return {name: row for name, row in self.equations.parameters.items() if row.pot}
+
+    @functools.cached_property
+    def names(self) -> Mapping[str, str]:
+        """Parameters by every name that a scenario may give them."""
+        aliases = {row.alias: name for name, row in self.parameters.items() if row.alias}
+        return {**aliases, **{name: name for name in self.parameters}}
+
+    @functools.cached_property
+    def estimates(self) -> tuple[str, ...]:
+        """Parameters that follow from a device's model, in the order of the file."""
+        return tuple(name for name in self.parameters if name in self.equations.estimates)
+
+    @functools.cached_property
+    def diagnosed(self) -> Mapping[str, str]:
+        """Parameters by the name that diagnoses give them."""
+        return {row.diagnosis: name for name, row in self.parameters.items() if row.diagnosis}
+
+    @functools.cached_property
+    def inverse(self) -> frozenset[str]:
+        """Parameters by which an equation divides: their pots turn with the reciprocal."""
+        lines = (*self.equations.derivatives, *self.equations.definitions)
+        return frozenset(name for line in lines for name in line.formula.divisors())
+
+    @functools.cached_property
+    def is_linear(self) -> bool:
+        """True if the plant is linear, starts from equilibrium, and its input does not reach its output at once."""
+        n = len(self.equations.states)
+        rng = np.random.default_rng(0)
+        a, b = rng.uniform(-1.0, 1.0, (2, n + 1))
+        with np.errstate(all="ignore"):
+            points = [self._rates(point, self.equations.values) for point in (a, b, 2.0 * a - 3.0 * b, np.zeros(n + 1))]
+            direct = self._rates(np.append(np.zeros(n), 1.0), self.equations.values)[-1]
+        expected = 2.0 * points[0] - 3.0 * points[1]
+        scale = np.abs(points[2]) + np.abs(points[0]) + np.abs(points[1])
+        return bool((np.abs(points[2] - expected) <= _LINEAR_TO * scale).all() and not points[3].any() and not direct)
+
+    def _rates(self, point: Any, values: Mapping[str, Any]) -> Any:
+        """Rates of the states, and the output, at a point: states and input (n + 1, ...)."""
+        equations = self.equations
+        first, *others = equations.inputs
+        known = {**values, first: point[-1], **dict.fromkeys(others, 0.0)}
+        rates = equations.slopes()(known, point[:-1])
+        known |= dict(zip(equations.states, point[:-1], strict=True))
+        for name, law in equations.signal_laws():
+            known[name] = law(known)
+        return np.append(rates, np.broadcast_to(known[self.channels[1]], rates.shape[1:])[None], axis=0)
+
+    def generators(self, values: Any) -> Any:
+        """Matrices (p, n + 1, n + 1) of a linear plant for parameters (p, m), ``parameters`` in order.
+
+        They give the rates of the states, and in the last row the output, from the states and the input.
+        """
+        p, n = len(values), len(self.equations.states)
+        known = {name: np.full(p, value) for name, value in self.equations.values.items()}
+        known |= dict(zip(self.parameters, np.asarray(values, np.float64).T, strict=True))
+        columns = [self._rates(np.repeat(unit[:, None], p, axis=1), known) for unit in np.eye(n + 1)]
+        return np.stack(columns, axis=2).transpose(1, 0, 2)
+
+
+@functools.lru_cache(maxsize=64)
+def _equations(source: str) -> Equations:
+    return equations_of(json.loads(source))
+
+
+def _check_channels(equations: Equations) -> None:
+    channels, driven = equations.channels, next(iter(equations.inputs))
+    if not 2 <= len(channels) <= MOST_CHANNELS:
+        raise ProgramError(f"channels: {len(channels)} of them; name the input, the output and at most two others")
+    if channels[0] != driven:
+        raise ProgramError(
+            f"channels: the first is {channels[0]!r}; name the input that the generator drives, {driven!r}"
+        )

@@ -1,0 +1,82 @@
+"""Columns of numbers in files of other tools, read by a process of its own (column_reader.py)."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.errors import RecordingError
+from analogrig.recordings.column_reader import FORMATS
+
+MOST_S = 600.0
+"""Longest time of the process that reads a file."""
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnFile:
+    """Names of all columns of a file, those that were read, (n,) float64 each, and the sample rate if it states one."""
+
+    names: tuple[str, ...]
+    columns: Mapping[str, NDArray[np.float64]]
+    rate_hz: float | None
+
+
+def read_columns(path: Path, wanted: Sequence[str] = (), skip_lines: int = 0) -> ColumnFile:
+    """Read columns of a CSV, NumPy, MATLAB, MF4, Parquet or WAV file, by its suffix.
+
+    :param skip_lines: lines of text before the header or the first row.
+    :raises RecordingError: the file or a column cannot be read.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise RecordingError(f"{path}: the suffix must be one of {', '.join(FORMATS)}")
+    if not path.is_file():
+        raise RecordingError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    with tempfile.TemporaryDirectory(prefix="analogrig-") as folder:
+        out = Path(folder) / "columns.npz"
+        request = {"file": str(path.absolute()), "wanted": list(wanted), "skip_lines": skip_lines, "out": str(out)}
+        answer = _ask(path, json.dumps(request))
+        if "error" in answer:
+            raise RecordingError(f"{path}: {answer['error']}")
+        columns = {}
+        if wanted:
+            with np.load(out, allow_pickle=False) as file:
+                columns = {name: file[str(i)] for i, name in enumerate(wanted)}
+    return ColumnFile(tuple(answer["names"]), columns, answer["rate_hz"])
+
+
+def _ask(path: Path, request: str) -> dict[str, Any]:
+    """Answer of the reader.
+
+    :raises RecordingError: it crashed, or took too long.
+    """
+    settings = {"OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-m", "analogrig.recordings.column_reader", request]
+    try:
+        reader = subprocess.run(
+            command,
+            env=os.environ | settings,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=MOST_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise RecordingError(f"{path}: reading it took longer than {MOST_S:g} s") from None
+    try:
+        answer: dict[str, Any] = json.loads(reader.stdout)
+    except ValueError:
+        status = reader.returncode
+        why = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        raise RecordingError(f"{path}: its reader {why}: the file is damaged, or too large") from None
+    return answer

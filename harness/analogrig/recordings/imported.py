@@ -1,0 +1,277 @@
+"""Import of measured data as a recording: columns of a file become codes of the two measured channels."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig import config
+from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.plant import MAX_SAMPLES, Segment
+from analogrig.recordings.columns import ColumnFile, read_columns
+from analogrig.run import Channel, Conditions, Run
+from analogrig.scenario import Scenario
+from analogrig.wording import number_of
+from analogrig_emulator import CHANNELS, Excitation
+
+if TYPE_CHECKING:
+    from analogrig.rigs.rig import Rig
+
+UNSEEN = "no device has seen these samples: pass the recording to analogrig replay"
+"""Fault of a recording that was imported and not played."""
+
+KIND = "import"
+"""Kind in the rig's table of an imported recording."""
+
+LEAST_BITS, MOST_BITS = 2, 16
+
+_MOST_JITTER = 0.02
+"""Largest deviation of a time from the even grid, in sample periods."""
+
+_SIGNALS = tuple(f"{channel}_{kind}" for kind in ("code", "clipped") for channel in CHANNELS)
+"""Columns that ``analogrig emulate`` writes, without its volts."""
+
+
+@dataclass(frozen=True)
+class ImportedColumn:
+    """One column of a file: values in ``unit`` are column * scale + offset. ValueError: a number is out of range."""
+
+    column: str
+    unit: str = "V"
+    scale: float = 1.0
+    offset: float = 0.0
+    range: tuple[float, float] | None = None
+    """Ends of the converter's range in ``unit``, beyond which a sample is clipped.
+
+    None: the range is symmetrical and holds all values.
+    """
+
+    def __post_init__(self) -> None:
+        if not self.column:
+            raise ValueError("column must not be empty")
+        if not self.unit or len(self.unit) > 20 or not self.unit.isprintable():
+            raise ValueError(f"unit must be 1 to 20 printable characters, not {self.unit[:40]!r}")
+        if not 1e-9 < abs(self.scale) < 1e9:
+            raise ValueError(f"scale must be within +-1e9 and not 0, not {self.scale:g}")
+        if self.range is not None and not self.range[0] < self.range[1]:
+            raise ValueError(f"range must ascend, not [{self.range[0]:g}, {self.range[1]:g}]")
+
+
+@dataclass(frozen=True)
+class ImportDescription:
+    """Meaning of the columns of a file, from the command line or a .toml file. ValueError: a value is out of range."""
+
+    input: ImportedColumn
+    output: ImportedColumn
+    rate_hz: float | None = None
+    """Sample rate; None: that of ``time``, or the one that the file states."""
+    time: str = ""
+    """Column of the sample instants in seconds; they must be evenly spaced."""
+    bits: int = MOST_BITS
+    """Resolution of the converter."""
+    first: int = 0
+    """First row of the recording."""
+    samples: int | None = None
+    """Number of rows; None: all from ``first`` on."""
+    skip_lines: int = 0
+    """Lines of a text file before its header or first row."""
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if self.rate_hz is not None and not 1e-6 <= self.rate_hz <= 1e9:
+            raise ValueError(f"rate_hz must be 1e-6 to 1e9, not {self.rate_hz:g}")
+        if self.rate_hz is not None and self.time:
+            raise ValueError("rate_hz and time state the rate twice: give one of them")
+        if not LEAST_BITS <= self.bits <= MOST_BITS:
+            raise ValueError(f"bits must be {LEAST_BITS} to {MOST_BITS}, not {self.bits}")
+        if self.first < 0 or self.skip_lines < 0:
+            raise ValueError("first and skip_lines must not be negative")
+        if self.samples is not None and not 1 <= self.samples <= MAX_SAMPLES:
+            raise ValueError(f"samples must be 1 to {MAX_SAMPLES}, not {self.samples}")
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns to read, each once."""
+        return tuple(dict.fromkeys(name for name in (self.input.column, self.output.column, self.time) if name))
+
+
+def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
+    """True if a file with columns of these names was written by ``analogrig emulate``."""
+    if path.suffix == ".npz":
+        return {"codes[0]", "codes[1]", "clipped[0]", "volts[0]"} <= set(names)
+    return set(_SIGNALS) <= set(names)
+
+
+def import_columns(path: Path, described: ImportDescription, scenario: Scenario | None) -> Run:
+    """Recording of two columns of a file, which no device has seen.
+
+    :param scenario: the truth about plant and changes; None: unknown.
+    :raises RecordingError: the file cannot be read, or its columns give no samples.
+    :raises ConfigurationError: the recording is longer than the scenario.
+    """
+    found = read_columns(path, described.columns, described.skip_lines)
+    rows = slice(described.first, None if described.samples is None else described.first + described.samples)
+    columns = {name: values[rows] for name, values in found.columns.items()}
+    count = {len(values) for values in columns.values()}
+    if len(count) > 1:
+        lengths = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
+        raise RecordingError(f"{path}: the columns differ in length: {lengths}")
+    if not (samples := count.pop()):
+        raise RecordingError(f"{path}: has no row {described.first}")
+    if described.samples is not None and samples < described.samples:
+        raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
+    codes, clipped = np.zeros((samples, len(CHANNELS)), np.uint16), np.ones((samples, len(CHANNELS)), np.bool_)
+    channels = {}
+    for name, each in zip(CHANNELS, (described.input, described.output), strict=False):
+        at = CHANNELS.index(name)
+        values = columns[each.column] * each.scale + each.offset
+        channels[name] = _channel(path, each, described.bits, values)
+        codes[:, at], clipped[:, at] = _converted(values, channels[name], is_ranged=each.range is not None)
+    rate_hz = _rate_hz(path, described, columns, found)
+    rig = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), **dataclasses.asdict(described)}
+    return _run(path, codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), scenario)
+
+
+def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scenario) -> Run:
+    """Recording of a file of ``analogrig emulate``, with the units and the rate of ``rig``; errors as import_columns.
+
+    :param played: scenario whose units the rig states.
+    """
+    if path.suffix == ".npz":
+        wanted = [f"{kind}[{i}]" for kind in ("codes", "clipped") for i in range(len(CHANNELS))]
+    else:
+        wanted = list(_SIGNALS)
+    found = read_columns(path, wanted)
+    values = np.stack([found.columns[name] for name in wanted], axis=1)
+    performance = rig.perform(played, 0)
+    codes, clipped = values[:, : len(CHANNELS)], values[:, len(CHANNELS) :]
+    most = [performance.channels[name].codes if name in performance.channels else 1 for name in CHANNELS]
+    if not (np.isfinite(values).all() and (codes == np.rint(codes)).all() and (codes >= 0).all()):
+        raise RecordingError(f"{path}: its codes are no whole numbers")
+    if not (codes < most).all():
+        raise RecordingError(f"{path}: has codes that rig {rig.description()['name']} does not have: name its rig")
+    if not np.isin(clipped, (0.0, 1.0)).all():
+        raise RecordingError(f"{path}: a flag of a clipped sample is neither 0 nor 1")
+    description = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), "rig": dict(rig.description())}
+    return _run(
+        path,
+        codes.astype(np.uint16),
+        clipped.astype(np.bool_),
+        performance.channels,
+        performance.sample_period_s,
+        performance.time_scale,
+        description,
+        scenario,
+    )
+
+
+def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[np.float64]) -> Channel:
+    """Scale of a converter with these values.
+
+    :raises RecordingError: they have no range.
+    """
+    codes = 1 << bits
+    if described.range is not None:
+        low, high = described.range
+    else:
+        finite = np.abs(values[np.isfinite(values)])
+        most = float(finite.max(initial=0.0)) / (1.0 - 2.0 / codes)  # the last code stands for the largest value
+        if not 1e-9 < most < 1e8:
+            raise RecordingError(f"{path}: column {described.column}: largest magnitude {most:g}: no signal; scale it")
+        low, high = -most, most
+    return Channel(low, (high - low) / codes, described.unit, 1.0, 0.0, codes)
+
+
+def _converted(
+    values: NDArray[np.float64], channel: Channel, *, is_ranged: bool
+) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Codes and clipping of values. With a known range an end code says only that the value was beyond it."""
+    with np.errstate(invalid="ignore"):
+        at = np.rint((values - channel.low_v) / channel.lsb_v)
+        last = channel.codes - 1
+        beyond = ~np.isfinite(values) | (at < 0) | (at > last) | (is_ranged & ((at == 0) | (at == last)))
+        codes = np.clip(np.nan_to_num(at, nan=0.0), 0, last).astype(np.uint16)
+    return codes, beyond
+
+
+def _rate_hz(
+    path: Path, described: ImportDescription, columns: Mapping[str, NDArray[np.float64]], found: ColumnFile
+) -> float:
+    """:raises RecordingError: no rate is known, or the samples are not evenly spaced."""
+    if described.rate_hz is not None:
+        return described.rate_hz
+    if not described.time:
+        if found.rate_hz is None:
+            raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN")
+        return found.rate_hz
+    instants_s = columns[described.time]
+    if len(instants_s) < 2 or not np.isfinite(instants_s).all():
+        raise RecordingError(f"{path}: column {described.time}: instants are missing")
+    period_s = float(instants_s[-1] - instants_s[0]) / (len(instants_s) - 1)
+    if not 1e-9 <= period_s <= 1e6:
+        raise RecordingError(f"{path}: column {described.time}: a sample period of {period_s:g} s")
+    late = np.abs(instants_s - instants_s[0] - period_s * np.arange(len(instants_s))) / period_s
+    if late.max() > _MOST_JITTER:
+        worst = int(late.argmax())
+        raise RecordingError(
+            f"{path}: column {described.time}: row {described.first + worst} is {late[worst]:.2g} sample periods off"
+            " an even grid: resample the data, or pass --rate HZ"
+        )
+    return 1.0 / period_s
+
+
+def _run(
+    path: Path,
+    codes: NDArray[np.uint16],
+    clipped: NDArray[np.bool_],
+    channels: Mapping[str, Channel],
+    period_s: float,
+    time_scale: float,
+    rig: Mapping[str, Any],
+    scenario: Scenario | None,
+) -> Run:
+    """Recording without answers of a device."""
+    samples = len(codes)
+    if scenario is not None and samples > scenario.samples:
+        raise ConfigurationError(
+            f"{path}: has {number_of(samples, 'sample')}, scenario {scenario.name} {scenario.samples}:"
+            " pass the scenario that was played"
+        )
+    segments: tuple[Segment, ...] = () if scenario is None else scenario.segments()
+    kept = scenario or _unknown(path, samples, period_s)
+    return Run(
+        conditions=Conditions(
+            seed=0,
+            samples_asked=kept.samples,
+            sample_period_s=period_s,
+            time_scale=time_scale,
+            channels=dict(channels),
+            segments=segments,
+            scenario=kept.as_table(),
+            rig=rig,
+            dut={"name": "none", "kind": KIND, "datasheet": {"alarms": False}},
+            link="none",
+            faults=(UNSEEN,),
+        ),
+        codes=codes,
+        clipped=clipped,
+        theta=np.zeros((samples, 0), np.float32),
+        innovation=np.zeros(samples, np.float32),
+        statistic=np.zeros(samples, np.float32),
+        flags=np.zeros(samples, np.uint8),
+        alarm_index=np.zeros(0, np.int64),
+        alarm_kind=np.zeros(0, np.uint8),
+        alarm_statistic=np.zeros(0, np.float32),
+    )
+
+
+def _unknown(path: Path, samples: int, period_s: float) -> Scenario:
+    """Scenario of samples of which nothing is known: a generator that never switches, and no change."""
+    still = Excitation(low_v=0.0, high_v=0.0, frequency_hz=min(max(0.1 / period_s, 1e-6), 1e12))
+    return Scenario(samples=samples, excitation=still, name=path.stem, description="measured data, plant unknown")

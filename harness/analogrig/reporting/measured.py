@@ -1,0 +1,322 @@
+"""Estimates, fit and spectrum of a run whose plant is unknown, for its page and its summary.
+
+Nothing here is a verdict: the figures say how well the device's own model describes the samples.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.datasheet import ModelOrders
+from analogrig.reporting.markup import heading, number, row, table, text
+from analogrig.run import INPUT, OUTPUT, Run
+from analogrig.wording import number_of
+
+_MOST_ROWS = 20
+_SETTLING_N = 50
+"""Samples in which a simulation forgets that it began with the measured values."""
+
+_LEAST_N = 4 * _SETTLING_N
+"""Fewest samples of a stretch whose fit is computed, from those of its second half after the settling time."""
+
+_SEGMENT_N = 1024
+_COHERENT = 0.8
+"""Least coherence of a point of the measured frequency response."""
+
+_WIDTH, _HEIGHT, _LEFT, _TOP, _BELOW = 640, 200, 64, 12, 42
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """Slowest pair of poles of an estimate, and its gain for a constant input."""
+
+    resonance_hz: float
+    """Undamped natural frequency, in machine time."""
+    damping: float
+    """Damping ratio; 1 or more: two real poles."""
+    gain: float
+    """Units of the output per unit of the input."""
+
+
+@dataclass(frozen=True)
+class StretchFit:
+    """Last estimate of a stretch of samples ``start`` <= k < ``end`` without an alarm, and its fit there."""
+
+    start: int
+    end: int
+    mode: Oscillation | None
+    """None: the estimate has no stable pair of poles."""
+    innovation_codes: float
+    """Root mean square of the device's prediction errors."""
+    predicted: float
+    """Share of the output's standard deviation that the predictions explain."""
+    simulated: float | None
+    """Share that a simulation from the input alone explains; None if it is unstable."""
+    neighbours: float
+    """Correlation of neighbouring prediction errors; 0 for a model that explains all but white noise."""
+
+
+def mode_of(run: Run, theta: NDArray[np.float32]) -> Oscillation | None:
+    """Slowest oscillation of an estimate, (p,); None if it has none."""
+    model = run.datasheet.model
+    if model is None or model.na < 2 or not np.isfinite(theta).all():
+        return None
+    denominator, numerator = _polynomials(theta, model)
+    poles = np.roots(denominator)
+    with np.errstate(all="ignore"):
+        rates = np.log(poles.astype(complex)) / run.conditions.sample_period_s
+    slow = rates[np.argsort(np.abs(rates))][:2]
+    squared = (slow[0] * slow[1]).real
+    if not (np.isfinite(slow).all() and (slow.real < 0).all() and squared > 0):
+        return None
+    rate = math.sqrt(squared)
+    scales = [run.conditions.channels[name].lsb for name in run.conditions.program.measured]
+    gain = numerator.sum() / denominator.sum() * scales[1] / scales[0]
+    return Oscillation(rate / (2.0 * math.pi), float(-(slow[0] + slow[1]).real / (2.0 * rate)), float(gain))
+
+
+def _polynomials(theta: NDArray[np.float32], model: ModelOrders) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """1 + a1 z^-1 + ..., and z^-nk (b0 + b1 z^-1 + ...)."""
+    values = theta.astype(np.float64)
+    return np.append(1.0, values[: model.na]), np.append(np.zeros(model.nk), values[model.na : model.na + model.nb])
+
+
+def fits(run: Run) -> tuple[StretchFit, ...]:
+    """Fit of each stretch between alarms that is long enough; empty if the device reports no estimates of a model."""
+    if run.datasheet.model is None or not run.theta.shape[1] or not run.samples:
+        return ()
+    starts = sorted({start for start, _ in run.records} | {index + 1 for index in run.alarm_index.tolist()})
+    spans = [span for span in itertools.pairwise([*starts, run.samples]) if span[1] - span[0] >= _LEAST_N]
+    return tuple(_fit(run, *span) for span in spans[-_MOST_ROWS:])
+
+
+def _fit(run: Run, start: int, end: int) -> StretchFit:
+    first = start + (end - start) // 2  # the estimate converges in the first half
+    theta = run.theta[end - 1]
+    y = run.codes[first:end, OUTPUT].astype(np.float64)
+    errors = run.innovation[first:end].astype(np.float64)
+    spread = float(y.std()) or 1.0
+    simulated = _simulate(run, theta, first, end)
+    left = None if simulated is None else float(np.sqrt(np.mean((y - simulated)[_SETTLING_N:] ** 2)))
+    centred = errors - errors.mean()
+    power = float(centred @ centred) or 1.0
+    return StretchFit(
+        start=start,
+        end=end,
+        mode=mode_of(run, theta),
+        innovation_codes=float(np.sqrt(np.mean(errors**2))),
+        predicted=1.0 - float(np.sqrt(np.mean(errors**2))) / spread,
+        simulated=None if left is None or not math.isfinite(left) else 1.0 - left / spread,
+        neighbours=float(centred[1:] @ centred[:-1]) / power,
+    )
+
+
+def _simulate(run: Run, theta: NDArray[np.float32], first: int, end: int) -> NDArray[np.float64] | None:
+    """Output in codes of the model with this estimate, from the input and the first outputs; None if it is unstable."""
+    from scipy.signal import lfilter, lfiltic
+
+    model = run.datasheet.model
+    if model is None or not np.isfinite(theta).all():
+        return None
+    denominator, numerator = _polynomials(theta, model)
+    if (np.abs(np.roots(denominator)) >= 1.0).any():
+        return None
+    u, y = (run.codes[first:end, at].astype(np.float64) for at in (INPUT, OUTPUT))
+    offset = float(theta[-1]) if model.offset else 0.0
+    level = (offset + numerator.sum() * u[0]) / denominator.sum()
+    state = lfiltic(numerator, denominator, np.full(model.na, y[0] - level), np.zeros(len(numerator)))
+    return np.asarray(lfilter(numerator, denominator, u - u[0], zi=state)[0] + level)
+
+
+def lines(run: Run) -> list[str]:
+    """Estimates and fits for the terminal."""
+    found = fits(run)
+    if not found:
+        return ["  the device reports no estimates of a model"]
+    unit = _gain_unit(run)
+    head = f"  samples          resonance [Hz]  damping  gain [{unit}]  predicted  simulated"
+    return [head, *(_line(each) for each in found)]
+
+
+def _line(fit: StretchFit) -> str:
+    mode = (
+        "         no oscillation"
+        if fit.mode is None
+        else (f"{fit.mode.resonance_hz:14.6g}  {fit.mode.damping:7.4f}  {fit.mode.gain:10.5g}")
+    )
+    simulated = "unstable" if fit.simulated is None else f"{fit.simulated:.1%}"
+    return f"  {fit.start:7}-{fit.end - 1:<8} {mode}  {fit.predicted:9.1%}  {simulated:>9}"
+
+
+def section(run: Run) -> str:
+    """Section of the page; empty if the plant is known."""
+    if run.conditions.segments or not run.samples:
+        return ""
+    return (
+        '<section aria-labelledby="measured"><h2 id="measured">Measured data</h2>'
+        "<p>Nothing is known of the plant, so nothing is judged. The figures show how well the device's own model"
+        f" describes the samples.</p>{_alarms(run)}{_fit_table(run)}{_spectrum(run)}</section>"
+    )
+
+
+def _alarms(run: Run) -> str:
+    alarms = run.alarm_index.tolist()
+    if not alarms:
+        return f"<p>No alarm in {number_of(run.samples, 'sample', form=',')}.</p>"
+    shown = ", ".join(map(str, alarms[:_MOST_ROWS])) + (", …" if len(alarms) > _MOST_ROWS else "")
+    return f"<p>{number_of(len(alarms), 'alarm', form=',')}, at {text(shown)}.</p>"
+
+
+def _fit_table(run: Run) -> str:
+    found = fits(run)
+    if not found:
+        return "<p>The device reports no estimates of a model.</p>"
+    note = (
+        "<p>Each row is the estimate after the last sample of a stretch between alarms. Its fit is that in the second"
+        " half of the stretch: the share of the output's standard deviation that it predicts one sample ahead, and"
+        " simulates from the input alone.</p>"
+    )
+    gain = f"Gain [{_gain_unit(run)}]"
+    numbers = ("Resonance [Hz]", "Damping ratio", gain, "Predicted", "Simulated", "Error [codes]", "Its correlation")
+    return note + table("Estimates and their fit", heading(("Samples",), numbers), (_fit_row(each) for each in found))
+
+
+def _fit_row(fit: StretchFit) -> str:
+    mode = fit.mode
+    values = (None, None, None) if mode is None else (mode.resonance_hz, mode.damping, mode.gain)
+    cells = [number(value, ".5g") for value in values]
+    cells += [number(fit.predicted, ".1%"), number(fit.simulated, ".1%")]
+    cells += [number(fit.innovation_codes, ".3g"), number(fit.neighbours, "+.2f")]
+    return row([f'<th scope="row">{fit.start}–{fit.end - 1}</th>', *cells])
+
+
+def _gain_unit(run: Run) -> str:
+    units = [run.conditions.channels[name].unit for name in run.conditions.program.measured]
+    return f"{units[1]}/{units[0]}"
+
+
+# ----------------------------------------------------------------------------------------------------------- spectrum
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Averaged spectra of a run: frequencies (f,) in Hz of machine time, and at each of them the figures below."""
+
+    frequency_hz: NDArray[np.float64]
+    input_density: NDArray[np.float64]
+    """Units squared per Hz."""
+    output_density: NDArray[np.float64]
+    response: NDArray[np.complex128]
+    """Output over input, in their units."""
+    coherence: NDArray[np.float64]
+
+
+def spectrum(run: Run) -> Spectrum | None:
+    """Spectra of input and output by Welch's method; None if the run is too short."""
+    from scipy import signal
+
+    values = [run.channel(name) for name in run.conditions.program.measured]
+    length = min(_SEGMENT_N, 1 << (run.samples // 2).bit_length() - 1) if run.samples >= 4 else 0
+    if length < 32:
+        return None
+    u, y = (each - each.mean() for each in values)
+    settings = {"fs": 1.0 / run.conditions.sample_period_s, "nperseg": length}
+    frequency, uu = signal.welch(u, **settings)
+    yy, uy = signal.welch(y, **settings)[1], signal.csd(u, y, **settings)[1]
+    with np.errstate(all="ignore"):
+        return Spectrum(frequency, uu, yy, uy / uu, np.abs(uy) ** 2 / (uu * yy))
+
+
+def _model_response(run: Run, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Magnitude of the last estimate's frequency response in units; None without a model."""
+    model = run.datasheet.model
+    if model is None or not run.theta.shape[1] or not np.isfinite(run.theta[-1]).all():
+        return None
+    denominator, numerator = _polynomials(run.theta[-1], model)
+    delay = np.exp(-2j * np.pi * frequency_hz * run.conditions.sample_period_s)
+    scales = [run.conditions.channels[name].lsb for name in run.conditions.program.measured]
+    value = np.polynomial.polynomial.polyval(delay, numerator) / np.polynomial.polynomial.polyval(delay, denominator)
+    return np.asarray(np.abs(value) * scales[1] / scales[0])
+
+
+def _spectrum(run: Run) -> str:
+    found = spectrum(run)
+    if found is None:
+        return "<p>The run is too short for a spectrum.</p>"
+    units = [run.conditions.channels[name].unit for name in run.conditions.program.measured]
+    densities = {
+        f"input [dB of {units[0]}²/Hz]": (_decibels(found.input_density, 10.0), "line"),
+        f"output [dB of {units[1]}²/Hz]": (_decibels(found.output_density, 10.0), "dashed"),
+    }
+    coherent = np.where(found.coherence >= _COHERENT, np.abs(found.response), np.nan)
+    curves = {"output over input": (_decibels(coherent, 20.0), "dots")}
+    model = _model_response(run, found.frequency_hz)
+    if model is not None:
+        curves["the device's last estimate"] = (_decibels(model, 20.0), "line")
+    gain = f"Frequency response in dB of {_gain_unit(run)}, where the coherence is at least {_COHERENT:g}"
+    return "".join(
+        _plot(found.frequency_hz[1:], {name: (values[1:], style) for name, (values, style) in each.items()}, caption)
+        for caption, each in (("Power spectral density", densities), (gain, curves))
+    )
+
+
+def _decibels(values: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
+    with np.errstate(all="ignore"):
+        out = factor * np.log10(values)
+    return np.where(np.isfinite(out), out, np.nan)
+
+
+def _plot(frequency_hz: NDArray[np.float64], curves: dict[str, tuple[NDArray[np.float64], str]], caption: str) -> str:
+    """Figure of some curves over the frequency."""
+    seen = np.concatenate([values[np.isfinite(values)] for values, _ in curves.values()])
+    if not len(seen):
+        return ""
+    low = 10.0 * math.floor(float(seen.min()) / 10.0)
+    high, most_hz = max(10.0 * math.ceil(float(seen.max()) / 10.0), low + 10.0), float(frequency_hz[-1])
+    x = _LEFT + (_WIDTH - _LEFT - 10) * frequency_hz / most_hz
+    parts = [*_level_lines(low, high), *_frequency_words(most_hz)]
+    for name, (values, style) in curves.items():
+        y = _TOP + _HEIGHT * (high - values) / (high - low)
+        parts.append(f"<g>{_curve(x, y, style)}<title>{text(name)}</title></g>")
+    named = "; ".join(f"{_STYLES[style]}: {name}" for name, (_, style) in curves.items())
+    return (
+        f'<figure><figcaption>{text(caption)} over Hz of machine time. {text(named)}</figcaption><div class="scroll">'
+        f'<svg role="img" aria-label="{text(caption)}" width="{_WIDTH}" height="{_TOP + _HEIGHT + _BELOW}"'
+        f' font-size="12">{"".join(parts)}</svg></div></figure>'
+    )
+
+
+_STYLES = {"line": "line", "dashed": "dashed line", "dots": "dots"}
+
+
+def _curve(x: NDArray[np.float64], y: NDArray[np.float64], style: str) -> str:
+    points = [(a, b) for a, b in zip(x.tolist(), y.tolist(), strict=True) if math.isfinite(b)]
+    if style == "dots":
+        return "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.5" fill="currentColor"/>' for a, b in points)
+    dash = ' stroke-dasharray="5 3"' if style == "dashed" else ""
+    line = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
+    return f'<polyline points="{line}" fill="none" stroke="currentColor"{dash}/>'
+
+
+def _level_lines(low: float, high: float) -> Iterator[str]:
+    step = 10.0 * math.ceil((high - low) / 60.0)
+    for i in range(int((high - low) / step) + 1):
+        y = _TOP + _HEIGHT * (1.0 - i * step / (high - low))
+        yield f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - 10}" stroke="currentColor" stroke-opacity=".2"/>'
+        yield _words(_LEFT - 8, y + 4, f"{low + i * step:g}", "end")
+
+
+def _frequency_words(most_hz: float) -> Iterator[str]:
+    for i in range(5):
+        x = _LEFT + (_WIDTH - _LEFT - 10) * i / 4
+        yield _words(x, _TOP + _HEIGHT + 16, f"{most_hz * i / 4:.4g}", "middle" if i else "start")
+
+
+def _words(x: float, y: float, words: str, anchor: str) -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="currentColor">{text(words)}</text>'

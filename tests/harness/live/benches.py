@@ -1,0 +1,106 @@
+"""Live benches: on a simulated clock, whose hand acts at set times; and served in real time."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from analogrig.devices.registry import describe
+from analogrig.live.commands import Command
+from analogrig.live.server import BenchServer
+from analogrig.live.session import LiveSession
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
+
+SEED = 7
+
+Action = Command | Callable[[LiveSession], None]
+
+
+class ScriptedClock:
+    """Clock that stands still but in waits, and acts when its time has come. The session ends after the last action."""
+
+    def __init__(self, script: Sequence[tuple[float, Action]]) -> None:
+        self.session: LiveSession | None = None
+        self.now_s = 0.0
+        self._script = list(script)
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def wait(self, woken: threading.Event, seconds: float | None) -> None:
+        """Advance to the next action, or by ``seconds``."""
+        assert self.session is not None
+        if woken.is_set():
+            return
+        until_s = self.now_s + (1e9 if seconds is None else seconds)
+        if not self._script:
+            self.session.close()
+        elif self._script[0][0] <= until_s:
+            at_s, action = self._script.pop(0)
+            self.now_s = max(at_s, self.now_s)
+            if callable(action):
+                action(self.session)
+            else:
+                self.session.do(action)
+        else:
+            self.now_s = until_s
+
+
+def scripted_session(
+    script: Sequence[tuple[float, Action]], folder: Path, *, scenario: Scenario | None = None, rig: str = "emulator"
+) -> LiveSession:
+    """Session that has played a script to its end; time is that of the machine."""
+    clock = ScriptedClock(script)
+    with open_rig(rig) as opened, describe("inproc").direct() as device:
+        session = LiveSession(opened, scenario or Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
+        clock.session = session
+        session.run()
+    return session
+
+
+class LiveBench:
+    """Bench that is served from a thread of its own, in real time: what ``analogrig bench`` does, without a process."""
+
+    def __init__(
+        self, folder: Path, *, token: str = "", port: int = 0, dut: str = "inproc", slow_s: float = 10.0
+    ) -> None:
+        self._folder, self._dut = folder, dut
+        self._settings: dict[str, Any] = {"token": token, "slow_s": slow_s}
+        self._port = port
+        self._ready: Future[BenchServer] = Future()
+        self._stop: asyncio.Event | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()))
+
+    def __enter__(self) -> BenchServer:
+        self._thread.start()
+        return self._ready.result(60)
+
+    def __exit__(self, *_: object) -> None:
+        assert self._loop is not None
+        assert self._stop is not None
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join()
+
+    async def _serve(self) -> None:
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        with open_rig("emulator") as rig, describe(self._dut).direct() as device:
+            session = LiveSession(rig, Scenario.load("thesis"), device, SEED, folder=self._folder)
+            playing = asyncio.create_task(asyncio.to_thread(session.run))
+            try:
+                server = BenchServer(session, **self._settings)
+                await server.listen(port=self._port)
+                self._ready.set_result(server)
+                await self._stop.wait()
+                await server.close()
+            except BaseException as error:
+                self._ready.set_exception(error)
+                raise
+            finally:
+                session.close()
+                await playing

@@ -1,0 +1,87 @@
+"""The command ``analogrig bench`` in a process of its own, with other devices and a real rig."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from analogrig import cli
+from analogrig.live.commands import SetRecording
+from analogrig.run import Run
+from tests.harness.live.benches import scripted_session
+from tests.harness.live.test_server import Client, open_client, played
+from tests.served.serving import serving
+
+SHOWN = 12
+"""Alarms of a state: later ones displace that of the change."""
+
+
+@contextmanager
+def benched(*options: str, folder: Path) -> Iterator[Any]:
+    """Address and token of a running command; it is ended by SIGTERM."""
+    command = [sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--json", "--out", str(folder), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            address = json.loads(process.stdout.readline())["address"]
+            yield SimpleNamespace(address=address, token=address.rpartition("=")[2])
+        finally:
+            process.send_signal(signal.SIGTERM)
+            errors = process.communicate()[1]
+    assert (process.returncode, errors) == (130, "analogrig: interrupted\n")
+
+
+@pytest.mark.parametrize("dut", ["host", "mean-between-faults"])
+def test_devices_behind_a_link_answer_live(dut: str, tmp_path: Path) -> None:
+    async def work() -> None:
+        async with open_client(bench) as socket:
+            client = Client(socket)
+            await client.until(lambda state: state["samples"] > 1500)
+            assert await client.ask("turn", name="K", value=15000.0) == ""
+            state = await client.until(
+                lambda state: any(alarm["what"] for alarm in state["alarms"]) or state["alarm_count"] > SHOWN
+            )
+            assert all(alarm["latency_n"] > 0 for alarm in state["alarms"] if alarm["what"])
+            assert not state["notices"]
+
+    with benched("--dut", dut, folder=tmp_path) as bench:
+        played(work)
+
+
+def test_served_instrument_is_driven_record_by_record(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with open_client(bench) as socket:
+            client = Client(socket)
+            state = await client.until(lambda state: state["drives"])
+            assert not state["generator"]["on"]  # until a hand switches it on
+            assert "force" in await client.ask("generate", high_v=20.0)
+            assert "whole records" in await client.ask("step")
+            assert await client.ask("generate", on=True) == ""
+            await client.until(lambda state: state["samples"] > 0)
+            assert await client.ask("turn", name="K", value=15000.0) == ""
+            state = await client.until(lambda state: any(alarm["what"] == "K" for alarm in state["alarms"]))
+            assert state["alarms"][-1]["change"] == 2000
+            assert await client.ask("record", on=True) == ""
+            state = await client.until(lambda state: state["saved"])
+            assert not state["recording"]
+            assert Run.load(Path(state["saved"][0]["run"])).samples == 4000
+
+    with serving() as served:
+        rigs = served.rigs_file(tmp_path)
+        with benched("--rig", f"{rigs}:bench", "--allow", served.address, folder=tmp_path / "out") as bench:
+            played(work)
+
+
+def test_recording_cannot_be_operated_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (saved,) = scripted_session(((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False))), tmp_path).saved
+    assert cli.main(["bench", "--rig", f"recording:{saved.run}", "--no-open", "--out", str(tmp_path)]) == 2
+    assert "no pots to turn" in capsys.readouterr().err

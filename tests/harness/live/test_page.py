@@ -1,0 +1,198 @@
+"""Page of the live bench in a real browser."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from analogrig import cli
+from analogrig.live.commands import Restart, SetPlaying, Step
+from analogrig.live.server import BenchServer
+from analogrig.run import Run
+from tests.browser import Watched
+from tests.harness.live.benches import LiveBench
+
+expect.set_options(timeout=600_000)
+
+TOKEN = "again"  # noqa: S105 - of a server that lives for one test
+K = '[data-parameter="K"]'
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[BenchServer]:
+    with LiveBench(tmp_path) as server:
+        yield server
+
+
+@pytest.fixture
+def opened(browser: Browser, bench: BenchServer) -> Iterator[Watched]:
+    watched = opened_at(browser, bench)
+    yield watched
+    watched.page.close()
+
+
+def opened_at(browser: Browser, bench: BenchServer) -> Watched:
+    watched = Watched(browser, bench.address)
+    watched.page.set_default_timeout(600_000)
+    watched.page.wait_for_selector("html[data-connected][data-role]")
+    return watched
+
+
+def wait_for_frames(page: Page, count: int) -> None:
+    page.wait_for_function("(count) => Number(document.documentElement.dataset.frames ?? 0) >= count", arg=count)
+
+
+def frames_of(page: Page) -> int:
+    return int(page.evaluate("Number(document.documentElement.dataset.frames ?? 0)"))
+
+
+def test_scope_moves_without_a_complaint_or_a_request_elsewhere(opened: Watched, bench: BenchServer) -> None:
+    wait_for_frames(opened.page, frames_of(opened.page) + 5)
+    assert min(opened.pixels((0, 114, 178))) > 100
+    expect(opened.page.locator("#triggered")).to_have_text("triggered")
+    expect(opened.page.locator('tr[data-signal="force"]')).to_contain_text("200 Hz")
+    assert opened.complaints == []
+    assert opened.requests == [bench.address]
+
+
+def test_pot_turned_by_the_keyboard_raises_an_alarm_within_twice_its_bound(opened: Watched, bench: BenchServer) -> None:
+    session, page = bench.session, opened.page
+    for command in (SetPlaying(on=False), Restart(), Step(1700)):
+        session.do(command)
+    expect(page.locator("#clock")).to_contain_text("take 2, 85 ms, 1700 samples")
+    page.locator(K).press("PageDown")
+    expect(page.locator(K)).to_have_attribute("aria-valuetext", re.compile("^K 22180"))
+    page.wait_for_function("() => document.getElementById('play').textContent === 'Run'")
+    session.do(Step(300))
+    row = page.locator("#alarms tbody tr").first
+    expect(row).to_contain_text("K")
+    expect(row.locator("td").nth(4)).not_to_have_text("–")
+    take, sample, change, latency, bound = row.locator("td").all_inner_texts()
+    assert (take, change) == ("2", "K")
+    assert int(sample) == 1699 + int(latency)
+    assert 0 < int(latency) <= 2 * int(bound)
+    expect(page.locator("#alarm")).to_contain_text(f"K changed: alarm {latency} samples later")
+
+
+def test_recording_made_on_the_page_replays_with_the_same_alarms(
+    opened: Watched, bench: BenchServer, tmp_path: Path
+) -> None:
+    page = opened.page
+    page.get_by_role("button", name="Record").click()
+    expect(page.get_by_role("button", name="End the recording")).to_be_visible()
+    page.wait_for_function(
+        "() => Number(document.getElementById('clock').textContent.match(/(\\d+) samples/)[1]) > 2000"
+    )
+    page.locator(K).press("PageDown")
+    expect(page.locator("#alarms tbody tr").first).to_contain_text("K")
+    page.get_by_role("button", name="End the recording").click()
+    expect(page.locator("#notices")).to_contain_text("analogrig replay")
+    (saved,) = bench.session.saved
+    recorded = Run.load(saved.run)
+    assert len(recorded.alarm_index) >= 1
+    cli.main(["replay", str(saved.run), "--out", str(tmp_path / "again")])
+    assert Run.load(tmp_path / "again" / "run.npz").alarm_index.tolist() == recorded.alarm_index.tolist()
+    assert opened.complaints == []
+
+
+def test_pots_turn_by_wheel_drag_and_number(opened: Watched, bench: BenchServer) -> None:
+    page, values = opened.page, bench.session.values
+    knob = page.locator(K)
+    page.locator(".knob").filter(has=knob).locator("input").fill("20000")
+    page.keyboard.press("Enter")
+    expect(knob).to_have_attribute("aria-valuenow", "20000")
+    knob.hover()
+    page.mouse.wheel(0, 100)
+    expect(knob).to_have_attribute("aria-valuetext", "K 19802 N/m")
+    box = knob.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 40, box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 40, box["y"] + 60, steps=4)
+    page.mouse.up()
+    expect(knob).to_have_attribute("aria-valuetext", re.compile("^K 18"))
+    page.wait_for_function("() => document.querySelector('#felt').textContent !== '–'")
+    assert values["K"] < 19802
+    page.locator(".knob").filter(has=knob).locator("input").fill("1e9")
+    page.keyboard.press("Enter")
+    expect(knob).to_have_attribute("aria-valuenow", "29000")
+
+
+def test_modes_faults_generator_and_probes_are_at_hand(opened: Watched, bench: BenchServer) -> None:
+    page = opened.page
+    page.get_by_role("button", name="hold", exact=True).click()
+    expect(page.get_by_role("button", name="hold", exact=True)).to_have_attribute("aria-pressed", "true")
+    page.get_by_role("button", name="operate", exact=True).click()
+    page.get_by_role("button", name="channel displacement stuck").click()
+    expect(page.get_by_role("button", name="channel displacement stuck")).to_have_attribute("aria-pressed", "true")
+    assert bench.session.injected == {"stuck"}
+    page.get_by_label("Frequency").fill("100")
+    page.keyboard.press("Enter")
+    expect(page.locator('tr[data-signal="force"]')).to_contain_text("100 Hz")
+    page.get_by_role("button", name="probe U3").click()
+    expect(page.locator('tr[data-signal="U3"]')).to_be_visible()
+    page.get_by_role("button", name="probe U2").press("Enter")
+    expect(page.locator('tr[data-signal="U2"]')).not_to_contain_text("–")
+    page.get_by_role("button", name="Switch off").click()
+    expect(page.locator("#role")).to_contain_text("generator is off")
+    assert opened.complaints == []
+
+
+def test_spectrum_xy_persistence_and_cursors(opened: Watched) -> None:
+    page = opened.page
+    page.get_by_role("checkbox", name="persistence").check()
+    page.get_by_role("checkbox", name="cursors").check()
+    expect(page.locator("#cursor-text")).to_contain_text(re.compile("B − A: .*1/Δt"))
+    page.get_by_label("Display").select_option("fft")
+    expect(page.locator("#cursor-text")).to_contain_text("dB")
+    page.get_by_label("Display").select_option("xy")
+    expect(page.locator("#xy")).to_be_visible()
+    wait_for_frames(page, frames_of(page) + 3)
+    painted = page.evaluate(
+        "() => { const c = document.getElementById('xy'); const d = c.getContext('2d')"
+        ".getImageData(0, 0, c.width, c.height).data; let n = 0;"
+        " for (let i = 0; i < d.length; i += 4) n += d[i + 3] > 0; return n; }"
+    )
+    assert painted > 1000
+    page.get_by_label("Values in").select_option("problem")
+    expect(page.locator('tr[data-signal="displacement"]')).to_contain_text(" m")
+    assert opened.complaints == []
+
+
+def test_second_page_watches_and_drives_when_the_first_is_closed(browser: Browser, bench: BenchServer) -> None:
+    first, second = opened_at(browser, bench), opened_at(browser, bench)
+    expect(second.page.locator("#role")).to_have_text("This page watches: another one drives.")
+    expect(second.page.get_by_role("button", name="Record")).to_be_disabled()
+    first.page.locator(K).press("PageDown")
+    expect(second.page.locator(K)).to_have_attribute("aria-valuetext", re.compile("^K 22180"))
+    first.page.close()
+    expect(second.page.locator("#role")).to_contain_text("Nobody drives")
+    second.page.get_by_role("button", name="Drive").click()
+    expect(second.page.locator("#role")).to_contain_text("The generator is off")
+    second.page.get_by_role("button", name="Switch on").click()
+    expect(second.page.locator("#role")).to_have_text("This page drives the bench.")
+    assert second.complaints == []
+    second.page.close()
+
+
+def test_page_connects_again_when_the_server_has_been_restarted(browser: Browser, tmp_path: Path) -> None:
+    with LiveBench(tmp_path, token=TOKEN) as server:
+        watched = opened_at(browser, server)
+        port = int(server.address.split(":")[2].partition("/")[0])
+    page = watched.page
+    page.wait_for_selector("html:not([data-connected])")
+    expect(page.locator("#trouble")).to_contain_text("does not answer")
+    with LiveBench(tmp_path, token=TOKEN, port=port):
+        page.wait_for_selector("html[data-connected]")
+        wait_for_frames(page, frames_of(page) + 3)
+        expect(page.locator("#trouble")).to_be_hidden()
+        page.close()
+
+
+def test_page_has_no_faults_light_and_dark_wide_and_narrow(opened: Watched) -> None:
+    wait_for_frames(opened.page, 2)
+    assert opened.faults() == []

@@ -1,0 +1,309 @@
+"""Server of a live bench: who gets in, who drives, and what hostile or slow clients can do."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import InvalidStatus
+from websockets.http11 import USER_AGENT
+
+from analogrig.live.scope import unpacked
+from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, BenchServer
+from analogrig.run import Run
+from tests.harness.live.benches import LiveBench
+
+TIMEOUT_S = 600.0  # only if something is broken, also under a load of ten
+TRIGGER = {"source": "force", "level": 5.0}
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[BenchServer]:
+    with LiveBench(tmp_path) as server:
+        yield server
+
+
+def host_of(server: BenchServer) -> str:
+    return urlsplit(server.address).netloc
+
+
+class Client:
+    """Client of the page's endpoint."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self.socket = socket
+        self.state: dict[str, Any] = {}
+        self._number = 0
+
+    async def ask(self, name: str, /, **table: Any) -> str:
+        """Send a message and return the error of its answer; empty if there is none."""
+        self._number += 1
+        await self.socket.send(json.dumps({"do": name, "id": self._number, **table}))
+        async for message in self.socket:
+            answer = json.loads(message) if isinstance(message, str) else {}
+            self.state = answer.get("state", self.state)
+            if answer.get("re") == self._number:
+                return str(answer.get("error", ""))
+        raise AssertionError("the connection has closed")
+
+    async def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        """State for which something holds."""
+        while not (self.state and holds(self.state)):
+            message = await self.socket.recv()
+            self.state = (json.loads(message) if isinstance(message, str) else {}).get("state", self.state)
+        return self.state
+
+    async def frame(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Next frame."""
+        while True:
+            message = await self.socket.recv()
+            if isinstance(message, bytes):
+                header, values = unpacked(message)
+                return header, dict(values)
+
+
+def open_client(server: BenchServer, path: str = "/live", **more: Any) -> Any:
+    """Connection to an endpoint, with the token and the origin of the page unless ``more`` has others."""
+    token = more.pop("token", server.token)
+    more.setdefault("origin", f"http://{host_of(server)}")
+    return connect(f"ws://{host_of(server)}{path}?token={token}", **more)
+
+
+def played(work: Callable[[], Awaitable[Any]]) -> Any:
+    async def bounded() -> Any:
+        async with asyncio.timeout(TIMEOUT_S):
+            return await work()
+
+    return asyncio.run(bounded())
+
+
+def status_of(url: str, **headers: str) -> int:
+    try:
+        request = urllib.request.Request(url, headers=headers)  # noqa: S310 - the address of our own server
+        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:  # noqa: S310
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_page_needs_the_token_and_a_host_of_this_server(bench: BenchServer) -> None:
+    base = f"http://{host_of(bench)}"
+    assert status_of(bench.address) == 200
+    assert status_of(f"{base}/?token={bench.token}x") == 403
+    assert status_of(base) == 403
+    assert status_of(f"{base}/etc/passwd?token={bench.token}") == 404
+    assert status_of(bench.address, Host="evil.example") == 403
+
+
+@pytest.mark.parametrize("path", ["/live", "/foxglove"])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"token": "no"},
+        {"token": ""},
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"additional_headers": {"Host": "evil.example"}},
+    ],
+    ids=str,
+)
+def test_socket_needs_token_host_and_origin(bench: BenchServer, path: str, wrong: dict[str, Any]) -> None:
+    async def work() -> int:
+        with pytest.raises(InvalidStatus) as refused:
+            async with open_client(bench, path, **wrong):
+                pass
+        return int(refused.value.response.status_code)
+
+    assert played(work) == 403
+    assert not bench._clients
+
+
+def test_endpoint_of_the_page_needs_an_origin(bench: BenchServer) -> None:
+    async def work() -> None:
+        with pytest.raises(InvalidStatus):
+            async with open_client(bench, origin=None, user_agent_header=USER_AGENT):
+                pass
+
+    played(work)
+
+
+def test_first_client_drives_and_others_watch(bench: BenchServer) -> None:
+    async def work() -> None:
+        async with open_client(bench) as one, open_client(bench) as two:
+            driver, watcher = Client(one), Client(two)
+            assert await driver.ask("turn", name="K", value=18000.0) == ""
+            assert "watches" in await watcher.ask("turn", name="K", value=20000.0)
+            assert "another client drives" in await watcher.ask("drive")
+            assert await watcher.ask("view", signals=["U1"], trigger=TRIGGER, samples=100) == ""
+            state = await watcher.until(lambda state: state["values"]["K"] == 18000.0)
+            assert not state["drives"]
+            header, _ = await watcher.frame()
+            assert header["signals"] == ["U1"]
+
+    played(work)
+
+
+def test_generator_is_off_when_the_driver_is_gone_and_the_recording_is_saved(bench: BenchServer) -> None:
+    async def work() -> None:
+        async with open_client(bench) as two:
+            async with open_client(bench) as one:
+                watcher = Client(one)
+                await watcher.until(lambda state: not state["drives"])
+            driver = Client(two)
+            assert await driver.ask("record", on=True) == ""
+            await driver.until(lambda state: state["recording"] and state["samples"] > 2000)
+        async with open_client(bench) as three:
+            state = await Client(three).until(lambda state: not state["generator"]["on"] and state["saved"])
+            assert state["drives"]
+            assert Run.load(Path(state["saved"][0]["run"])).samples > 2000
+
+    played(work)
+
+
+def test_limits_of_the_rig_hold_whatever_a_client_sends(bench: BenchServer) -> None:
+    async def work() -> None:
+        async with open_client(bench) as socket:
+            client = Client(socket)
+            assert "K must be" in await client.ask("turn", name="K", value=1e12)
+            assert "must be a number" in await client.ask("turn", name="K", value="1")
+            assert "high_v" in await client.ask("generate", low_v=20.0, high_v=10.0)
+            assert "no signal is called" in await client.ask("view", signals=["secret"], trigger=TRIGGER)
+            assert "samples must be" in await client.ask("view", signals=["U1"], trigger=TRIGGER, samples=10**9)
+            assert "no command is called" in await client.ask("__class__")
+
+    played(work)
+    assert bench.session.values == bench.session.desk.scenario.plant.parameters()
+
+
+HOSTILE = (
+    b"\x00" * 100,
+    "",
+    "null",
+    "[]",
+    '"do"',
+    "{",
+    "[" * 5000,
+    '{"do": {}}',
+    '{"do": "turn", "name": [], "value": {}}',
+    '{"do": "turn", "name": "K", "value": NaN}',
+    '{"do": "view", "signals": [], "trigger": 1}',
+    '{"do": "step", "samples": 1e99}',
+    '{"do": "tempo", "factor": -1}',
+    '{"id": {"a": [1]}, "do": "x"}',
+)
+
+
+def test_wrong_messages_are_answered_and_the_driver_is_unharmed(bench: BenchServer) -> None:
+    async def work() -> None:
+        async with open_client(bench) as one:
+            driver = Client(one)
+            await driver.until(lambda state: state["drives"])
+            async with open_client(bench) as two, open_client(bench, "/foxglove") as three:
+                for message in HOSTILE:
+                    await two.send(message)
+                    await three.send(message)
+                errors = 0
+                while errors < len(HOSTILE):
+                    answer = await two.recv()
+                    errors += isinstance(answer, str) and "error" in json.loads(answer)
+                statuses = 0
+                while statuses < len(HOSTILE):
+                    answer = await three.recv()
+                    statuses += isinstance(answer, str) and json.loads(answer)["op"] == "status"
+                for socket in (two, three):
+                    await socket.send("x" * (MOST_MESSAGE_BYTES + 1))
+                    await socket.wait_closed()
+                    assert socket.close_code == 1009
+            assert await driver.ask("turn", name="K", value=18000.0) == ""
+            await driver.until(lambda state: state["values"]["K"] == 18000.0)
+
+    played(work)
+
+
+def test_client_that_takes_nothing_is_dropped_and_holds_up_nobody(tmp_path: Path) -> None:
+    async def work(bench: BenchServer) -> None:
+        async with open_client(bench) as one:
+            driver = Client(one)
+            await driver.ask("view", signals=["force"], trigger=TRIGGER)
+            small = socket.socket()
+            small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            small.connect(("127.0.0.1", int(host_of(bench).rpartition(":")[2])))
+            async with open_client(bench, max_queue=1, sock=small) as two:
+                view = {"signals": ["U1", "U2", "U3", "U4"], "trigger": TRIGGER, "columns": 4000, "samples": 60000}
+                await two.send(json.dumps({"do": "view", **view}))
+                two.transport.pause_reading()
+                await driver.until(lambda state: state["clients"] == 1 and state["samples"] > 30_000)
+                frames = [await driver.frame() for _ in range(3)]
+                assert frames[-1][0]["end"] > frames[0][0]["end"]
+                two.transport.abort()
+
+    with LiveBench(tmp_path, slow_s=0.5) as bench:
+        played(lambda: work(bench))
+
+
+def test_newcomer_is_turned_away_when_all_places_are_taken(bench: BenchServer) -> None:
+    async def work() -> None:
+        async with asyncio.TaskGroup() as group:
+            clients = [group.create_task(open_client(bench).__aenter__()) for _ in range(MOST_CLIENTS)]
+        with pytest.raises(InvalidStatus) as refused:
+            async with open_client(bench):
+                pass
+        assert refused.value.response.status_code == 503
+        await asyncio.gather(*(each.result().close() for each in clients))
+
+    played(work)
+
+
+def test_frames_hold_what_the_card_has_seen(bench: BenchServer) -> None:
+    async def work() -> None:
+        async with open_client(bench) as socket:
+            client = Client(socket)
+            await client.ask("view", signals=["force"], samples=400, trigger=TRIGGER | {"mode": "normal"})
+            header, values = await client.frame()
+            force = values["force"]
+            trigger = header["trigger"] - header["first"]
+            assert trigger == pytest.approx(100, abs=2)
+            assert force[int(trigger)] < 5.0 < force[int(trigger) + 2]
+            assert header["measures"]["force"]["frequency"] == pytest.approx(200.0, rel=0.01)
+            assert np.ptp(force) == pytest.approx(9.8, abs=0.1)
+            await client.ask("view", signals=["force"], trigger=TRIGGER, samples=20000, columns=100)
+            header, values = await client.frame()
+            while header["samples"] < 20000:
+                header, values = await client.frame()
+            assert len(values["force"]) == header["points"] == 200
+            assert np.ptp(values["force"]) == pytest.approx(9.8, abs=0.1)
+
+    played(work)
+
+
+def test_single_trigger_shows_one_screen_until_it_is_armed_again(bench: BenchServer) -> None:
+    async def work() -> None:
+        async with open_client(bench) as socket:
+            client = Client(socket)
+            trigger = TRIGGER | {"mode": "single"}
+            await client.ask("view", signals=["force"], samples=100, trigger=trigger)
+            header, _ = await client.frame()
+            seen = client.state.get("samples", 0)
+            frames = 0
+            while client.state.get("samples", 0) < seen + 5000:
+                message = await socket.recv()
+                if isinstance(message, bytes):
+                    frames += 1
+                else:
+                    client.state = json.loads(message).get("state", client.state)
+            assert frames == 0
+            await client.ask("view", signals=["force"], samples=100, trigger=trigger, arm=1)
+            again, _ = await client.frame()
+            assert again["trigger"] > header["trigger"]
+
+    played(work)

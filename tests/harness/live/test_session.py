@@ -1,0 +1,275 @@
+"""The live session without a browser, on a simulated clock."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analogrig import cli
+from analogrig.errors import ConfigurationError
+from analogrig.judging.verdict import judge
+from analogrig.live.commands import (
+    ClearLamps,
+    Generate,
+    Inject,
+    Operate,
+    Restart,
+    SetPlaying,
+    SetRecording,
+    Step,
+    Tempo,
+    Turn,
+    command_of,
+)
+from analogrig.live.desk import SteppedDesk
+from analogrig.live.session import BLOCK_S, LiveSession
+from analogrig.program import Program
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.run import Run
+from analogrig.scenario import Scenario
+from analogrig_emulator import SuspensionComputer
+from tests.harness.live.benches import SEED, scripted_session
+
+RATE_HZ = 20_000
+BLOCK_N = int(RATE_HZ * BLOCK_S)
+
+PLAYED_BY_HAND = (
+    (0.0, SetRecording(on=True)),
+    (0.1, Turn("K", 18000.0)),
+    (0.2, Turn("B", 3453.0, 100)),
+    (0.3, Turn("M", 60.0)),
+    (0.4, SetRecording(on=False)),
+    (0.41, SetPlaying(on=False)),
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> LiveSession:
+    return scripted_session(PLAYED_BY_HAND, tmp_path_factory.mktemp("live"))
+
+
+def test_recording_names_the_sample_of_every_turn(recorded: LiveSession) -> None:
+    (saved,) = recorded.saved
+    run = Run.load(saved.run)
+    assert run.samples == saved.samples == 32 * BLOCK_N - BLOCK_N
+    scenario = Scenario.load(str(saved.scenario))
+    assert [(each.sample % BLOCK_N, each.set, each.ramp_n) for each in scenario.tweaks] == [
+        (BLOCK_N - 1, {"K": 18000.0}, 0),
+        (BLOCK_N - 1, {"B": 3453.0}, 100),
+        (BLOCK_N - 1, {"M": 60.0}, 0),
+    ]
+    assert [segment.start for segment in run.conditions.segments] == [0, *(each.sample for each in scenario.tweaks)]
+
+
+def test_scenario_of_a_recording_plays_the_same_codes_on_the_emulator(recorded: LiveSession, tmp_path: Path) -> None:
+    (saved,) = recorded.saved
+    out = tmp_path / "again"
+    cli.main(["run", "--scenario", str(saved.scenario), "--rig", "emulator", "--dut", "inproc", "--out", str(out)])
+    again, by_hand = Run.load(out / "run.npz"), Run.load(saved.run)
+    np.testing.assert_array_equal(again.codes, by_hand.codes)
+    np.testing.assert_array_equal(again.theta, by_hand.theta)
+
+
+def test_replay_and_judge_find_the_alarms_that_were_seen_live(
+    recorded: LiveSession, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (saved,) = recorded.saved
+    seen = {alarm.sample: alarm.latency_n for alarm in recorded.notes.alarms if alarm.take == 2}
+    for command in ("replay", "judge"):
+        cli.main([command, str(saved.run), "--out", str(tmp_path / command), "--json"])
+        found = json.loads(capsys.readouterr().out)
+        assert Run.load(tmp_path / command / "run.npz").alarm_index.tolist() == list(seen)
+        live = [alarm for alarm in recorded.notes.alarms if alarm.what]
+        first = {alarm.change: alarm for alarm in reversed(live)}
+        assert [(each["latency"], each["bound"]) for each in found["tweaks"]] == [
+            (first[each["sample"]].latency_n, first[each["sample"]].bound_n) for each in found["tweaks"]
+        ]
+
+
+@pytest.mark.parametrize("program", ["dc-motor", "pendulum", "two-mass"])
+def test_alarm_of_any_program_has_the_latency_and_the_bound_of_its_recording(program: str, tmp_path: Path) -> None:
+    scenario = Scenario.of_program(Program.load(program))
+    name, row = next(iter(scenario.program.parameters.items()))
+    script = ((0.0, SetRecording(on=True)), (0.1, Turn(name, row.high, 40)), (0.2, SetRecording(on=False)))
+    session = scripted_session(script, tmp_path, scenario=scenario, rig="emulator-real")
+    assert list(session.knobs) == list(scenario.program.parameters)
+    assert not session.notes.estimates()  # these programs state none
+    alarm = next(alarm for alarm in session.notes.alarms if alarm.what)
+    (tweak,) = judge(Run.load(session.saved[0].run)).tweaks
+    assert (alarm.what, alarm.latency_n, alarm.bound_n) == (name, tweak.latency_n, tweak.bound_n)
+
+
+def test_digital_pots_that_show_two_parameters_follow_both(tmp_path: Path) -> None:
+    rig = tmp_path / "digital.toml"
+    rig.write_text('kind = "emulator"\n[computer]\npots = "dial"\n[card]\nrange_v = {}\n')
+    script = ((0.0, SetRecording(on=True)), (0.05, Turn("l", 0.55)), (0.1, Turn("m", 0.6)))
+    scenario = Scenario.of_program(Program.load("pendulum"))
+    session = scripted_session((*script, (0.15, SetRecording(on=False))), tmp_path, scenario=scenario, rig=str(rig))
+    assert isinstance(session.desk, SteppedDesk)
+    dials = session.desk.computer.dials
+    with open_rig(str(rig)) as opened:
+        assert isinstance(opened, EmulatorRig)
+        _, _, (_, turn) = opened.set_up(Scenario.load(str(session.saved[0].scenario)), SEED)
+    nominal = SuspensionComputer(scenario.program.circuit, opamp="ideal").dials_for(l=0.55, m=0.6)
+    assert dials == {**dials, **nominal}
+    assert {pot: turn.values[f"{pot}_dial"] for pot in ("P4", "P5")} == {pot: nominal[pot] for pot in ("P4", "P5")}
+
+
+def test_pot_is_felt_within_one_block(recorded: LiveSession) -> None:
+    assert len(recorded.notes.felt_s) == 3
+    assert max(recorded.notes.felt_s) <= 2 * BLOCK_S
+
+
+def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) -> None:
+    ends: list[int] = []
+
+    def note(session: LiveSession) -> None:
+        ends.append(session.ring.end)
+
+    scripted_session(
+        ((0.0, SetPlaying(on=False)), (1.0, note), (2.0, Step(1)), (3.0, note), (4.0, Step(7)), (5.0, note)), tmp_path
+    )
+    assert ends == [0, 1, 8]
+
+
+def test_time_factor_slows_and_hastens_the_session(tmp_path: Path) -> None:
+    ends: list[int] = []
+
+    def note(session: LiveSession) -> None:
+        ends.append(session.ring.end)
+
+    scripted_session(((0.0, Tempo(100.0)), (1.0, note), (1.0, Tempo(0.5)), (1.1, note)), tmp_path)
+    slow, fast = ends[0], ends[1] - ends[0]
+    assert slow == pytest.approx(RATE_HZ / 100, abs=3)
+    assert fast == pytest.approx(0.1 * RATE_HZ / 0.5, abs=2 * 500)
+
+
+def test_hold_keeps_the_outputs_of_the_integrators(tmp_path: Path) -> None:
+    session = scripted_session(((0.1, Operate("HOLD")), (0.2, SetPlaying(on=False))), tmp_path)
+    end = session.ring.end
+    held = session.ring.read("probed", end - 500, end)[:, session.desk.amplifiers.index("U3")]
+    assert float(np.ptp(held)) < 0.02  # the edges of the force come through the amplifiers
+    assert session.desk.mode == "HOLD"
+
+
+def test_modes_are_reached_through_the_modes_between(tmp_path: Path) -> None:
+    session = scripted_session(
+        ((0.1, Operate("POT SET")), (0.2, Operate("OPERATE")), (0.3, Operate("POT SET"))), tmp_path
+    )
+    assert session.desk.mode == "POT SET"
+    assert not session.notices
+
+
+def test_generator_that_is_off_gives_no_volts(tmp_path: Path) -> None:
+    session = scripted_session(((0.05, Generate(on=False)), (0.1, SetPlaying(on=False))), tmp_path)
+    end = session.ring.end
+    assert np.abs(session.ring.read("probed", end - 500, end)).max() < 0.1
+
+
+def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path: Path) -> None:
+    script = (
+        (0.0, SetRecording(on=True)),
+        (0.1, Inject("stuck", on=True)),
+        (0.2, SetRecording(on=False)),
+        (0.21, SetPlaying(on=False)),
+    )
+    (saved,) = scripted_session(script, tmp_path).saved
+    run = Run.load(saved.run)
+    assert np.unique(run.codes[2500:, 1]).size <= 12  # the noise of the card alone
+    assert "channel displacement stuck: injected by hand at sample 1750" in run.conditions.faults
+    assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (Turn("X", 1.0), "no pot shows 'X'"),
+        (Turn("K", 1e9), "K must be 15000 to 29000 N/m"),
+        (Turn("K", float("nan")), "K must be"),
+        (Generate(frequency_hz=1e9), "exceeds half the sample rate"),
+        (Generate(low_v=11.0), "must be finite and not below low_v"),
+    ],
+)
+def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
+    command: Turn | Generate, words: str, tmp_path: Path
+) -> None:
+    def refuse(session: LiveSession) -> None:
+        with pytest.raises(ConfigurationError, match=words):
+            session.do(command)
+
+    session = scripted_session(((0.05, refuse),), tmp_path)
+    assert session.values == session.desk.scenario.plant.parameters()
+    assert session.take_number == 1
+
+
+def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> None:
+    def refuse(session: LiveSession) -> None:
+        for command in (Generate(high_v=5.0), Operate("HOLD")):
+            with pytest.raises(ConfigurationError, match="within a recording"):
+                session.do(command)
+
+    session = scripted_session(((0.0, SetRecording(on=True)), (0.05, refuse)), tmp_path)
+    assert len(session.saved) == 1  # the end of the session ends the recording too
+
+
+def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
+    session = scripted_session(((0.05, Turn("K", 18000.0)), (0.1, Restart()), (0.15, ClearLamps())), tmp_path)
+    assert session.take_number == 2
+    assert session.ring.end < 0.06 * RATE_HZ
+    assert session.values["K"] == 18000.0
+    assert not session.take.changes
+
+
+def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None:
+    held: list[int] = []
+
+    def note(session: LiveSession) -> None:
+        held.append(sum(column.nbytes for column in session.ring.columns.values()))
+        assert not session.take.changes
+
+    session = scripted_session(((0.0, Tempo(0.001)), (0.005, note), (0.02, note)), tmp_path)
+    assert held[0] == held[1]
+    assert session.ring.end > session.ring.start > 0
+
+
+def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
+    from analogrig.devices.opening import open_dut
+    from tests.harness.live.benches import ScriptedClock
+
+    clock = ScriptedClock(
+        (
+            (0.02, Turn("K", 18000.0)),
+            (0.05, SetPlaying(on=False)),
+            (90.0, SetPlaying(on=True)),
+            (90.1, SetPlaying(on=False)),
+        )
+    )
+    with open_rig("emulator") as rig, open_dut("inproc") as device:
+        session = LiveSession(rig, Scenario.load("thesis"), device, SEED, folder=tmp_path, clock=clock)
+        clock.session = session
+        session.run()
+    assert not session.notices
+    assert session.ring.end > 0.1 * RATE_HZ
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "words"),
+    [
+        ("explode", {}, "no command is called 'explode'"),
+        (7, {}, "no command is called 7"),
+        ("turn", {"name": "K"}, "the key 'value' is lacking"),
+        ("turn", {"name": "K", "value": "much"}, "must be a number"),
+        ("turn", {"name": "K", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
+        ("tempo", {"factor": 0.0}, "factor must be 0.001 to"),
+        ("step", {"samples": 10**9}, "samples must be 1 to"),
+        ("operate", {"mode": "FLY"}, "must be one of"),
+        ("record", {"on": True, "file": "/etc/passwd"}, "unknown key 'file'"),
+    ],
+)
+def test_command_of_a_wrong_message_is_refused(name: object, table: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words):
+        command_of(name, table)

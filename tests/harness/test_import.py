@@ -1,0 +1,449 @@
+"""Measured data of other tools: its formats, its way to a page, and files that are wrong on purpose."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analogrig.cli import main
+from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.recordings import column_reader, columns, imported
+from analogrig.recordings.columns import read_columns
+from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
+from analogrig.run import Run
+from analogrig.scenario import Scenario
+from analogrig.testing.played import Played
+from analogrig_emulator import CHANNELS
+
+RATE_HZ = 1000.0
+SAMPLES = 600
+FORCE, DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
+
+Values = NDArray[np.float64]
+
+
+def made_signals(samples: int = SAMPLES) -> tuple[Values, Values]:
+    """Input and output of a resonance of 60 Hz and damping .05."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=samples)
+    y = np.zeros(samples)
+    pole = np.exp((-0.05 + 1j) * 2 * np.pi * 60.0 / RATE_HZ)
+    a1, a2 = -2.0 * pole.real, abs(pole) ** 2
+    for k in range(2, samples):
+        y[k] = -a1 * y[k - 1] - a2 * y[k - 2] + 0.1 * u[k - 1]
+    return u, y + 1e-3 * rng.normal(size=samples)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read files here: a process for each of many files takes long."""
+    monkeypatch.setattr(columns, "_ask", lambda _, request: column_reader.answer(json.loads(request)))
+
+
+def description(**changes: Any) -> ImportDescription:
+    named: dict[str, Any] = {"input": ImportedColumn("u"), "output": ImportedColumn("y"), "rate_hz": RATE_HZ}
+    return ImportDescription(**(named | changes))
+
+
+# ------------------------------------------------------------------------------------------------------------- formats
+
+
+def write_csv(path: Path, u: Values, y: Values) -> None:
+    rows = "\n".join(f"{a!r};{b!r};" for a, b in zip(u.tolist(), y.tolist(), strict=True)).replace(".", ",")
+    path.write_text(f"# by an oscilloscope\nu;y;\n{rows}\n", encoding="utf-8-sig")
+
+
+def write_npy(path: Path, u: Values, y: Values) -> None:
+    rows = np.empty(len(u), [("u", "f8"), ("y", "f8")])
+    rows["u"], rows["y"] = u, y
+    np.save(path, rows)
+
+
+def write_npz(path: Path, u: Values, y: Values) -> None:
+    np.savez_compressed(path, u=u, y=y, note=np.array("text"))
+
+
+def write_mat_5(path: Path, u: Values, y: Values) -> None:
+    from scipy.io import savemat
+
+    savemat(path, {"u": u, "y": y[:, None], "note": "text", "more": {"a": 1.0}}, do_compression=True)
+
+
+def write_mat_73(path: Path, u: Values, y: Values) -> None:
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["u"] = u[None]
+        file.create_dataset("y", data=y[:, None], compression="gzip")
+        file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
+        file["soft"] = h5py.SoftLink("/u")
+
+
+def write_mf4(path: Path, u: Values, y: Values) -> None:
+    from asammdf import MDF, Signal
+
+    t = np.arange(len(u)) / RATE_HZ
+    with MDF() as file:
+        file.append([Signal(each, t, name=name) for name, each in (("u", u), ("y", y))])
+        file.save(path)
+
+
+def write_parquet(path: Path, u: Values, y: Values) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    instants = (np.arange(len(u)) * 1_000_000).astype("datetime64[ns]")
+    parquet.write_table(pa.table({"u": u, "y": y, "t": instants, "note": ["text"] * len(u)}), path)
+
+
+WRITERS: dict[str, Callable[[Path, Values, Values], None]] = {
+    "a.csv": write_csv,
+    "a.npy": write_npy,
+    "a.npz": write_npz,
+    "five.mat": write_mat_5,
+    "seven.mat": write_mat_73,
+    "a.mf4": write_mf4,
+    "a.parquet": write_parquet,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.usefixtures("in_this_process")
+def test_every_format_gives_the_same_recording(name: str, tmp_path: Path) -> None:
+    u, y = made_signals()
+    WRITERS[name](tmp_path / name, u, y)
+    run = import_columns(tmp_path / name, description(), None)
+    for at, channel, values in ((FORCE, "force", u), (DISPLACEMENT, "displacement", y)):
+        scale = run.conditions.channels[channel]
+        assert np.abs(scale.physical(run.codes[:, at]) - values).max() <= 0.5 * scale.lsb * 1.001
+        assert not run.clipped[:, at].any()
+    assert run.conditions.sample_period_s == 1.0 / RATE_HZ
+    assert not run.conditions.segments
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_wav_states_its_rate_and_scales_whole_numbers(tmp_path: Path) -> None:
+    from scipy.io import wavfile
+
+    u, y = made_signals()
+    samples = np.rint(np.stack([u / 10, y / 10], axis=1) * 32768).astype(np.int16)
+    wavfile.write(tmp_path / "a.wav", 8000, samples)
+    found = read_columns(tmp_path / "a.wav", ["0", "1"])
+    assert found.rate_hz == 8000.0
+    assert (found.columns["1"] == samples[:, 1] / 32768.0).all()
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_instants_give_the_rate(tmp_path: Path) -> None:
+    write_parquet(tmp_path / "a.parquet", *made_signals())
+    run = import_columns(tmp_path / "a.parquet", description(rate_hz=None, time="t"), None)
+    assert run.conditions.sample_period_s == pytest.approx(1e-3, rel=1e-12)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_scale_range_and_bits_make_the_codes_of_that_converter(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", u=np.array([-5.0, 0.0, 4.99, 5.5]), y=np.array([1.0, 2.0, np.nan, 3.0]))
+    ranged = ImportedColumn("u", unit="N", scale=2.0, offset=1.0, range=(-10.0, 10.0))
+    run = import_columns(tmp_path / "a.npz", description(input=ranged, bits=8), None)
+    assert run.codes[:, FORCE].tolist() == [13, 141, 255, 255]
+    assert run.clipped[:, FORCE].tolist() == [False, False, True, True]
+    assert run.clipped[:, DISPLACEMENT].tolist() == [False, False, True, False]
+    assert run.missing.tolist() == [False, False, True, True]
+    assert run.conditions.channels["force"].unit == "N"
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_rows_are_chosen_and_the_file_is_described_in_toml(tmp_path: Path) -> None:
+    u, y = made_signals()
+    write_csv(tmp_path / "a.csv", u, y)
+    (tmp_path / "map.toml").write_text('rate_hz = 1000.0\n[input]\ncolumn = "u"\n[output]\ncolumn = "y"\nunit = "mm"\n')
+    command = ["import", str(tmp_path / "a.csv"), "--map", str(tmp_path / "map.toml"), "--out", str(tmp_path / "a.npz")]
+    assert main([*command, "--first", "100", "--samples", "50", "--output-unit", "m"]) == 0
+    run = Run.load(tmp_path / "a.npz")
+    assert run.samples == 50
+    assert run.conditions.channels["displacement"].unit == "m"
+    assert np.abs(run.channel("force") - u[100:150]).max() < 1e-3
+
+
+# ------------------------------------------------------------------------------------------------------- to the verdict
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+@pytest.mark.usefixtures("in_this_process")
+def test_signals_of_emulate_come_back_bit_for_bit(suffix: str, tmp_path: Path) -> None:
+    signals, again = tmp_path / f"signals.{suffix}", tmp_path / "again.npz"
+    assert main(["emulate", "--scenario", "thesis", "--seed", "7", "--out", str(signals)]) == 0
+    assert main(["import", str(signals), "--scenario", "thesis", "--out", str(again)]) == 0
+    assert main(["replay", str(again), "--dut", "inproc", "--out", str(tmp_path / "again")]) == 0
+    assert main(["run", "--scenario", "thesis", "--seed", "7", "--dut", "inproc", "--out", str(tmp_path / "run")]) == 0
+    ours, theirs = (Run.load(tmp_path / name / "run.npz") for name in ("again", "run"))
+    assert (ours.codes == theirs.codes).all() and (ours.clipped == theirs.clipped).all()
+    assert ours.conditions.channels == theirs.conditions.channels
+    assert ours.theta_hash() == theirs.theta_hash()
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_the_truth_can_be_named_later(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    signals, recording = tmp_path / "signals.npz", tmp_path / "recording.npz"
+    assert main(["emulate", "--scenario", "thesis", "--seed", "7", "--out", str(signals)]) == 0
+    assert main(["import", str(signals), "--out", str(recording)]) == 0
+    replay = ["replay", str(recording), "--dut", "inproc"]
+    assert main([*replay, "--out", str(tmp_path / "blind")]) == 3
+    assert "alarms: 4 (at" in capsys.readouterr().out
+    assert main([*replay, "--scenario", "thesis", "--out", str(tmp_path / "judged")]) == 0
+    assert (
+        main(["judge", str(tmp_path / "blind" / "run.npz"), "--scenario", "thesis", "--out", str(tmp_path / "j")]) == 0
+    )
+
+
+def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_csv(tmp_path / "a.csv", *made_signals(4000))
+    recording, out = tmp_path / "a.npz", tmp_path / "out"
+    named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(recording)]
+    assert main(["import", str(tmp_path / "a.csv"), *named]) == 0
+    assert "truth: unknown: UNJUDGED" in capsys.readouterr().out
+    assert main(["replay", str(recording), "--dut", "inproc", "--out", str(out), "--json"]) == 3
+    told = capsys.readouterr()
+    verdict = json.loads(told.out)
+    assert verdict["outcome"] == "unjudged" and not verdict["valid"] and not verdict["false_alarms"]
+    assert told.err.startswith("analogrig: UNJUDGED: nothing is known of the plant")
+    page = (out / "report.html").read_text()
+    assert "Power spectral density" in page and "Frequency response" in page and "Resonance [Hz]" in page
+    run = Run.load(out / "run.npz")
+    played = Played(run)
+    assert not played.passes() and not played.stays_quiet() and "UNJUDGED" in played.passes().why
+    assert main(["judge", str(out / "run.npz"), "--out", str(tmp_path / "judged")]) == 3
+    words = capsys.readouterr().out
+    row = next(line for line in words.splitlines() if line.strip().startswith("0-3999")).split()
+    assert float(row[1]) == pytest.approx(60.07, rel=0.01) and float(row[2]) == pytest.approx(0.05, rel=0.03)
+    assert main(["report", str(tmp_path), "--out", str(tmp_path / "session.html")]) == 0
+    assert "2 unjudged" in (tmp_path / "session.html").read_text()
+
+
+def test_measured_data_alone_is_inconclusive_and_names_the_next_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals())
+    recording = tmp_path / "recording.npz"
+    named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(recording)]
+    assert main(["import", str(tmp_path / "a.npz"), *named]) == 0
+    assert main(["judge", str(recording), "--out", str(tmp_path / "judged")]) == 3
+    assert "pass the recording to analogrig replay" in capsys.readouterr().err
+    assert main(["replay", str(recording), "--out", str(tmp_path / "replayed")]) == 2
+    assert "measured data has no device: name one with --dut" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_recording_longer_than_its_scenario_is_refused(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals(2000))
+    with pytest.raises(ConfigurationError, match="has 2000 samples, scenario thesis 1800"):
+        import_columns(tmp_path / "a.npz", description(), Scenario.load("thesis"))
+
+
+# ---------------------------------------------------------------------------------------------------------- wrong files
+
+
+def npy_bytes(header: str) -> bytes:
+    """File of NumPy with a header of one's own and 16 bytes of data."""
+    padded = header.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded + bytes(16)
+
+
+def zip_bytes(name: str, content: bytes) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, content)
+    return out.getvalue()
+
+
+def npz_bytes(**arrays: Any) -> bytes:
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def hdf5_bytes(fill: Callable[[Any], None]) -> bytes:
+    import h5py
+
+    out = io.BytesIO()
+    with h5py.File(out, "w") as file:
+        fill(file)
+    return out.getvalue()
+
+
+def _huge(file: Any) -> None:
+    for name in "uy":
+        file.create_dataset(name, shape=(10**12,), dtype="f8", chunks=(1000,))
+
+
+def _external(file: Any) -> None:
+    for name in "uy":
+        file.create_dataset(name, shape=(2,), dtype="f8", external=[("/etc/passwd", 0, 16)])
+
+
+def mat_bytes(**variables: Any) -> bytes:
+    from scipy.io import savemat
+
+    out = io.BytesIO()
+    savemat(out, variables)
+    return out.getvalue()
+
+
+def _larger_mat() -> bytes:
+    """MATLAB file of version 5 that declares 10^9 rows where it has two."""
+    told = mat_bytes(u=np.zeros((2, 1)), y=np.zeros((2, 1)))
+    return told.replace(struct.pack("<ii", 2, 1), struct.pack("<ii", 10**9, 1))
+
+
+HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
+PICKLED = np.array([{"a": 1}, None], dtype=object)
+
+BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
+    "suffix": ("a.xls", b"", "the suffix must be one of .csv"),
+    "empty csv": ("a.csv", b"", "holds no line of text"),
+    "binary csv": ("a.csv", bytes(range(256)) * 20, "no column is called 'u'"),
+    "no such column": ("a.csv", b"a,b\n1,2\n", "no column is called 'u'; there are a, b"),
+    "two of one name": ("a.csv", b"u,u,y\n1,2,3\n", "2 columns are called 'u'"),
+    "word for a number": ("a.csv", b"u,y\n1,2\n3,four\n", "line 3, column y: 'four'"),
+    "short row": ("a.csv", b"u,y\n1,2\n3\n", "line 3, column y: no such cell"),
+    "long line": ("a.csv", b"u,y\n" + b"1" * 70_000, "more than 65536 characters"),
+    "long cell": ("a.csv", b"u,y\n1," + b"9" * 60_000 + b"x\n", "line 2, column y"),
+    "many columns": ("a.csv", b",".join(b"c%d" % k for k in range(5000)) + b"\n", "more than 4096 columns"),
+    "header alone": ("a.csv", b"u,y\n", "has no row 0"),
+    "no signal": ("a.csv", b"u,y\n0,0\n0,0\n", "largest magnitude 0: no signal"),
+    "overflow": ("a.csv", b"u,y\n1e300,1\n1,1\n", "no signal; scale it"),
+    "no npy": ("a.npy", b"no array", "damaged, or no NumPy file"),
+    "npy of objects": ("a.npy", lambda: _npy(PICKLED), "damaged, or no NumPy file"),
+    "npy of 1e12": (
+        "a.npy",
+        npy_bytes("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"),
+        "NumPy",
+    ),
+    "npy header": ("a.npy", npy_bytes("__import__('os').abort()"), "damaged, or no NumPy file"),
+    "npy of text": ("a.npy", lambda: _npy(np.array([("a", "b")], dtype="U1,U1")), "no column is called 'u'"),
+    "no npz": ("a.npz", b"PK\x03\x04 no archive", "damaged, or no NumPy file"),
+    "npz of objects": ("a.npz", lambda: npz_bytes(u=PICKLED, y=PICKLED), "no column is called 'u'"),
+    "npz of 1e12": (
+        "a.npz",
+        zip_bytes("u.npy", npy_bytes(HUGE)),
+        "larger than its member",
+    ),
+    "npz bomb": ("a.npz", zip_bytes("u.npy", bytes(20_000_000)), "damaged, or no NumPy file"),
+    "npz lengths": ("a.npz", lambda: npz_bytes(u=np.ones(5), y=np.ones(4)), "differ in length: u 5, y 4"),
+    "npz of complex": ("a.npz", lambda: npz_bytes(u=np.ones(5) * 1j, y=np.ones(4)), "no column is called 'u'"),
+    "no mat": ("a.mat", b"MATLAB 5.0 " * 40, "damaged, or no MATLAB file"),
+    "mat of 1e9": ("a.mat", _larger_mat, "more than 10000000"),
+    "mat of structs": ("a.mat", lambda: mat_bytes(u={"a": 1.0}, y={"a": 1.0}), "no column is called 'u'"),
+    "cut mat": ("a.mat", lambda: mat_bytes(u=np.ones(99), y=np.ones(99))[:-300], "MATLAB"),
+    "hdf5 of 1e12": ("a.mat", lambda: hdf5_bytes(_huge), "u has 1000000000000 samples, more than 10000000"),
+    "hdf5 of another file": ("a.mat", lambda: hdf5_bytes(_external), "no column is called 'u'; there are none"),
+    "cut hdf5": ("a.mat", lambda: hdf5_bytes(_huge)[:600], "damaged, or no MATLAB file"),
+    "no mf4": ("a.mf4", b"MDF     4.10    " + bytes(300), "damaged, or no MF4 file"),
+    "no parquet": ("a.parquet", b"PAR1" + bytes(64) + b"PAR1", "damaged, or no Parquet file"),
+    "no wav": ("a.wav", b"RIFF" + bytes(64), "damaged, or no WAV file"),
+}
+
+
+def _npy(values: NDArray[Any]) -> bytes:
+    out = io.BytesIO()
+    np.save(out, values, allow_pickle=True)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("defect", BAD_FILES)
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.filterwarnings("ignore")  # of the libraries, about the damage
+def test_a_wrong_file_is_one_line(defect: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name, content, complaint = BAD_FILES[defect]
+    (tmp_path / name).write_bytes(content() if callable(content) else content)
+    out = tmp_path / "out.npz"
+    named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(out)]
+    assert main(["import", str(tmp_path / name), *named]) == 2
+    told = capsys.readouterr().err
+    assert complaint in told and told.count("\n") == 1 and "Traceback" not in told
+    assert not out.exists()
+
+
+DEEP = "[" * 2000 + "]" * 2000
+
+BAD_SETTINGS = {
+    "deep toml": (f"rate_hz = {DEEP}", [], "nested deeper than 32 levels"),
+    "unknown key": ("speed = 3", [], "unknown key 'speed'"),
+    "table": ("input = 3", [], "must be a table"),
+    "range": ('[input]\ncolumn = "u"\nrange = [1.0, -1.0]', [], "range must ascend"),
+    "bits": ("bits = 24", [], "bits must be 2 to 16"),
+    "rate": ("rate_hz = nan", [], "rate_hz"),
+    "rate twice": ('rate_hz = 1.0\ntime = "t"', [], "state the rate twice"),
+    "unit": ('[input]\ncolumn = "u"\nunit = "a\\nb"', [], "unit must be"),
+    "scale": ("", ["--input-scale", "0"], "scale must be within"),
+    "first": ("", ["--first", "-3"], "must not be negative"),
+    "beyond": ("", ["--first", "700", "--rate", "1"], "has no row 700"),
+    "too many": ("", ["--samples", "700", "--rate", "1"], "has 600 rows from row 0 on, not 700"),
+    "no rate": ("", [], "states no sample rate: pass --rate HZ"),
+    "no time": ("", ["--time", "t"], "no column is called 't'"),
+    "uneven time": ("", ["--time", "u"], "column u"),
+    "suffix of out": ("", ["--out", "a.csv"], "must end with .npz"),
+}
+
+
+@pytest.mark.parametrize("defect", BAD_SETTINGS)
+@pytest.mark.usefixtures("in_this_process")
+def test_a_wrong_setting_is_one_line(defect: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, options, complaint = BAD_SETTINGS[defect]
+    (tmp_path / "map.toml").write_text(text)
+    write_npz(tmp_path / "a.npz", *made_signals())
+    command = ["import", str(tmp_path / "a.npz"), "--map", str(tmp_path / "map.toml"), "--out", str(tmp_path / "o.npz")]
+    sides = [] if "[input]" in text or "input =" in text else ["--input", "u"]
+    assert main([*command, *sides, "--output", "y", *options]) == 2
+    told = capsys.readouterr().err
+    assert complaint in told and told.count("\n") == 1 and "Traceback" not in told
+
+
+def test_the_columns_are_named_to_a_user_who_named_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_csv(tmp_path / "a.csv", *made_signals())
+    assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
+    assert "name the columns with --input and --output: there are u, y" in capsys.readouterr().err
+
+
+def test_the_reader_is_bounded_in_memory(tmp_path: Path) -> None:
+    told = b"RIFF" + struct.pack("<I", 0xFFFFFFF0) + b"WAVEfmt " + struct.pack("<IHHIIHH", 16, 3, 1, 8000, 64000, 8, 64)
+    (tmp_path / "a.wav").write_bytes(told + b"data" + struct.pack("<I", 0xFFFFFFE0) + bytes(64))
+    with pytest.raises(RecordingError, match=r"needs more than 4 GiB|damaged"):
+        read_columns(tmp_path / "a.wav", ["0"])
+
+
+def test_a_reader_that_crashes_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.csv").write_text("u,y\n1,2\n")
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(RecordingError, match=r"a.csv: its reader ended with status 1"):
+        read_columns(tmp_path / "a.csv")
+
+
+def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.mat").write_bytes(b"\x89HDF\r\n\x1a\n")
+    for module, name in (("h5py", "a.mat"), ("pyarrow", "a.parquet"), ("asammdf", "a.mf4")):
+        monkeypatch.setitem(sys.modules, module, None)
+        (tmp_path / name).touch()
+        found = column_reader.answer({"file": str(tmp_path / name), "wanted": ["u"], "skip_lines": 0, "out": ""})
+        assert f"need {module}: pip install 'analogrig[import]'" in found["error"]
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_codes_that_the_rig_lacks_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ",".join(imported._SIGNALS)
+    for code, complaint in ((9000, "codes that rig emulator does not have"), (1.5, "no whole numbers")):
+        (tmp_path / "a.csv").write_text(f"sample,{names}\n0,{code},1,1,1,0,0,0,0\n")
+        assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
+        assert complaint in capsys.readouterr().err

@@ -1,0 +1,35 @@
+"""Benchmark of the two-mass quarter car, on few trials."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analogrig.estimator_config import EstimatorConfig
+from tests.benchmarks.bench_two_mass import delays, device, false_alarms
+
+
+def test_changes_of_the_suspension_are_detected_within_the_bound_of_the_benchmark(tmp_path: Path) -> None:
+    """Of the page's 400 changes none is missed; the mean ratio of eight changes is below 1.6 with certainty."""
+    made = device(tmp_path)
+    for parameter in ("M2", "B2", "K2", "K1"):
+        found = delays(made, parameter, 8)
+        assert found.missed == 0
+        assert found.trials == 8
+        assert found.ratio()[0] < 1.6
+    alarms, armed = false_alarms(made, 2, 20_000)
+    assert alarms == 0
+    assert armed == 2 * (20_000 - 550)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_default_serves_up_to_order_2(order: int) -> None:
+    assert EstimatorConfig.of_order(order) == EstimatorConfig()
+
+
+def test_higher_order_has_the_prefilter_of_equal_poles() -> None:
+    settings = EstimatorConfig.of_order(4)
+    assert (settings.na, settings.nb, settings.parameters) == (4, 5, 10)
+    assert np.roots([1.0, *settings.c]) == pytest.approx([0.8] * 4, abs=1e-3)
