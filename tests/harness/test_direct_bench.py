@@ -14,7 +14,9 @@ from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_b
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
+from analogrig.judging import information
 from analogrig.judging.verdict import judge, judge_all
+from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
@@ -140,6 +142,20 @@ def test_runs_played_and_judged_together_are_those_played_alone_to_the_bit(rig_n
             assert mine.tobytes() == its.tobytes() if isinstance(mine, np.ndarray) else mine == its, field.name
     assert any(len(run.alarm_index) for run in together)
     assert judge_all(together) == [judge(run) for run in alone]
+
+
+@pytest.mark.parametrize("rig_name", ["emulator", "emulator-0-10v"])
+@pytest.mark.parametrize("program", ["front", "dc-motor", "duffing"])
+def test_runs_of_any_program_are_judged_together_by_the_courses_of_each_to_the_bit(program: str, rig_name: str) -> None:
+    """The multipliers of a Duffing oscillator leave nothing to share; the pots of the second rig are the same."""
+    scenario = dataclasses.replace(Scenario.of_program(Program.load(program)), samples=1100)
+    runs = direct_bench(emulator(rig_name), describe("inproc")).play_all(scenario, range(4))
+    assert judge_all(runs) == [judge(run) for run in runs]
+    for run, model in zip(runs, information.models_of(runs), strict=True):
+        shared, alone = (information.change_information(run, each) for each in (model, None))
+        assert len(shared) == len(scenario.tweaks)
+        assert [each.tobytes() for each in shared] == [each.tobytes() for each in alone]
+        assert information.isolation_bounds(run, model) == information.isolation_bounds(run)
 
 
 def test_long_runs_are_played_one_by_one() -> None:

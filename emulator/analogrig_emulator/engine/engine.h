@@ -163,22 +163,25 @@ typedef struct {
     const int64_t*         place;  ///< indices in a row
 } engine_schedule_t;
 
-/// Call engine_restart(), engine_watch(), engine_play() and engine_get_overdue() for each of `plays` plays, which differ in
-/// their edges and in some numbers. constants: turns x places for each play. edges: their number in each play, of `room` in its
-/// row of tick and level; input: as for engine_play(), in common. y: the rows of all plays. overdue: kinks for each play.
+/// Call engine_restart(), engine_watch(), engine_play(), engine_get_overdue() and engine_get_state() for each of `plays` plays,
+/// which differ in their edges and in some numbers. constants: turns x places for each play. start: states for each play, which
+/// the first circuit starts from; NULL: rest. edges: their number in each play, of `room` in its row of tick and level; input: as
+/// for engine_play(), in common. y: the rows of all plays. overdue: kinks for each play. end: states for each play.
 ///
 /// Fails as engine_play(), in the first play that does.
 engine_status_t engine_play_all(engine_t*                self,
                                 const engine_schedule_t* schedule,
                                 int64_t                  plays,
                                 const double*            constants,
+                                const double*            start,
                                 const int32_t*           input,
                                 int64_t                  room,
                                 const int64_t*           edges,
                                 const int64_t*           tick,
                                 const double*            level,
                                 double*                  y,
-                                int64_t*                 overdue);
+                                int64_t*                 overdue,
+                                double*                  end);
 
 /// Watch, from the present tick on, for kinks that stay outside their middle piece for `patience` ticks without a break.
 /// Before the first call, patience is one sample period. Cost: none while no mode changes.

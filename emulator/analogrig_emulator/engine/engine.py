@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,17 @@ class EngineCounts:
     steps: int
     quiet: int
     modes_built: int
+
+
+class Plays(NamedTuple):
+    """Plays of one schedule."""
+
+    volts: NDArray[np.float64]
+    """(plays, samples, outputs) V."""
+    overdue_ticks: NDArray[np.int64]
+    """(plays, kinks), as Engine.overdue_ticks."""
+    states_v: NDArray[np.float64]
+    """(plays, states) V at the last sample."""
 
 
 class Engine:
@@ -223,13 +234,17 @@ class Engine:
         return volts
 
     def play_all(
-        self, schedule: CircuitSchedule, constants: NDArray[np.float64], edges: Mapping[str, EdgeRows]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Play a schedule from rest, once for each row of constants (plays, systems, places) and of edges of one input.
+        self,
+        schedule: CircuitSchedule,
+        constants: NDArray[np.float64],
+        edges: Mapping[str, EdgeRows],
+        states_v: NDArray[np.float64] | None = None,
+    ) -> Plays:
+        """Play a schedule once for each row of constants (plays, systems, places) and of edges of one input.
 
-        Returns V, float64 (plays, schedule.samples, outputs), and overdue_ticks of each play, int64 (plays, kinks).
-        Each play equals alternating set_system() and run() on a new engine, at a fraction of the cost. Clock and
-        watch() restart. Raises EngineError.
+        states_v: (plays, states) V at which the first circuit starts; None: at rest. Each play equals alternating
+        set_system() and run() on a new engine, at a fraction of the cost. Clock and watch() restart.
+        Raises EngineError.
         """
         if self._drives:
             raise EngineError("a schedule is for inputs with edges: play drives with run()")
@@ -241,9 +256,16 @@ class Engine:
         inputs = np.full(room, self._names[1].index(name), np.int32)
         volts = np.empty((plays, schedule.samples, len(self._outputs)))
         overdue = np.empty((plays, self._kinks), np.int64)
+        ends_v = np.empty((plays, len(self._names[0])))
+        starts_v = None if states_v is None else np.ascontiguousarray(states_v, np.float64)
+        if starts_v is not None and starts_v.shape != ends_v.shape:
+            raise EngineError(f"the states of the plays have shape {ends_v.shape}, got {starts_v.shape}")
         before, after = [
-            [array.ctypes.data for array in arrays]
-            for arrays in ((constants, inputs), (trains.counts, trains.ticks, trains.levels_v, volts, overdue))
+            [None if array is None else array.ctypes.data for array in arrays]
+            for arrays in (
+                (constants, starts_v, inputs),
+                (trains.counts, trains.ticks, trains.levels_v, volts, overdue, ends_v),
+            )
         ]
         status = self._library.engine_play_all(
             self._handle, ctypes.byref(schedule.struct), plays, *before, room, *after
@@ -251,7 +273,7 @@ class Engine:
         self._check(status)
         self._recorded, self._now_tick = 0, -1
         self._advance_clock(schedule.samples)
-        return volts, overdue
+        return Plays(volts, overdue, ends_v)
 
     def advance(self, tick: int, edges: Mapping[str, Edges] | None = None) -> None:
         """Go to an instant before the next sample without recording; apply the edges up to it.

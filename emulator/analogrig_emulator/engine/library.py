@@ -65,7 +65,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_set_state", c_int, (c_void_p, c_void_p)),
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
     ("engine_play", c_int, (c_void_p, c_int64, POINTER(System), c_void_p, c_int64, *(c_void_p,) * 4)),
-    ("engine_play_all", c_int, (c_void_p, POINTER(Schedule), c_int64, *(c_void_p,) * 2, c_int64, *(c_void_p,) * 5)),
+    ("engine_play_all", c_int, (c_void_p, POINTER(Schedule), c_int64, *(c_void_p,) * 3, c_int64, *(c_void_p,) * 6)),
     ("engine_drive", c_int, (c_void_p, c_int, c_int64, c_void_p)),
     ("engine_look_ahead", None, (c_void_p, c_int64)),
     ("engine_watch", None, (c_void_p, c_int64)),

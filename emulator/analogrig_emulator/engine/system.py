@@ -49,6 +49,20 @@ class EdgeRows(NamedTuple):
     levels_v: NDArray[np.float64]
     """(plays, room), all finite."""
 
+    def between(self, first: int, last: int) -> EdgeRows:
+        """Level at tick `first` and edges up to tick `last`, counted from `first`. Each row has an edge by then."""
+        begins = np.count_nonzero((self.ticks <= first) & self._exist, axis=1) - 1
+        counts = np.count_nonzero((self.ticks <= last) & self._exist, axis=1) - begins
+        places = np.minimum(begins[:, None] + np.arange(counts.max()), self.ticks.shape[1] - 1)
+        ticks = np.take_along_axis(self.ticks, places, axis=1) - first
+        ticks[:, 0] = 0
+        return EdgeRows(counts, ticks, np.take_along_axis(self.levels_v, places, axis=1))
+
+    @property
+    def _exist(self) -> NDArray[np.bool_]:
+        """(plays, room)"""
+        return np.arange(self.ticks.shape[1]) < self.counts[:, None]
+
 
 @dataclass(frozen=True)
 class Edges:

@@ -80,9 +80,10 @@ class RepeatedPlay:
         """
         constants = (self._apart_v + offsets_v[:, None, self._numbers]) * self._gain_rate
         edges = excitation.edges_at(phases, 0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
-        volts, overdue_ticks = self._engine.play_all(self._schedule, constants, {SOURCE: edges})
+        plays = self._engine.play_all(self._schedule, constants, {SOURCE: edges})
+        volts = plays.volts
         volts *= self._signs
         return [
             Repeat(each, lamp_samples(self._amplifiers, self._kinks, ticks))
-            for each, ticks in zip(volts, overdue_ticks, strict=True)
+            for each, ticks in zip(volts, plays.overdue_ticks, strict=True)
         ]

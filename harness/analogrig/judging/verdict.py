@@ -26,7 +26,7 @@ from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
-from analogrig.judging.courses import first_at_level
+from analogrig.judging.courses import Model, first_at_level
 from analogrig.judging.exposure import Exposure, exposures
 from analogrig.plant import Segment, estimated_parameters
 from analogrig.run import LOST, Run
@@ -321,20 +321,23 @@ def judge_all(runs: Iterable[Run]) -> list[Verdict]:
 def _common(run: Run) -> tuple[object, ...]:
     """Values that runs have in common which are judged together."""
     known = run.conditions
-    return run.samples, known.segments, known.records, known.channels, known.scenario, known.dut
+    return run.samples, known.segments, known.records, known.channels, known.scenario, known.dut, known.rig
 
 
 def _judge_alike(runs: Sequence[Run]) -> Iterator[Verdict]:
     expect = config.build(Expectations, runs[0].conditions.scenario.get("expect", {}), "the recorded scenario: expect")
-    for run, shown, estimates in zip(runs, exposures(runs), _segment_estimates(runs), strict=True):
-        yield _judge(run, expect, shown, estimates)
+    models = information.models_of(runs) if _is_exact(runs[0]) else [None] * len(runs)
+    for run, model, shown, estimates in zip(runs, models, exposures(runs), _segment_estimates(runs), strict=True):
+        yield _judge(run, model, expect, shown, estimates)
 
 
-def _judge(run: Run, expect: Expectations, shown: Exposure, estimates: tuple[SegmentEstimate, ...]) -> Verdict:
-    """Verdict on a run with this exposure and these estimates."""
+def _judge(
+    run: Run, model: Model | None, expect: Expectations, shown: Exposure, estimates: tuple[SegmentEstimate, ...]
+) -> Verdict:
+    """Verdict on a run with this model of its plant, exposure and estimates."""
     sheet = run.datasheet
     level = sheet.log_arl0(expect.arl0)
-    results = _evaluate_hypotheses(run, expect, level)
+    results = _evaluate_hypotheses(run, model, expect, level)
     invalid = invalid_reasons(run, shown, expect)
     outcome, reasons = _decide_outcome(results, expect)
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
@@ -503,14 +506,16 @@ class _HypothesisResult:
     failures: tuple[str, ...]
 
 
-def _evaluate_hypotheses(run: Run, expect: Expectations, level: float) -> list[_HypothesisResult]:
+def _evaluate_hypotheses(
+    run: Run, model: Model | None, expect: Expectations, level: float
+) -> list[_HypothesisResult]:
     """Results at the likeliest instants and, unless these are exact, at the earliest and the latest."""
     runs = [run]
     if not _is_exact(run):
         runs += [run.with_change_instants(Segment.earliest), run.with_change_instants(Segment.latest)]
     out = []
     for supposed in runs:
-        tweaks, false_alarms = _attribute_alarms(supposed, expect, level)
+        tweaks, false_alarms = _attribute_alarms(supposed, model, expect, level)
         out.append(_HypothesisResult(tweaks, false_alarms, tuple(_failure_reasons(tweaks, false_alarms, expect))))
     return out
 
@@ -563,7 +568,7 @@ def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[ChangeVerdi
 
 
 def _attribute_alarms(
-    run: Run, expect: Expectations, level: float
+    run: Run, model: Model | None, expect: Expectations, level: float
 ) -> tuple[tuple[ChangeVerdict, ...], tuple[int, ...]]:
     """Verdict on each change, and the samples of the false alarms."""
     alarms = run.alarm_index.tolist()
@@ -572,9 +577,10 @@ def _attribute_alarms(
     tweaks = []
     diagnosed, is_bounded = run.conditions.program.diagnosed, information.is_bounded(run)
     isolates = len(run.diagnosis_index) and diagnosed
-    isolation_bounds = information.isolation_bounds(run) if isolates else [None] * len(run.segments)
+    model = model or information.model_of(run)
+    isolation_bounds = information.isolation_bounds(run, model) if isolates else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
-        run.segments, run.segments[1:], information.change_information(run), isolation_bounds, strict=False
+        run.segments, run.segments[1:], information.change_information(run, model), isolation_bounds, strict=False
     ):
         if start in run.conditions.records:
             continue  # a device that restarts has no earlier plant to compare with

@@ -38,6 +38,7 @@ from analogrig_emulator import (
     Pot,
     PotTurn,
     ProgramCircuit,
+    RepeatedCourses,
     RepeatedPlay,
     Resistor,
     Sampler,
@@ -308,6 +309,7 @@ class EmulatorRig(Rig):
         )  # refused here, and not when it is first played
         self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._last_prepared: _Prepared | None = None
+        self._cards: dict[tuple[str, ...], Card] = {}
         self._table = dataclasses.asdict(description)  # to write it takes as long as to play a thousand samples
         self._block_samples = block_samples
 
@@ -323,7 +325,9 @@ class EmulatorRig(Rig):
 
     def card(self, program: Program) -> Card:
         """Card with the channels of a program."""
-        return self._description.card.card(program.channels)
+        if program.channels not in self._cards:
+            self._cards[program.channels] = self._description.card.card(program.channels)
+        return self._cards[program.channels]
 
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:
         """Machine as the scenario starts it, with the excitation and the changes to play on it.
@@ -358,6 +362,30 @@ class EmulatorRig(Rig):
 
         excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         return Courses(wired, card, excitation, samples, OUTPUT)
+
+    def courses_together(self, scenario: Scenario, seeds: Sequence[int], samples: int) -> RepeatedCourses | None:
+        """Courses, as of ``courses``, of the machines of several plays; None where more than offsets differs.
+
+        :raises EmulatorError: as ``courses``.
+        """
+        program, card = scenario.program, self.card(scenario.program)
+        if not self._draws_offsets_alone(card) or any(tweak.ramp_n for tweak in scenario.tweaks):
+            return None
+        machine = _drawn_machine(self._description.computer, program.circuit, seeds[0], card.true_rate_hz)
+        if not is_repeatable(machine, ()):
+            return None
+        wired = Wired(machine, _nominal(program) if self._description.computer.pots == "dial" else machine)
+        phases, offsets_v = self._drawn(scenario, seeds, machine)
+        return RepeatedCourses(wired, scenario.excitation, phases, offsets_v, samples, OUTPUT)
+
+    def _drawn(
+        self, scenario: Scenario, seeds: Sequence[int], computer: SuspensionComputer
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Phases (seeds,) and offsets of the amplifiers (seeds, amplifiers) in volts."""
+        count, offset_v = computer.program.amplifiers, self._description.computer.offset_v
+        generators = (Stream.COMPONENTS.generator(seed) for seed in seeds)
+        offsets_v = np.stack([drawn_offsets_v(self._amplifier, count, rng, offset_v) for rng in generators])
+        return np.array([scenario.draw_phase(Stream.EXCITATION.generator(seed)) for seed in seeds]), offsets_v
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         if repeated := self._repeat(scenario, [seed]):
@@ -472,10 +500,7 @@ class EmulatorRig(Rig):
         self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seeds: Sequence[int]
     ) -> Iterator[tuple[Block, Mapping[str, int]]]:
         """Samples and lit lamps of each seed."""
-        count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
-        generators = (Stream.COMPONENTS.generator(seed) for seed in seeds)
-        offsets_v = np.stack([drawn_offsets_v(self._amplifier, count, rng, offset_v) for rng in generators])
-        phases = np.array([scenario.draw_phase(Stream.EXCITATION.generator(seed)) for seed in seeds])
+        phases, offsets_v = self._drawn(scenario, seeds, prepared.computer)
         with emulator_errors(as_error=RigError):
             for seed, (volts, lamps) in zip(seeds, play.play_all(scenario.excitation, phases, offsets_v), strict=True):
                 codes, clipped = Sampler(prepared.card, Stream.CARD.generator(seed)).sample(volts)
