@@ -50,7 +50,7 @@ class EdgeRows(NamedTuple):
     """(plays, room), all finite."""
 
     def between(self, first: int, last: int) -> EdgeRows:
-        """Level at tick `first` and edges up to tick `last`, counted from `first`. Each row has an edge by then."""
+        """Level at tick first, with the edges up to tick last, counted from first. Each row has an edge by then."""
         begins = np.count_nonzero((self.ticks <= first) & self._exist, axis=1) - 1
         counts = np.count_nonzero((self.ticks <= last) & self._exist, axis=1) - begins
         places = np.minimum(begins[:, None] + np.arange(counts.max()), self.ticks.shape[1] - 1)
@@ -60,7 +60,7 @@ class EdgeRows(NamedTuple):
 
     @property
     def _exist(self) -> NDArray[np.bool_]:
-        """(plays, room)"""
+        """Mask of the edges of each row, (plays, room)."""
         return np.arange(self.ticks.shape[1]) < self.counts[:, None]
 
 

@@ -160,7 +160,7 @@ class Courses:
 
 
 class RepeatedCourses:
-    """Courses of machines that differ in op-amp offsets, each with a phase of the excitation: as of Courses, to the bit.
+    """Courses of machines that differ in op-amp offsets, each with its phase of the excitation: Courses to the bit.
 
     wired: machine that is_repeatable(), taken at every sample of the card; phases: (plays,); offsets_v: (plays,
     amplifiers) V from U1 on; samples, channel: as for Courses. Raises ExcitationError and CircuitError.

@@ -100,9 +100,7 @@ class _OneOfMany:
 
     @functools.cached_property
     def _alone(self) -> Machine:
-        machine = machine_of(self._run)
-        assert machine is not None
-        return machine
+        return _machine(self._run)
 
     def at_rest(self, start: int, values: Values) -> Moment:  # noqa: ARG002 - as of a machine
         return self._together.at_rest
@@ -133,9 +131,11 @@ def machine_of(run: Run) -> Machine | None:
 
     :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
     """
+    return _machine(run) if is_played(run) else None
+
+
+def _machine(run: Run) -> Machine:
     conditions = run.conditions
-    if not is_played(run):
-        return None
     recorded = _recorded(conditions.rig, conditions.scenario)
     with emulator_errors(_PREFIX):
         courses = recorded.rig.courses(recorded.scenario, conditions.seed, run.samples)
@@ -143,19 +143,22 @@ def machine_of(run: Run) -> Machine | None:
 
 
 def machines_of(runs: Sequence[Run]) -> Sequence[_OneOfMany]:
-    """Machine of each run, as of ``machine_of``, for runs that differ in the seed alone; none if they have little to share.
+    """Machine of each run, for runs that differ in the seed alone; none if they have little to share.
 
     :raises ConfigurationError: as ``machine_of``.
     """
     first = runs[0]
-    if len(runs) == 1 or not is_played(first) or len(first.segments) < 2:
+    has_ramps = any(segment.ramp_n for segment in first.conditions.segments)
+    if len(runs) == 1 or not is_played(first) or len(first.segments) < 2 or has_ramps:
         return ()
     recorded = _recorded(first.conditions.rig, first.conditions.scenario)
     with emulator_errors(_PREFIX):
         seeds = [run.conditions.seed for run in runs]
         courses = recorded.rig.courses_together(recorded.scenario, seeds, first.samples)
-    together = None if courses is None else _Together(courses, first)
-    return () if together is None else [_OneOfMany(run, together, place) for place, run in enumerate(runs)]
+    if courses is None:
+        return ()
+    together = _Together(courses, first)
+    return [_OneOfMany(run, together, place) for place, run in enumerate(runs)]
 
 
 def is_played(run: Run) -> bool:

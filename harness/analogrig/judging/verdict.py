@@ -506,9 +506,7 @@ class _HypothesisResult:
     failures: tuple[str, ...]
 
 
-def _evaluate_hypotheses(
-    run: Run, model: Model | None, expect: Expectations, level: float
-) -> list[_HypothesisResult]:
+def _evaluate_hypotheses(run: Run, model: Model | None, expect: Expectations, level: float) -> list[_HypothesisResult]:
     """Results at the likeliest instants and, unless these are exact, at the earliest and the latest."""
     runs = [run]
     if not _is_exact(run):
@@ -711,10 +709,10 @@ def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]
     ]
     ends = [end - 1 for _, end, _ in segments]
     lasts = _parameters_of(run, np.concatenate([each.theta[ends] for each in runs]))
-    is_known = ~np.isnan(lasts).any(axis=1) & bool(names)
+    is_known = np.asarray(~np.isnan(lasts).any(axis=1))
     estimates = (
-        dict(zip(names, last, strict=True)) if known else None
-        for last, known in zip(lasts.tolist(), is_known.tolist(), strict=True)
+        dict(zip(names, last, strict=True)) if known and names else None
+        for last, known in zip(lasts.tolist(), is_known, strict=True)
     )
     return [tuple(SegmentEstimate(*each, next(estimates)) for each in segments) for _ in runs]
 

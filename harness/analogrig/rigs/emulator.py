@@ -364,12 +364,12 @@ class EmulatorRig(Rig):
         return Courses(wired, card, excitation, samples, OUTPUT)
 
     def courses_together(self, scenario: Scenario, seeds: Sequence[int], samples: int) -> RepeatedCourses | None:
-        """Courses, as of ``courses``, of the machines of several plays; None where more than offsets differs.
+        """Courses without ramps of the machines of several plays; None where these differ in more than offsets.
 
         :raises EmulatorError: as ``courses``.
         """
         program, card = scenario.program, self.card(scenario.program)
-        if not self._draws_offsets_alone(card) or any(tweak.ramp_n for tweak in scenario.tweaks):
+        if not self._draws_offsets_alone(card):
             return None
         machine = _drawn_machine(self._description.computer, program.circuit, seeds[0], card.true_rate_hz)
         if not is_repeatable(machine, ()):
