@@ -107,9 +107,8 @@ def test_courses_of_many_are_each_those_of_a_machine_of_its_own() -> None:
     later, ends = together.play(after, 150, 100, states)
     for i, seed in enumerate(seeds):
         own = fresh(model, "front", seed)
-        alone = Courses(
-            lambda _, own=own: Wired(own, own), Card(), replace(excitation, phase=float(phases[i])), SAMPLES, 1
-        )
+        wired = {1.0: Wired(own, own)}
+        alone = Courses(wired.__getitem__, Card(), replace(excitation, phase=float(phases[i])), SAMPLES, 1)
         course = alone.course(alone.at_rest(before), before, before)
         assert course.advance(150).tobytes() == courses[i].tobytes()
         moment = course.moment()
