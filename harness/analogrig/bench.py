@@ -210,6 +210,7 @@ class Bench:
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._pace_blocks(performance)
+        self.dut.suit(scenario.program.order)
         self.dut.prepare(performance.of_device, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
@@ -359,6 +360,7 @@ class DirectBench(Bench):
         if scenario.samples > DIRECT_BLOCK_SAMPLES:
             return [self.play(scenario, seed) for seed in seeds]
         performances = self.rig.perform_all(scenario, seeds)
+        self.dut.suit(scenario.program.order)
         self.dut.prepare(performances[0].of_device, performances[0].sample_period_s)
         blocks = [next(each.blocks) for each in performances]
         played = list(zip(blocks, self.dut.play_records([block.samples() for block in blocks]), strict=True))

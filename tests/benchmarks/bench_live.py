@@ -1,9 +1,11 @@
 """The live bench in real time: samples, frames, processor time, memory, and hostile clients.
 
-python -m tests.benchmarks live [--seconds S] [--hostile S] [--minutes M]
+python -m tests.benchmarks live [--parts PART ...] [--seconds S] [--hostile S] [--minutes M]
 
-``--seconds``: length of the recording in real time. ``--hostile``: time for hostile clients at each endpoint.
-``--minutes``: machine time over which memory is compared.
+``--parts``: ``real-time`` (a recording, without a browser), ``screen`` (frames that a browser draws), ``hostile``
+(hostile clients at each endpoint), ``memory``; all by default. ``--seconds``: length of the recording, and of the time
+in the browser. ``--hostile``: time for hostile clients at each endpoint. ``--minutes``: machine time over which memory
+is compared.
 """
 
 # ruff: noqa: S311 - input drawn from a seed is no secret
@@ -21,21 +23,28 @@ import subprocess
 import sys
 import tempfile
 import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
+from playwright.sync_api import Page, sync_playwright
 from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
 from analogrig.live.commands import Tempo
 from analogrig.live.session import LiveSession
 from analogrig.run import Run
+from tests import tools
 from tests.harness.live.benches import scripted_session
+from tests.harness.processes import descendants, marked
 
 from .figure import Figure
 
 SIGNALS = ("force", "displacement", "velocity", "net_force", "estimate K", "statistic")
+PARTS = ("real-time", "screen", "hostile", "memory")
+SCREEN_HZ = 30
+"""Frames per second that one core must manage."""
 TURN_S = 0.5
 """Time between two turns of a pot."""
 _TICK_HZ = os.sysconf("SC_CLK_TCK")
@@ -43,6 +52,7 @@ _TICK_HZ = os.sysconf("SC_CLK_TCK")
 NOTE = """\
 The emulator plays 20,000 samples/s into the in-process device, an estimate every 64 samples.
 One client shows four channels, an estimate and the statistic, and turns a pot twice a second.
+Frames are drawn by Chromium without a graphics processor, at 1280 by 900 pixels.
 Processor time and memory are those of the process `analogrig bench`. A turn is felt when the
 first sample after it has been answered. Hostile clients send random and almost valid messages,
 wrong tokens and origins, and read nothing; a driver works beside them."""
@@ -51,15 +61,34 @@ wrong tokens and origins, and read nothing; a driver works beside them."""
 def figures(*options: str) -> Iterator[Figure]:
     """Figures of a bench in real time, under hostile clients, and over a long time."""
     parser = argparse.ArgumentParser(prog="live")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--hostile", type=float, default=60.0)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--quick", action="store_true")
     given = parser.parse_args(options)
-    yield from asyncio.run(_real_time(given.seconds))
-    for path in ("live", "foxglove"):
+    if "real-time" in given.parts:
+        _announce(f"a recording of {given.seconds:g} s")
+        yield from asyncio.run(_real_time(given.seconds))
+    if "screen" in given.parts:
+        _announce(f"a browser for {given.seconds:g} s")
+        yield from _screen(given.seconds)
+    for path in ("live", "foxglove") if "hostile" in given.parts else ():
+        _announce(f"hostile clients at /{path} for {given.hostile:g} s")
         yield from asyncio.run(_hostile(path, given.hostile))
-    yield from _memory(given.minutes)
+    if "memory" in given.parts:
+        _announce(f"{given.minutes:g} minutes of machine time")
+        yield from _memory(given.minutes)
+
+
+def _announce(text: str) -> None:
+    print(f"live: {text}", file=sys.stderr, flush=True)
+
+
+def cpu_s(*pids: int) -> float:
+    """Processor time of processes so far."""
+    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
+    return sum(int(words[11]) + int(words[12]) for words in stats) / _TICK_HZ
 
 
 class _Process:
@@ -86,8 +115,7 @@ class _Process:
 
     def cpu_s(self) -> float:
         """Processor time so far."""
-        words = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(words[11]) + int(words[12])) / _TICK_HZ
+        return cpu_s(self._process.pid)
 
     def memory_mb(self, key: str = "VmHWM") -> float:
         """Largest resident set so far, or the present one (VmRSS)."""
@@ -119,6 +147,37 @@ async def _real_time(seconds: float) -> list[Figure]:
         Figure("memory of the server", memory_mb, "MB"),
         Figure("pot to sample, median", statistics.median(felt_ms), "ms", bounds=(min(felt_ms), max(felt_ms))),
     ]
+
+
+def _screen(seconds: float) -> Iterator[Figure]:
+    """Frames that a browser draws without a graphics processor, and its processor time for each."""
+    mark = str(uuid.uuid4())
+    with tempfile.TemporaryDirectory() as folder, _Process(Path(folder)) as bench, sync_playwright() as playwright:
+        environment: dict[str, str | float | bool] = {**os.environ, "ANALOGRIG_TEST_MARK": mark}
+        path = tools.found("chromium")
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"], env=environment)
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.goto(bench.address)
+        page.wait_for_selector("html[data-drawn]")
+        for signal in SIGNALS[2:]:
+            page.get_by_label("Add a signal").select_option(signal)
+        page.get_by_label("Time base").select_option("0.1")
+        page.wait_for_function("(rows) => document.querySelectorAll('#signals tbody tr').length === rows", arg=6)
+        processes = {pid for parent in marked(mark) for pid in (parent, *descendants(parent))}
+        began_s, server_s, browser_s, frames = time.monotonic(), bench.cpu_s(), cpu_s(*processes), _drawn(page)
+        page.wait_for_timeout(1000 * seconds)
+        spent_s, server_s = time.monotonic() - began_s, bench.cpu_s() - server_s
+        browser_s, frames = cpu_s(*processes) - browser_s, _drawn(page) - frames
+        browser.close()
+    browser_part, server_part = browser_s / frames * SCREEN_HZ, server_s / spent_s
+    yield Figure("frames drawn by the browser", frames / spent_s, "Hz")
+    yield Figure("processor time of the browser for a frame", 1000 * browser_s / frames, "ms")
+    yield Figure("processor time of the server beside it", 100 * server_part, "% of a core")
+    yield Figure(f"browser and server at {SCREEN_HZ} Hz", 100 * (browser_part + server_part), "% of a core")
+
+
+def _drawn(page: Page) -> int:
+    return int(page.evaluate("document.documentElement.dataset.frames"))
 
 
 async def _watch(socket: Any, seconds: float) -> tuple[int, list[float], dict[str, Any]]:

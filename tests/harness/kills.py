@@ -10,6 +10,7 @@ part of a result that looks whole.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -20,6 +21,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -27,15 +29,22 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from websockets import Origin
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import ClientConnection, connect
+
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.store import Store
 from analogrig.config import read_toml
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
+from analogrig.scenario import Scenario
 from tests.harness.processes import gone, with_default_signals
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
 
+AT_WORK_S = 1.0
+"""Time of work with a command that does not end."""
 LONG_S = 300.0
 """For what takes seconds unless something is broken."""
 
@@ -51,6 +60,8 @@ class Case:
     """Told the folder as it is, and as it was before the command."""
     ends: bool = True
     """True if the command ends by itself."""
+    at_work: Callable[[subprocess.Popen[bytes]], object] | None = None
+    """Work with a command that does not end, until it does."""
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -105,6 +116,32 @@ def check_nothing(_: Path, __: Path) -> None:
     """It writes no files."""
 
 
+def check_takes(now: Path, _: Path) -> None:
+    """Every recording is whole and has its scenario."""
+    for path in (now / "takes").glob("*.npz"):
+        assert Run.load(path).samples
+        assert Scenario.load(str(path.with_suffix(".toml"))).samples
+
+
+def record_takes(process: subprocess.Popen[bytes]) -> None:
+    """Start and end recordings on a bench until it is gone."""
+    assert process.stdout is not None
+    told = process.stdout.readline().split()
+    if told:
+        url = told[-1].decode()
+        with contextlib.suppress(OSError, WebSocketException), open_page(url) as socket:
+            for is_on in itertools.cycle((True, False)):
+                socket.send(json.dumps({"do": "record", "on": is_on}))
+                while json.loads(socket.recv()).get("state", {}).get("recording") is not is_on:
+                    pass
+
+
+def open_page(url: str) -> ClientConnection:
+    """Connection of a page of the bench."""
+    address, _, token = url.partition("/?")
+    return connect(f"{address.replace('http', 'ws')}/live?{token}", origin=Origin(address), max_size=None)
+
+
 CASES = {
     "run": Case(("run", "--dut", "host", "--out", "out"), check_run),
     "campaign": Case(("campaign", "spec.toml", "--out", "out.sqlite", "--workers", "2"), check_campaign),
@@ -115,6 +152,7 @@ CASES = {
         ("calibrate", "--components", "nominal", "--pots", "coefficient", "--out", "twin.toml"), check_twin
     ),
     "serve": Case(("serve", "--port", "0"), check_nothing, ends=False),
+    "bench": Case(("bench", "--no-open", "--out", "takes"), check_takes, ends=False, at_work=record_takes),
 }
 
 
@@ -164,7 +202,7 @@ def _measured_s(case: Case, before: Path) -> float:
                 process.communicate(timeout=LONG_S)
             elif process.stdout is not None:
                 process.stdout.readline()
-            return time.monotonic() - start_s
+            return time.monotonic() - start_s + (AT_WORK_S if case.at_work else 0.0)
 
 
 def kill(case: Case, number: signal.Signals, before: Path, after_s: float) -> str:
@@ -172,10 +210,13 @@ def kill(case: Case, number: signal.Signals, before: Path, after_s: float) -> st
     with tempfile.TemporaryDirectory() as folder:
         now = Path(shutil.copytree(before, Path(folder) / "now"))
         with started(case, now) as (process, mark):
+            work = threading.Thread(target=case.at_work or (lambda _: None), args=(process,))
+            work.start()
             try:
                 process.wait(after_s)
             except subprocess.TimeoutExpired:
                 process.send_signal(number)
+            work.join(LONG_S)
             _, said = process.communicate(timeout=LONG_S)
             assert gone(mark), "processes are left"
         # -number: the command does not handle signals yet, or no longer. Status 1: Python itself had not started.
@@ -193,7 +234,9 @@ def instants(name: str, number: signal.Signals, kills: int, seed: int, most_s: f
 
 
 def main(kills: int, seed: int) -> int:
-    """Kill every command by every signal so many times; returns the number of faults."""
+    """Kill every command by every signal, and browsers at a bench, so many times; returns the number of faults."""
+    from tests.harness.live.browser_kills import kill_browsers  # which imports this module
+
     faults = 0
     with tempfile.TemporaryDirectory() as folder:
         before = prepared(Path(folder) / "before")
@@ -209,6 +252,7 @@ def main(kills: int, seed: int) -> int:
                     print(f"{name}, {number.name} after {after_s:.3f} s: {type(error).__name__}: {error}")
                 ended[how] = ended.get(how, 0) + 1
             print(f"{name:10} {number.name:8} {kills} kills within {most_s:.2f} s; by status {ended}", flush=True)
+    kill_browsers(kills, seed)
     print(f"{faults} faults; seed {seed}")
     return faults
 

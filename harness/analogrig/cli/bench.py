@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
 """Environment variable with the token of the address; by default a random one."""
 
+NO_FAULTS = "seed=1995"
+"""Line without faults, into which a hand can inject some."""
 REPORT_INTERVAL_N = 64
 """Samples between estimates from a device of our catalogue: the page shows ten states a second."""
 
@@ -98,6 +100,7 @@ def _open_device(name: str, arguments: argparse.Namespace) -> Device:
         changes["report_interval_n"] = changes["report_interval_n"] or REPORT_INTERVAL_N
         if description.kind != "can":
             changes["exchange"] = changes["exchange"] or "block"
+        changes["wire_faults"] = changes["wire_faults"] or NO_FAULTS
     return open_dut(name, allow=trust, **changes)
 
 

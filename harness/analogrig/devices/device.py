@@ -16,6 +16,7 @@ from analogrig.run import Channel
 
 if TYPE_CHECKING:
     from analogrig.links.link import CanListener
+    from analogrig.links.wire_faults import FaultyLine
 
 
 class Device(ABC):
@@ -66,6 +67,12 @@ class Device(ABC):
         """
         if settings:
             raise DeviceRefused(f"device {self.name}: has no setting {next(iter(settings))}")
+
+    def suit(self, order: int) -> None:  # noqa: B027 - few devices model the plant
+        """Take the order of the plant, before ``prepare``.
+
+        A device that leaves its orders to the program chooses its settings.
+        """
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: B027 - few devices need it
         """Take the scales of the channels ``u`` and ``y``, and the machine time between samples, before ``start``.
@@ -149,6 +156,11 @@ class Device(ABC):
     def line(self) -> Mapping[str, int]:
         """Bit rates of the line, if known, with ``samples_per_message`` and ``window`` of the packing."""
         return {}
+
+    @property
+    def faulty_line(self) -> FaultyLine[Any, Any] | None:
+        """Line that applies faults to its frames; None if the device was opened without line faults."""
+        return None
 
     def listen(self, listener: CanListener) -> None:  # noqa: B027 - few lines carry CAN frames
         """Report all CAN frames to the listener from now on; a line without any ignores it."""

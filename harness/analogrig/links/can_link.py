@@ -6,6 +6,7 @@ A frame has the identifier of its message in estimator_c/catalogue/analogrig.dbc
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from analogrig.catalogue import LAYOUTS, Message, pack, unpack_any
 from analogrig.links.can_bus import CanBus
@@ -13,6 +14,7 @@ from analogrig.links.can_station import CanStation
 from analogrig.links.frame_bits import CLASSIC_BYTES
 from analogrig.links.link import CanListener
 from analogrig.links.python_can import can
+from analogrig.links.wire_faults import FaultyLine
 
 _HARNESS_IDS = {(layout.id, False) for layout in LAYOUTS.values() if layout.from_harness}
 _DEVICE_IDS = {(layout.id, False) for layout in LAYOUTS.values() if not layout.from_harness}
@@ -42,6 +44,10 @@ class CanLink:
     @property
     def line_s(self) -> float:
         return self._station.line_s
+
+    @property
+    def faulty(self) -> FaultyLine[Any, Any] | None:
+        return self.bus if isinstance(self.bus, FaultyLine) else None
 
     def listen(self, listener: CanListener) -> None:
         self._station.listen(listener)

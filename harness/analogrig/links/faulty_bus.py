@@ -72,6 +72,15 @@ class FaultyBus(FaultyLine[CanBus, can.Message]):
     def waiting(self) -> int:
         return super().waiting + len(self._ready)
 
+    @property
+    def _is_intact(self) -> bool:
+        return super()._is_intact and self._off_until_s is None
+
+    def mend(self) -> None:
+        super().mend()
+        self._off_until_s = None
+        self._ready.clear()
+
     def _write(self, sent: Sequence[can.Message]) -> None:
         for frame in sent:
             self._line.send(frame)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from analogrig.catalogue import Message, pack, unpack_any
 from analogrig.links import frame
 from analogrig.links.line import Line, SerialLine
 from analogrig.links.wire import Connection, Wire
+from analogrig.links.wire_faults import FaultyLine
 
 if TYPE_CHECKING:
     import can
@@ -45,6 +46,10 @@ class Link(Connection, Protocol):
     @property
     def unread_n(self) -> int | None:
         """Largest number of received messages that the system buffers; None if it is unlimited."""
+
+    @property
+    def faulty(self) -> FaultyLine[Any, Any] | None:
+        """Line that applies faults to its frames; None if it was opened without faults."""
 
     def listen(self, listener: CanListener) -> None:
         """Report all CAN frames to the listener from now on; a link without any ignores it."""
@@ -83,6 +88,10 @@ class FramedLink:
     @property
     def counters(self) -> Mapping[str, int]:
         return {"frames_dropped": self._decoder.dropped + self._unknown_n}
+
+    @property
+    def faulty(self) -> FaultyLine[Any, Any] | None:
+        return self.wire if isinstance(self.wire, FaultyLine) else None
 
     def listen(self, listener: CanListener) -> None:
         """Do nothing: a wire carries no CAN frames."""

@@ -124,6 +124,17 @@ class Lane(Generic[T]):
             self.put(*(sent for n, sent in self.held if n <= 1))
             self.held = [(n - 1, sent) for n, sent in self.held if n > 1]
 
+    @property
+    def is_altered(self) -> bool:
+        """True if not every frame passes at once."""
+        return bool(self.held or self.queue or self.babble or self.lost_n or self.stalled_s > self.clock())
+
+    def mend(self) -> None:
+        """End outage, stall and noise, and lose the frames that are held back."""
+        self.held.clear()
+        self.queue.clear()
+        self.stalled_s, self.babble, self.lost_n = 0.0, "", 0
+
     def due(self) -> list[T]:
         """Frames that have arrived by now."""
         out = []
@@ -165,6 +176,26 @@ class FaultyLine(ABC, Generic[L, T]):
         """Number of frames that are held back."""
         return sum(len(lane.queue) + len(lane.held) for lane in self._lanes.values())
 
+    @property
+    def lasting(self) -> Sequence[str]:
+        """Kinds of the faults in force."""
+        return sorted(self._lasting | {lane.babble for lane in self._lanes.values() if lane.babble})
+
+    def inject(self, kind: str, direction: Direction) -> None:
+        """Apply a fault at the next frame of this direction.
+
+        :raises ConfigurationError: the line has no such fault.
+        """
+        if kind not in self.KINDS:
+            raise ConfigurationError(f"the line has no fault {kind!r}: it has {', '.join(self.KINDS)}")
+        self._at[direction, self._lanes[direction].frames] = kind
+
+    def mend(self) -> None:
+        """End the faults in force; frames that are held back are lost."""
+        self._lasting.clear()
+        for lane in self._lanes.values():
+            lane.mend()
+
     def close(self) -> None:
         self._line.close()
 
@@ -202,7 +233,17 @@ class FaultyLine(ABC, Generic[L, T]):
         if isinstance(self.clock, VirtualClock):
             self.clock.advance(by_s)
 
+    @property
+    def _is_intact(self) -> bool:
+        """True if no frame can have a fault before another one is injected, and none is held back."""
+        lanes = self._lanes.values()
+        return not (self._at or self._rates or self._lasting or any(lane.is_altered for lane in lanes))
+
     def _send(self, sent: Sequence[T]) -> None:
+        if self._is_intact:
+            self._lanes["to"].frames += len(sent)
+            self._write(sent)
+            return
         self._enter("to", sent)
         self._deliver()
 
@@ -219,7 +260,11 @@ class FaultyLine(ABC, Generic[L, T]):
             if received or is_over:
                 return received
             left_s = max(0.0, deadline_s - self.clock())
-            self._enter("from", self._read(min(left_s, self._soon_s())))
+            passed = self._read(min(left_s, self._soon_s()))
+            if passed and self._is_intact:
+                lane.frames += len(passed)
+                return passed
+            self._enter("from", passed)
             is_over = self.clock() >= deadline_s
 
     def _deliver(self) -> None:
@@ -251,7 +296,7 @@ class FaultyLine(ABC, Generic[L, T]):
             lane.release()
 
     def _due_kind(self, direction: Direction, lane: Lane[T]) -> str | None:
-        kind = self._at.get((direction, lane.frames))
+        kind = self._at.pop((direction, lane.frames), None)
         if kind is not None:
             return kind
         return next((kind for kind, rate in self._rates.items() if lane.rng.random() < rate), None)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
+from analogrig.links.wire_faults import Direction
 
 MOST_STEPS = 1_000_000
 SLOWEST, FASTEST = 1e6, 1e-3
@@ -93,6 +94,19 @@ class Inject:
 
 
 @dataclass(frozen=True)
+class Spoil:
+    """Inject a fault of the device's line into the next frame of one direction."""
+
+    kind: str
+    direction: Direction = "to"
+
+
+@dataclass(frozen=True)
+class Mend:
+    """End the faults of the device's line."""
+
+
+@dataclass(frozen=True)
 class SetRecording:
     """Start a recording, from rest, or end and save it."""
 
@@ -104,7 +118,9 @@ class ClearLamps:
     """Put the overload lamps out."""
 
 
-Command = Turn | Generate | Operate | SetPlaying | Step | Tempo | Restart | Inject | SetRecording | ClearLamps
+Command = (
+    Turn | Generate | Operate | SetPlaying | Step | Tempo | Restart | Inject | Spoil | Mend | SetRecording | ClearLamps
+)
 
 _COMMANDS: Mapping[str, type[Command]] = {
     "turn": Turn,
@@ -115,6 +131,8 @@ _COMMANDS: Mapping[str, type[Command]] = {
     "tempo": Tempo,
     "restart": Restart,
     "inject": Inject,
+    "spoil": Spoil,
+    "mend": Mend,
     "record": SetRecording,
     "clear lamps": ClearLamps,
 }

@@ -1,4 +1,4 @@
-"""Faults of the channel of the output that a hand switches on and off, between computer and card."""
+"""Faults that a hand injects: of the channel of the output, between computer and card, and of the device's line."""
 
 from __future__ import annotations
 
@@ -16,6 +16,34 @@ HUM_LSB, HUM_HZ = 40.0, 50.0
 """Amplitude and frequency of the hum, in machine time."""
 SKEW_N = 0.5
 """Delay of the skewed channel, in samples."""
+
+
+LINE_LABELS: Mapping[str, str] = {
+    "flip": "bits flipped",
+    "lose": "bytes lost",
+    "insert": "bytes inserted",
+    "truncate": "frame cut short",
+    "drop": "frame lost",
+    "duplicate": "frame doubled",
+    "outage": "many frames lost",
+    "reorder": "frame after later ones",
+    "repeat": "frame repeated later",
+    "delay": "delay of up to 3 s",
+    "error": "error frame, then sent again",
+    "remote": "remote frame before it",
+    "collide": "other frame of its identifier",
+    "fd": "frame of CAN FD",
+    "bus-off": "bus-off for up to 3 s",
+    "babble": "noise without end",
+    "jam": "foreign frames without end",
+    "disconnect": "line cut",
+    "hang": "nothing passes",
+    "stranger": "another catalogue",
+    "reset": "device reset",
+    "wrong-baud": "wrong baud rate",
+    "wrong-bitrate": "wrong bit rate",
+}
+"""Labels of the faults of lines."""
 
 
 def labels(channel: str) -> Mapping[Fault, str]:

@@ -183,7 +183,12 @@ class Viewer:
                     table = {"take": alarm.take, "sample": alarm.sample, "what": alarm.what}
                     await self._send("/alarms", table | {"latency_n": alarm.latency_n, "bound_n": alarm.bound_n})
                 if end != last:
-                    state = {"mode": session.mode, "samples": end, "speed": session.speed_hz, "take": take}
+                    state = {
+                        "mode": session.mode,
+                        "samples": end,
+                        "speed": session.meter.rates.samples_hz,
+                        "take": take,
+                    }
                     await self._send("/state", state)
                 changed = {name: value for name, value in session.values.items() if told.get(name) != value}
                 told |= changed

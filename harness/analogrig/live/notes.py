@@ -24,7 +24,7 @@ from analogrig.live.ring import Ring
 from analogrig.live.take import Take
 from analogrig.plant import estimated_parameters
 from analogrig.rigs.rig import Block
-from analogrig.run import INPUT, OUTPUT, missing_samples
+from analogrig.run import INPUT, LOST, OUTPUT, missing_samples
 
 _BOUND_AFTER_N = (64, 256, 1024)
 """Samples after a change at which its bound is looked for."""
@@ -66,6 +66,7 @@ class Notes:
         self.diagnosis = ""
         self.misfit = ""
         self.missing_n = 0
+        """Samples that the device has not got: clipped, or lost on its line."""
 
     def begin(self, take: Take, number: int) -> None:
         """Begin a take."""
@@ -80,7 +81,7 @@ class Notes:
     def watch(self, block: Block, answers: Answers, now_s: float) -> bool:
         """Take note of an answered block that is in the ring. Return True if there is news."""
         end = self._ring.end
-        self.missing_n += int(np.count_nonzero(~block.samples().valid))
+        self.missing_n += int(np.count_nonzero(~block.samples().valid[: len(answers)] | (answers.flags & LOST != 0)))
         self.felt_s.extend(now_s - at_s for sample, at_s in self._unfelt if sample < end)
         self._unfelt = [each for each in self._unfelt if each[0] >= end]
         for alarm in answers.alarms:

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from analogrig.live.desk import SteppedDesk
+from analogrig.live.faults import LINE_LABELS
 from analogrig.live.scope import signals_of
 from analogrig.live.session import LiveSession
 from analogrig_emulator import Capacitor, Pot, Resistor
@@ -24,6 +25,8 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
         "stepped": desk.is_stepped,
         "modes": ["POT SET", "INITIAL CONDITION", "HOLD", "OPERATE"] if desk.is_stepped else [],
         "faults": dict(desk.faults),
+        "line_faults": {kind: LINE_LABELS[kind] for kind in session.line_faults},
+        "line": {name: count for name, count in device.line.items() if count},
         "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
         "level": (session.excitation.low_v + session.excitation.high_v) / 2.0,
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
@@ -81,7 +84,7 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "samples": end,
         "playing": session.is_playing,
         "factor": session.factor,
-        "speed": session.speed_hz,
+        "rates": dataclasses.asdict(session.meter.rates),
         "rate": session.sample_rate_hz,
         "overruns": session.overruns_n,
         "missing": session.notes.missing_n,
@@ -90,12 +93,14 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "values": dict(session.values),
         "generator": {"on": session.is_on, **dataclasses.asdict(session.excitation)},
         "faults": sorted(session.injected),
+        "line_faults": list(line.lasting) if (line := session.device.faulty_line) is not None else [],
         "estimates": [{"name": name, "estimate": value, "truth": truth.get(name)} for name, value in estimates.items()],
         "statistic": _last(session, "statistic"),
         "volts": _volts(session),
         "diagnosis": session.notes.diagnosis,
         "misfit": session.notes.misfit,
         "counters": {name: count for name, count in session.counters.items() if count},
+        "link_counters": {name: count for name, count in session.device.link_counters.items() if count},
         "alarms": [dataclasses.asdict(alarm) for alarm in list(session.notes.alarms)[-12:]],
         "alarm_count": session.notes.alarm_count,
         "recording": session.is_recording,

@@ -21,8 +21,10 @@ from analogrig.live.session import LiveSession
 MOST_SIGNALS = 16
 LEAST_WINDOW_N, MOST_WINDOW_N = 16, RING_N // 2
 MOST_COLUMNS = 4000
-_MOST_ESTIMATES = 2048
+_MOST_ESTIMATES = 512
 """Rows of theta that are converted for one screen."""
+_MEASURE_S = 0.2
+"""Time between two measurements, which people read."""
 _HYSTERESIS = 0.002
 """Hysteresis of the trigger, as a part of the source's range in the ring."""
 
@@ -69,7 +71,6 @@ class View:
     samples: int = 400
     columns: int = 1000
     kind: Literal["yt", "xy", "fft"] = "yt"
-    measure: bool = True
     arm: int = 0
     """Number of the arming: another one arms a single trigger again."""
 
@@ -119,10 +120,12 @@ def read_signal(session: LiveSession, name: str, first: int, end: int) -> Values
         return ring.read(name, first, end).astype(np.float64)
     names, parameter = session.notes.estimate_names, name.removeprefix("estimate ")
     if parameter in names:
-        stride = max(1, (end - first) // _MOST_ESTIMATES)
-        theta: Any = ring.read("theta", first, end)[::stride]
-        found = session.notes.estimated(theta)[:, names.index(parameter)]
-        return np.repeat(found, stride)[: end - first]
+        theta: Any = ring.read("theta", first, end)
+        is_new = np.append(True, (theta[1:] != theta[:-1]).any(axis=1))  # reports are often far apart
+        starts = np.flatnonzero(is_new)
+        starts = starts[:: -(-len(starts) // _MOST_ESTIMATES)]
+        found = session.notes.estimated(theta[starts])[:, names.index(parameter)]
+        return np.repeat(found, np.diff(starts, append=end - first))
     raise LookupError(f"no signal is called {name!r}")
 
 
@@ -133,8 +136,10 @@ class Screen:
         self.view: View | None = None
         """View that the client has asked for."""
         self._is_waiting = True
-        self._shown: tuple[int, int, float] | None = None
-        """Take, last sample and trigger of the last frame."""
+        self._shown: tuple[int, int] | None = None
+        """Take and last sample of the last frame."""
+        self._measured_s = -_MEASURE_S
+        """Time of the last measurements."""
 
     def change(self, view: View) -> None:
         """Show another view."""
@@ -142,6 +147,7 @@ class Screen:
             self._is_waiting = True
         self.view = view
         self._shown = None
+        self._measured_s = -_MEASURE_S
 
     def frame(self, session: LiveSession) -> bytes | None:
         """Next frame; None if there is nothing new to show."""
@@ -149,7 +155,7 @@ class Screen:
         if view is None or (view.trigger.mode == "single" and not self._is_waiting):
             return None
         end, take = ring.end, session.take_number
-        if end < LEAST_WINDOW_N or (self._shown is not None and self._shown[:2] == (take, end)):
+        if end < LEAST_WINDOW_N or self._shown == (take, end):
             return None
         try:
             return self._frame(view, session, take, end)
@@ -166,15 +172,16 @@ class Screen:
         else:
             trigger = found
             first = min(max(int(found) - round(view.trigger.position * samples), session.ring.start), end - samples)
-        shown = take, end, -1.0 if trigger is None else trigger
-        self._shown = shown
+        self._shown = take, end
         if trigger is not None:
             self._is_waiting = False
         signals = {name: read_signal(session, name, first, first + samples) for name in view.signals}
         rate_hz = session.sample_rate_hz
         header: dict[str, Any] = {"take": take, "first": first, "samples": samples, "rate": rate_hz, "end": end}
-        header |= {"trigger": trigger, "kind": view.kind, "signals": list(signals), "at": session.clock()}
-        if view.measure:
+        header |= {"trigger": trigger, "kind": view.kind, "signals": list(signals)}
+        now_s = session.clock()
+        if now_s - self._measured_s >= _MEASURE_S or not session.is_playing:
+            self._measured_s = now_s
             header["measures"] = {name: measures(values, rate_hz) for name, values in signals.items()}
         if view.kind == "fft":
             header["step"] = rate_hz / samples

@@ -53,6 +53,8 @@ BUFFERED_BYTES = 262_144
 SLOW_S = 10.0
 FRAME_S = 1.0 / 45.0
 """Time between two frames."""
+LEAST_PAUSE_S = 0.002
+"""Least time between the work for two frames, which is left to other clients."""
 STATE_S = 0.1
 """Time between two states while the session plays."""
 _PAGE = Path(__file__).parent / "page"
@@ -243,6 +245,7 @@ class BenchServer:
             await self._send(client, json.dumps({"bench": bench_table(self.session)}))
             told_s, version = 0.0, -1
             while True:
+                due_s = time.monotonic() + FRAME_S
                 frame = client.screen.frame(self.session)
                 if frame is not None:
                     await self._send(client, frame)
@@ -252,7 +255,7 @@ class BenchServer:
                     told_s, version = time.monotonic(), self.session.version
                     await self._send(client, json.dumps({"state": self._state(client)}))
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(FRAME_S):
+                    async with asyncio.timeout(max(LEAST_PAUSE_S, due_s - time.monotonic())):
                         await client.changed.wait()
         except ConnectionClosed:
             pass

@@ -27,6 +27,7 @@ from analogrig.live.clock import LiveClock, WallClock
 from analogrig.live.commands import Command
 from analogrig.live.desk import CHANGE_N, SteppedDesk, open_desk
 from analogrig.live.notes import Notes
+from analogrig.live.rates import RateMeter
 from analogrig.live.ring import Ring
 from analogrig.live.take import MOST_RECORDED_N, Take, TakeBuilder
 from analogrig.plant import MAX_CHANGES
@@ -35,6 +36,7 @@ from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 from analogrig.storage import replace_file
+from analogrig.wording import number_of
 from analogrig_emulator import EmulatorError
 
 BLOCK_S = 0.0125
@@ -109,19 +111,20 @@ class LiveSession:
         self.notices: deque[tuple[int, str]] = deque(maxlen=_MOST_NOTED)
         self.saved: deque[Saved] = deque(maxlen=_MOST_NOTED)
         self.counters: Mapping[str, int] = {}
-        self.speed_hz = 0.0
-        """Samples per second of wall-clock time, over the last second."""
+        self.meter = RateMeter(device)
         self.is_recording = False
         self.version = 0
         """Number that grows with every change of the state, apart from samples."""
         self._notice_numbers = itertools.count(1)
+        self._has_failed = False
+        """True until the device has been brought back after a failure."""
+        self._spoils: list[commands.Spoil] = []
+        """Faults of the line that wait for the next answered block: handshake and configuration are spared."""
         self._steps = 0
         self._ends_take = False
-        self._is_closed = False
-        self._is_made_safe = False
+        self._is_closed, self._is_made_safe = False, False
         self._pace: tuple[float, int] | None = None
         """Time and sample from which the pace is counted."""
-        self._speed_from = (0.0, 0)
         self._turns: dict[str, float] = {}
         self._ramp_n = 0
         self._turned_at: list[float] = []
@@ -170,6 +173,8 @@ class LiveSession:
                 self.desk.check(dataclasses.replace(self.desk.scenario, excitation=excitation))
             case commands.Operate():
                 self._refuse_while_recording("the mode")
+            case commands.Spoil() if command.kind not in self.line_faults:
+                raise ConfigurationError(f"the line of this device has no fault {command.kind!r} to inject")
             case commands.Inject() if command.fault not in self.desk.faults:
                 raise ConfigurationError(f"this rig has no fault {command.fault!r} to inject")
         if not self.desk.is_stepped and isinstance(command, commands.Operate | commands.Step | commands.ClearLamps):
@@ -197,7 +202,10 @@ class LiveSession:
     def run(self) -> None:
         """Play takes until ``close``."""
         while not self._is_closed:
-            self._play_take()
+            if self._has_failed:
+                self._bring_back()
+            else:
+                self._play_take()
 
     def _play_take(self) -> None:
         """Play from rest until something demands a new start."""
@@ -210,6 +218,8 @@ class LiveSession:
         )
         try:
             run = bench.play(self.take.scenario, self.seed)
+            if not (run.samples or run.conditions.faults):
+                self.device.stop()  # it was started, and had no record to end
         except AnalogrigError as error:
             self._stop_after(str(error))
             return
@@ -245,15 +255,21 @@ class LiveSession:
             self._note_fault(fault)
 
     @property
+    def line_faults(self) -> tuple[str, ...]:
+        """Kinds of faults that the line of the device can have."""
+        return () if self.device.faulty_line is None else self.device.faulty_line.KINDS
+
+    @property
     def injected(self) -> set[commands.Fault]:
         """Faults in force."""
         return set(self.desk.injected) if isinstance(self.desk, SteppedDesk) else set()
 
     def _wait_to_play(self) -> None:
-        """For a rig of whole records: apply the commands, and wait while paused."""
+        """Outside a take: apply the commands, and wait while there is nothing to play."""
         while True:
             self._apply_commands()
-            if (self.is_playing and self.is_on) or self._is_closed:
+            is_due = self.is_playing and (self.is_on or self.desk.is_stepped)
+            if is_due or self._steps or self._is_closed:
                 return
             self._wait(None)
 
@@ -288,7 +304,7 @@ class LiveSession:
         now_s = self.clock()
         if self._pace is None:
             self._pace = (now_s, self._taken)
-            self._speed_from = (now_s, self._taken)
+            self.meter.restart()
         start_s, start_n = self._pace
         due_s = start_s + (self._taken + length - start_n) / rate_hz
         if now_s < due_s:
@@ -355,8 +371,16 @@ class LiveSession:
             case commands.SetRecording():
                 self._ends_take = self._ends_take or command.on != self.is_recording
                 self.is_recording = command.on
+            case commands.Spoil() | commands.Mend():
+                self._alter_line(command)
             case _ if isinstance(self.desk, SteppedDesk):
                 self._operate(self.desk, command)
+
+    def _alter_line(self, command: commands.Spoil | commands.Mend) -> None:
+        if isinstance(command, commands.Spoil):
+            self._spoils.append(command)
+        elif self.device.faulty_line is not None:
+            self.device.faulty_line.mend()
 
     def _operate(self, desk: SteppedDesk, command: Command) -> None:
         """Apply a command that only an emulated computer has."""
@@ -400,16 +424,25 @@ class LiveSession:
         self.notes.await_turn(sample + 1, times_s)
         self.version += 1
 
+    def _spoil(self) -> None:
+        """Inject the faults of the line that were asked for."""
+        spoils, self._spoils = self._spoils, []
+        if self.device.faulty_line is not None:
+            for each in spoils:
+                self.device.faulty_line.inject(each.kind, each.direction)
+                self.take.caveats.append(
+                    f"line fault {each.kind}, {each.direction} the device: injected by hand at sample {self.ring.end}"
+                )
+
     def _watch(self, block: Block, answers: Answers) -> None:
         """Take note of an answered block."""
         now_s = self.clock()
         self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
         self.ring.add(block, self.desk.probed(len(block.codes)), answers)
+        self._spoil()
+        self.meter.count(len(answers), now_s)
         if self.notes.watch(block, answers, now_s) or not self.is_playing:
             self.version += 1
-        since_s, since_n = self._speed_from
-        if now_s - since_s >= 1.0:
-            self.speed_hz, self._speed_from = (self._taken - since_n) / (now_s - since_s), (now_s, self._taken)
 
     # ---- ends of takes
 
@@ -423,26 +456,35 @@ class LiveSession:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             number = next(n for n in itertools.count(1) if not self._file(n, "npz").exists())
-            concluded.save(self._file(number, "npz"))
             table = {k: v for k, v in concluded.conditions.scenario.items() if v != "" and k not in ("name", "rig")}
             with replace_file(self._file(number, "toml")) as file:
                 file.write(config.to_toml(table).encode())
+            concluded.save(self._file(number, "npz"))  # last: no recording is without its scenario
         except (AnalogrigError, OSError) as error:
             self.notify(f"the recording could not be saved: {error}")
             return
         saved = Saved(self._file(number, "npz"), self._file(number, "toml"), run.samples, len(run.alarm_index))
         self.saved.append(saved)
-        self.notify(f"{saved.run}: {run.samples} samples, {saved.alarms} alarms; scenario: {saved.scenario}")
+        held = f"{number_of(run.samples, 'sample', form=',')}, {number_of(saved.alarms, 'alarm')}"
+        self.notify(f"saved {saved.run}: {held}; scenario: {saved.scenario}")
 
     def _file(self, number: int, suffix: str) -> Path:
         return self._folder / f"take-{number}.{suffix}"
 
     def _stop_after(self, reason: str) -> None:
-        """Pause after a failure, with the device ready for the next take."""
+        """Pause after a failure."""
         self.notify(f"stopped: {reason}")
-        self.is_playing, self._steps, self.is_recording = False, 0, False
+        self.is_playing, self._steps, self.is_recording, self._has_failed = False, 0, False, True
+
+    def _bring_back(self) -> None:
+        """Bring the device back as soon as a hand wants to go on."""
+        self._wait_to_play()
+        if self._is_closed:
+            return
         try:
             self.device.recover()
             self.device.configure()
         except AnalogrigError as error:
-            self.notify(str(error))
+            self._stop_after(str(error))
+        else:
+            self._has_failed = False

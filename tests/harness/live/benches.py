@@ -9,6 +9,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+from analogrig.devices.device import Device
 from analogrig.devices.registry import describe
 from analogrig.live.commands import Command
 from analogrig.live.server import BenchServer
@@ -52,11 +53,16 @@ class ScriptedClock:
 
 
 def scripted_session(
-    script: Sequence[tuple[float, Action]], folder: Path, *, scenario: Scenario | None = None, rig: str = "emulator"
+    script: Sequence[tuple[float, Action]],
+    folder: Path,
+    *,
+    scenario: Scenario | None = None,
+    rig: str = "emulator",
+    dut: Device | None = None,
 ) -> LiveSession:
-    """Session that has played a script to its end; time is that of the machine."""
+    """Session that has played a script to its end; time is that of the machine. The device is closed."""
     clock = ScriptedClock(script)
-    with open_rig(rig) as opened, describe("inproc").direct() as device:
+    with open_rig(rig) as opened, dut or describe("inproc").direct() as device:
         session = LiveSession(opened, scenario or Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
         clock.session = session
         session.run()

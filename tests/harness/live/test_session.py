@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from analogrig import cli
+from analogrig.catalogue import BLOCK_SAMPLES
+from analogrig.cli.bench import NO_FAULTS
+from analogrig.devices.device import Device
+from analogrig.devices.opening import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge
+from analogrig.links.faulty_bus import FaultyBus
+from analogrig.links.wire_faults import FaultyLine, FaultyWire
 from analogrig.live.commands import (
     ClearLamps,
+    Command,
     Generate,
     Inject,
+    Mend,
     Operate,
     Restart,
     SetPlaying,
     SetRecording,
+    Spoil,
     Step,
     Tempo,
     Turn,
     command_of,
 )
 from analogrig.live.desk import SteppedDesk
+from analogrig.live.faults import LINE_LABELS
 from analogrig.live.session import BLOCK_S, LiveSession
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
@@ -188,6 +200,7 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
     ("command", "words"),
     [
         (Turn("X", 1.0), "no pot shows 'X'"),
+        (Spoil("drop"), "the line of this device has no fault 'drop'"),
         (Turn("K", 1e9), "K must be 15000 to 29000 N/m"),
         (Turn("K", float("nan")), "K must be"),
         (Generate(frequency_hz=1e9), "exceeds half the sample rate"),
@@ -195,7 +208,7 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
     ],
 )
 def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
-    command: Turn | Generate, words: str, tmp_path: Path
+    command: Command, words: str, tmp_path: Path
 ) -> None:
     def refuse(session: LiveSession) -> None:
         with pytest.raises(ConfigurationError, match=words):
@@ -224,6 +237,14 @@ def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
     assert not session.take.changes
 
 
+def test_take_that_ends_before_its_first_sample_leaves_the_device_ready(tmp_path: Path) -> None:
+    script = ((0.001, Restart()), (0.002, Restart()), (0.1, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path, dut=linked())
+    assert session.take_number == 3
+    assert not session.notices
+    assert session.ring.end > 1000
+
+
 def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None:
     held: list[int] = []
 
@@ -237,23 +258,70 @@ def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None
 
 
 def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
-    from analogrig.devices.opening import open_dut
-    from tests.harness.live.benches import ScriptedClock
-
-    clock = ScriptedClock(
-        (
-            (0.02, Turn("K", 18000.0)),
-            (0.05, SetPlaying(on=False)),
-            (90.0, SetPlaying(on=True)),
-            (90.1, SetPlaying(on=False)),
-        )
+    script = (
+        (0.02, Turn("K", 18000.0)),
+        (0.05, SetPlaying(on=False)),
+        (90.0, SetPlaying(on=True)),
+        (90.1, SetPlaying(on=False)),
     )
-    with open_rig("emulator") as rig, open_dut("inproc") as device:
-        session = LiveSession(rig, Scenario.load("thesis"), device, SEED, folder=tmp_path, clock=clock)
-        clock.session = session
-        session.run()
+    session = scripted_session(script, tmp_path, dut=open_dut("inproc"))
     assert not session.notices
     assert session.ring.end > 0.1 * RATE_HZ
+
+
+def linked() -> Device:
+    """Device behind a line into which a hand can inject faults."""
+    return open_dut("inproc", exchange="block", wire_faults=NO_FAULTS)
+
+
+def test_frame_lost_by_hand_is_counted_and_recorded(tmp_path: Path) -> None:
+    script = ((0.0, SetRecording(on=True)), (0.05, Spoil("drop", "to")), (0.1, SetRecording(on=False)))
+    session = scripted_session(script, tmp_path, dut=linked())
+    run = Run.load(session.saved[0].run)
+    assert 0 < session.notes.missing_n == run.lost.sum() <= BLOCK_SAMPLES
+    (fault,) = run.conditions.faults
+    assert re.fullmatch(r"line fault drop, to the device: injected by hand at sample \d+", fault)
+    assert cli.main(["judge", str(session.saved[0].run), "--out", str(tmp_path / "judged")]) == 3
+
+
+def test_cut_line_stops_the_session_until_it_is_mended(tmp_path: Path) -> None:
+    ends: list[tuple[bool, int]] = []
+
+    def note(session: LiveSession) -> None:
+        ends.append((session.is_playing, session.ring.end))
+
+    script = (
+        (0.05, Spoil("disconnect", "from")),
+        (0.10, note),
+        (0.10, SetPlaying(on=True)),  # in vain
+        (0.20, note),
+        (0.20, Mend()),
+        (0.21, SetPlaying(on=True)),
+        (0.30, note),
+    )
+    session = scripted_session(script, tmp_path, dut=linked())
+    assert [playing for playing, _ in ends] == [False, False, True]
+    assert ends[2][1] > 1000
+    notices = [text for _, text in session.notices]
+    assert len(notices) == 2  # one for each attempt
+    assert all("the line is cut" in text for text in notices)
+
+
+@pytest.mark.parametrize("kind", FaultyWire.KINDS)
+def test_line_fault_of_any_kind_leaves_a_bench_that_can_be_mended(kind: str, tmp_path: Path) -> None:
+    again = SetPlaying(on=True)  # the second time after messages out of order, which the first one meets
+    script = ((0.03, Spoil(kind, "from")), (0.06, Mend()), (0.06, again), (0.07, again), (0.15, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path, dut=linked())
+    assert session.ring.end > 0.05 * RATE_HZ
+    assert session.device.faulty_line is not None
+    assert not session.device.faulty_line.lasting
+
+
+@pytest.mark.parametrize(("name", "line"), [("inproc", FaultyWire), ("inproc?link=can", FaultyBus)])
+def test_every_line_fault_has_a_label(name: str, line: type[FaultyLine[Any, Any]]) -> None:
+    with open_dut(name, wire_faults=NO_FAULTS) as device:
+        assert isinstance(device.faulty_line, line)
+    assert set(line.KINDS) <= set(LINE_LABELS)
 
 
 @pytest.mark.parametrize(
@@ -266,6 +334,7 @@ def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> No
         ("turn", {"name": "K", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
         ("tempo", {"factor": 0.0}, "factor must be 0.001 to"),
         ("step", {"samples": 10**9}, "samples must be 1 to"),
+        ("spoil", {"kind": "drop", "direction": "up"}, "must be one of"),
         ("operate", {"mode": "FLY"}, "must be one of"),
         ("record", {"on": True, "file": "/etc/passwd"}, "unknown key 'file'"),
     ],

@@ -5,6 +5,7 @@
   const BASES_S = [0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2];
   const DIVISIONS = 5; // above and below the middle
   const SCALES = [1, 2, 2.5, 5];
+  const WIDTH = 1; // of curves: wider ones take three times as long to draw without a graphics processor
   const KEPT = 12; // frames of the persistence
   const RETRY_MS = 500;
   const HAND_MS = 40; // time between two messages of a hand that turns a pot
@@ -16,7 +17,9 @@
   let bench = null;
   let state = null;
   let frame = null;
-  let frames = 0;
+  let frames = 0; // that were drawn
+  let isDue = false; // true until the last frame is drawn
+  let measures = null; // that were not shown yet
   let shown = [];
   let current = "";
   const scales = new Map(); // of each signal: volts per division, and volts at the middle
@@ -26,6 +29,9 @@
   let arm = 0;
   let number = 0;
   const knobs = new Map();
+  const voltages = new Map(); // texts of the patch by amplifier
+  const settings = document.querySelectorAll("#generator [data-key]");
+  let operated = []; // what only the page that drives can operate
 
   // ---- messages
 
@@ -69,6 +75,10 @@
   }
 
   // ---- numbers
+
+  function put(element, text) {
+    if (element.textContent !== String(text)) element.textContent = text;
+  }
 
   function short(value, digits = 4) {
     if (value === null || value === undefined || !Number.isFinite(value)) return "–";
@@ -138,6 +148,10 @@
     buildFaults();
     buildPatch();
     buildSignals();
+    operated = document.querySelectorAll(
+      ".bar button, .bar select, #generator button, #generator [data-key], #modes button, #fault-section button, " +
+        "#fault-section select, #clear-lamps",
+    );
   }
 
   function buildKnobs() {
@@ -167,7 +181,7 @@
 
   function buildFaults() {
     const names = Object.entries(bench.faults);
-    $("fault-section").hidden = !names.length;
+    $("fault-section").hidden = !names.length && !Object.keys(bench.line_faults).length;
     $("faults").replaceChildren();
     for (const [fault, label] of names) {
       const button = document.createElement("button");
@@ -177,6 +191,10 @@
       button.onclick = () => send("inject", { fault, on: button.getAttribute("aria-pressed") !== "true" });
       $("faults").append(button);
     }
+    const kinds = Object.entries(bench.line_faults);
+    $("line-section").hidden = !kinds.length;
+    $("line-fault").replaceChildren();
+    for (const [kind, label] of kinds) option($("line-fault"), kind, `${kind}: ${label}`);
   }
 
   function cell(row, text, kind = "") {
@@ -377,6 +395,7 @@
     $("patch-section").hidden = !bench.patch.length;
     const drawing = $("patch");
     drawing.replaceChildren();
+    voltages.clear();
     let y = 12;
     for (const row of bench.patch) {
       const height = 30 * Math.max(1, row.inputs.length);
@@ -398,7 +417,7 @@
       svg(group, "path", { class: "wire", d: `M310 ${y + height / 2}H340` });
       svg(group, "text", { x: 248, y: y + height / 2 + 4, class: "small" }, row.name);
       svg(group, "text", { x: 348, y: y + height / 2 + 4 }, `${row.node}${row.quantity ? `: ${row.quantity}` : ""}`);
-      svg(group, "text", { x: 540, y: y + height / 2 + 4, "data-volts": row.name, "text-anchor": "end" }, "–");
+      voltages.set(row.name, svg(group, "text", { x: 540, y: y + height / 2 + 4, "text-anchor": "end" }, "–"));
       group.onclick = () => toggle(row.name);
       group.onkeydown = (event) => {
         if (event.key !== "Enter" && event.key !== " ") return;
@@ -423,41 +442,41 @@
         : "Nobody drives the bench.";
     $("drive").hidden = state.driven;
     document.documentElement.dataset.role = drives ? "drives" : "watches";
-    const mine = "#play, #step, #restart, #tempo, #record, #generator *, #modes button, #faults button, #clear-lamps";
-    for (const each of document.querySelectorAll(mine)) each.disabled = !drives;
+    for (const each of operated) each.disabled = !drives;
     if (!bench.stepped) $("tempo").disabled = true;
     pressed("play", state.playing, state.playing ? "Pause" : "Run");
     pressed("record", state.recording, state.recording ? "End the recording" : "Record");
     pressed("generator-on", state.generator.on, state.generator.on ? "Switch off" : "Switch on");
     if (document.activeElement !== $("tempo")) $("tempo").value = String(state.factor);
-    $("clock").textContent = `take ${state.take}, ${withPrefix(state.samples / state.rate, "s")}, ${state.samples} samples`;
+    put($("clock"), `take ${state.take}, ${withPrefix(state.samples / state.rate, "s")}, ${state.samples} samples`);
     for (const [name, knob] of knobs) {
       knob.input.disabled = !drives;
       knob.slider.setAttribute("aria-disabled", String(!drives));
       if (!knob.held && state.values[name] !== undefined) knob.show(state.values[name]);
     }
-    for (const each of document.querySelectorAll("#generator [data-key]")) {
+    for (const each of settings) {
       const value = state.generator[each.dataset.key];
       if (document.activeElement !== each) each.value = typeof value === "number" ? short(value, 6) : value;
       if (each.dataset.key === "duty") each.disabled ||= state.generator.shape !== "pulse";
     }
     for (const each of $("modes").children) each.setAttribute("aria-pressed", String(each.dataset.mode === state.mode));
     for (const each of $("faults").children) each.setAttribute("aria-pressed", String(state.faults.includes(each.dataset.fault)));
-    $("lamps").textContent = state.lamps.length ? state.lamps.join(", ") : "none";
+    put($("line-faults"), state.line_faults.length ? `in force: ${state.line_faults.join(", ")}` : "");
+    put($("lamps"), state.lamps.length ? state.lamps.join(", ") : "none");
     $("lamps").classList.toggle("lit", state.lamps.length > 0);
     for (const [name, volts] of Object.entries(state.volts)) {
-      const text = $("patch").querySelector(`[data-volts="${name}"]`);
-      if (text) text.textContent = `${volts.toFixed(2)} V`;
+      if (voltages.has(name)) put(voltages.get(name), `${volts.toFixed(2)} V`);
     }
     showDevice();
     const notices = state.notices.map(([, text]) => text).reverse();
+    put($("notice"), notices[0] ?? "");
     const files = state.saved.map(({ run }) => `analogrig replay ${run}`);
     list($("notices"), [...notices, ...files.map((text) => `to play it again: ${text}`)]);
   }
 
   function pressed(id, on, text) {
     $(id).setAttribute("aria-pressed", String(on));
-    if ($(id).textContent !== text) $(id).textContent = text;
+    put($(id), text);
   }
 
   function list(parent, texts) {
@@ -473,7 +492,7 @@
     const place = last && (last.what ? `${last.what} changed: alarm ${last.latency_n} samples later` : "no change explains it");
     const bound = last && last.bound_n !== null ? `, bound ${last.bound_n}` : "";
     const text = last ? `alarm at sample ${last.sample}: ${place}${bound}` : "no alarm yet";
-    if ($("alarm").textContent !== text) $("alarm").textContent = text;
+    put($("alarm"), text);
     rows($("alarms"), alarms, (row, alarm) => {
       cell(row, alarm.take);
       cell(row, alarm.sample, "number");
@@ -493,18 +512,24 @@
       cell(row, error === null ? "–" : `${error.toFixed(2)} %`, "number");
     });
     const ceiling = bench.ceiling;
-    $("statistic").textContent = ceiling === null ? short(state.statistic) : `${short(state.statistic)} of ${short(ceiling)}`;
+    put($("statistic"), ceiling === null ? short(state.statistic) : `${short(state.statistic)} of ${short(ceiling)}`);
     const part = ceiling ? Math.min(1, Math.max(0, state.statistic / ceiling)) : 0;
     $("meter").style.width = `${100 * part}%`;
     $("meter").classList.toggle("high", part >= 1);
-    $("diagnosis").textContent = bench.diagnoses ? state.diagnosis || "none" : "not reported";
-    $("misfit").textContent = bench.misfits ? state.misfit || "none" : "not reported";
-    $("speed").textContent = short(state.speed, 5);
-    $("overruns").textContent = state.overruns;
-    $("missing").textContent = state.missing;
-    $("felt").textContent = state.felt_ms === null ? "–" : `${state.felt_ms} ms`;
-    const counters = Object.entries(state.counters).map(([name, count]) => `${count} ${name.replaceAll("_", " ")}`);
-    $("counters").textContent = counters.join(", ") || "–";
+    put($("diagnosis"), bench.diagnoses ? state.diagnosis || "none" : "not reported");
+    put($("misfit"), bench.misfits ? state.misfit || "none" : "not reported");
+    put($("speed"), short(state.rates.samples_hz, 5));
+    put($("frames"), state.rates.frames_hz ? short(state.rates.frames_hz) : "–");
+    put($("load"), state.rates.line_load ? `${(100 * state.rates.line_load).toFixed(1)} %` : "–");
+    put($("overruns"), state.overruns);
+    put($("missing"), state.missing);
+    put($("felt"), state.felt_ms === null ? "–" : `${state.felt_ms} ms`);
+    put($("link-counters"), counted(state.link_counters));
+    put($("counters"), counted(state.counters));
+  }
+
+  function counted(counters) {
+    return Object.entries(counters).map(([name, count]) => `${count} ${name.replaceAll("_", " ")}`).join(", ") || "none";
   }
 
   function rows(table, items, fill) {
@@ -547,19 +572,22 @@
       values[id] = new Float32Array(buffer, 4 + length + 4 * i * header.points, header.points);
     });
     frame = { ...header, values };
-    frames += 1;
+    measures = header.measures ?? measures;
     if ($("persist").checked) kept = [...kept.slice(1 - KEPT), frame];
-    requestAnimationFrame(redraw);
+    if (!isDue) requestAnimationFrame(redraw);
+    isDue = true;
   }
 
   function redraw() {
+    isDue = false;
     if (!frame || !frame.signals.every((id) => shown.includes(id))) return;
     for (const id of frame.signals) if (!scaleOf(id).per) fit(id);
     if (frame.kind === "xy") drawXy();
     else drawPlot();
-    showMeasures();
+    if (measures) showMeasures();
     if (!$("cursor-panel").hidden) showCursors();
-    $("triggered").textContent = frame.kind === "fft" ? "" : frame.trigger === null ? "no trigger" : "triggered";
+    put($("triggered"), frame.kind === "fft" ? "" : frame.trigger === null ? "no trigger" : "triggered");
+    frames += 1;
     document.documentElement.setAttribute("data-drawn", "");
     document.documentElement.dataset.frames = frames;
   }
@@ -578,12 +606,17 @@
 
   function times(of) {
     const [step, zero] = of.kind === "fft" ? [of.step, 0] : [1000 / of.rate, of.first - (of.trigger ?? of.first)];
-    return Array.from({ length: of.points }, (_, i) => (zero + i * of.per) * step);
+    const out = new Float64Array(of.points);
+    for (let i = 0; i < out.length; i++) out[i] = (zero + i * of.per) * step;
+    return out;
   }
 
   function heights(of, id) {
     const { per, middle } = of.kind === "fft" ? { per: 20, middle: -60 } : scaleOf(id);
-    return Array.from(of.values[id], (value) => (Number.isFinite(value) ? (value - middle) / per : null));
+    const values = of.values[id];
+    const out = new Array(values.length);
+    for (let i = 0; i < out.length; i++) out[i] = Number.isFinite(values[i]) ? (values[i] - middle) / per : null;
+    return out;
   }
 
   function drawPlot() {
@@ -606,7 +639,7 @@
         return short((at * per + middle) * (isSpectrum ? 1 : factorOf(current)), 3);
       });
     const vertical = Array.from({ length: 2 * DIVISIONS + 1 }, (_, i) => i - DIVISIONS);
-    const curves = frame.signals.map((id) => plotting.curve(id, ink(colourOf(id)), { unit: "", width: id === current ? 2 : 1.5 }));
+    const curves = frame.signals.map((id) => plotting.curve(id, ink(colourOf(id)), { unit: "", width: WIDTH }));
     plot = new uPlot(
       {
         width: box.clientWidth,
@@ -707,12 +740,13 @@
   function showMeasures() {
     for (const row of $("signals").tBodies[0].rows) {
       const id = row.dataset.signal;
-      const found = frame.measures?.[id];
+      const found = measures[id];
       if (!found) continue;
       const texts = ["min", "max", "mean", "rms"].map((key) => reading(id, found[key]));
       texts.push(withPrefix(found.frequency, "Hz"), found.overshoot === null ? "–" : `${(100 * found.overshoot).toFixed(1)} %`);
-      texts.forEach((text, i) => (row.cells[3 + i].textContent = text));
+      texts.forEach((text, i) => put(row.cells[3 + i], text));
     }
+    measures = null;
   }
 
   // ---- the hand
@@ -726,7 +760,9 @@
     $("record").onclick = () => send("record", { on: !state.recording });
     $("generator-on").onclick = () => send("generate", { on: !state.generator.on });
     $("clear-lamps").onclick = () => send("clear lamps");
-    for (const each of document.querySelectorAll("#generator [data-key]")) {
+    $("spoil").onclick = () => send("spoil", { kind: $("line-fault").value, direction: $("line-direction").value });
+    $("mend").onclick = () => send("mend");
+    for (const each of settings) {
       each.onchange = () => {
         const value = each.type === "number" ? Number(each.value) : each.value;
         each.blur();
