@@ -207,7 +207,9 @@ def _check_words(equations: Equations) -> None:
             raise ProgramError(f"parameters.{name}.alias: {row.alias} is a key of changes in scenarios; choose another")
         if row.diagnosis and row.diagnosis not in _DIAGNOSES:
             known = ", ".join(_DIAGNOSES)
-            raise ProgramError(f"parameters.{name}.diagnosis: no device names {row.diagnosis[:40]!r}; there are {known}")
+            raise ProgramError(
+                f"parameters.{name}.diagnosis: no device names {row.diagnosis[:40]!r}; there are {known}"
+            )
 
 
 def _check_channels(equations: Equations) -> None:
