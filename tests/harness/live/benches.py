@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import signal
+import subprocess
+import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from analogrig.cli.bench import NO_FAULTS, REPORT_INTERVAL_N
@@ -128,3 +134,18 @@ class LiveBench:
             finally:
                 session.close()
                 await playing
+
+
+@contextmanager
+def benched(*options: str, folder: Path) -> Iterator[Any]:
+    """Address and token of a running command; it is ended by SIGTERM."""
+    command = [sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--json", "--out", str(folder), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            address = json.loads(process.stdout.readline())["address"]
+            yield SimpleNamespace(address=address, token=address.rpartition("=")[2])
+        finally:
+            process.send_signal(signal.SIGTERM)
+            errors = process.communicate()[1]
+    assert (process.returncode, errors) == (130, "analogrig: interrupted\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
@@ -17,7 +18,8 @@ from analogrig.run import Run
 from analogrig.scenario import Scenario
 from tests import tools
 from tests.browser import Watched
-from tests.harness.live.benches import LiveBench, linked
+from tests.harness.live.benches import LiveBench, benched, linked
+from tests.served.serving import serving
 
 expect.set_options(timeout=600_000)
 
@@ -39,7 +41,8 @@ def opened(browser: Browser, bench: BenchServer) -> Iterator[Watched]:
     watched.page.close()
 
 
-def opened_at(browser: Browser, bench: BenchServer) -> Watched:
+def opened_at(browser: Browser, bench: Any) -> Watched:
+    """Page of anything with an address."""
     watched = Watched(browser, bench.address)
     watched.page.set_default_timeout(600_000)
     watched.page.wait_for_selector("html[data-connected][data-role]")
@@ -206,6 +209,20 @@ def test_page_connects_again_when_the_server_has_been_restarted(browser: Browser
         wait_for_frames(page, frames_of(page) + 3)
         expect(page.locator("#trouble")).to_be_hidden()
         page.close()
+
+
+def test_page_drives_a_served_instrument_in_another_process(browser: Browser, tmp_path: Path) -> None:
+    with serving() as served:
+        rig = f"{served.rigs_file(tmp_path)}:bench"
+        with benched("--rig", rig, "--allow", served.address, folder=tmp_path / "out") as bench:
+            watched = opened_at(browser, bench)
+            page = watched.page
+            page.get_by_role("button", name="Switch on").click()
+            wait_for_frames(page, 1)
+            page.locator(K).press("PageDown")
+            expect(page.locator("#alarms")).to_contain_text("K")
+            assert watched.complaints == []
+            page.close()
 
 
 def test_cut_line_is_reported_and_mended(browser: Browser, tmp_path: Path) -> None:
