@@ -556,7 +556,7 @@
       mode: $("mode").value,
       position: Number($("position").value),
     };
-    const columns = Math.min(4000, Math.max(200, Math.round(($("screen").clientWidth || 800) / 2))); // of two values
+    const columns = Math.min(4000, Math.max(200, Math.round($("screen").clientWidth || 800)));
     const kind = $("kind").value;
     kept = [];
     $("arm").hidden = $("mode").value !== "single";
