@@ -28,7 +28,9 @@ from setuptools.command.sdist import sdist
 CATALOGUE = Path("harness/analogrig/_catalogue.py")
 ENGINE = Path("emulator/analogrig_emulator/_engine.so")
 DEVICE = Path("harness/analogrig/_device.so")
+WIDE_DEVICE = Path("harness/analogrig/_device_wide.so")
 HOST = Path("harness/analogrig/bin/analogrig-device")
+WIDE_HOST = Path("harness/analogrig/bin/analogrig-device-wide")
 TETHER = Path("harness/analogrig/bin/analogrig-tether")
 LIBRARY_CHILD = Path("harness/analogrig/bin/analogrig-library")
 EXIT_GUARD = Path("harness/analogrig/_exit_guard.so")
@@ -37,7 +39,7 @@ UPLOT = {
     Path("harness/analogrig/reporting/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
     Path("harness/analogrig/reporting/uPlot.min.css"): "uplot/static/uPlot.min.css",
 }
-PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, LIBRARY_CHILD, EXIT_GUARD, *UPLOT)
+PRODUCTS = (CATALOGUE, ENGINE, DEVICE, WIDE_DEVICE, HOST, WIDE_HOST, TETHER, LIBRARY_CHILD, EXIT_GUARD, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c",)
@@ -65,6 +67,7 @@ OTHER_SOURCES = ("emulator/analogrig_emulator/engine/*.h", *SHIPPED)
 # Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
 # A computer has room for extended least squares as well.
 ROOM = ("-DEST_NC_MAX=2U",)
+WIDE_ROOM = (*ROOM, "-DEST_NA_MAX=7U", "-DEST_NB_MAX=8U", "-DEST_THETA_MAX=16U")  # for plants of up to order 7
 BIT_EXACT = ("-std=c99", "-ffp-contract=off", "-fno-fast-math")
 SHARED = ("-shared", "-fPIC")
 HOST_ROOM = ("-DDEVICE_LOOP_INPUT_SIZE=18360U",)  # 255 blocks, 0.18 s of real time: as long as the harness may be late
@@ -110,10 +113,11 @@ class BuildProducts(Command):
         generate_codecs(generated, placed(CATALOGUE))
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
         folders = (*(f"estimator_c/{part}" for part in ("core", "isolation", "fit", "device", "ports/loop")), generated)
-        include = (*ROOM, *(f"-I{path}" for path in folders))
+        include = tuple(f"-I{path}" for path in folders)
         compile_c(placed(ENGINE), sources(ENGINE_SOURCES), SHARED)
-        compile_c(placed(DEVICE), (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
-        compile_c(placed(HOST), (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *include))
+        for library, host, room in ((DEVICE, HOST, ROOM), (WIDE_DEVICE, WIDE_HOST, WIDE_ROOM)):
+            compile_c(placed(library), (*sources(LIBRARY_SOURCES), *device), (*SHARED, *room, *include))
+            compile_c(placed(host), (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *room, *include))
         compile_c(placed(TETHER), sources(TETHER_SOURCES), POSIX)
         compile_c(placed(LIBRARY_CHILD), sources(LIBRARY_CHILD_SOURCES), LIBRARY_CHILD_FLAGS, ("-ldl", "-lm"))
         compile_c(placed(EXIT_GUARD), sources(EXIT_GUARD_SOURCES), (*SHARED, *POSIX))

@@ -77,7 +77,7 @@ def copy(folder: Path) -> Path:
             os.utime(path, (0, 0))
     os.utime(checkout / "Makefile", (0, 0))
     (checkout / ".venv").symlink_to(sys.prefix, target_is_directory=True)
-    for made in ("build/generated", "build/strict", ".mypy_cache"):
+    for made in ("build/firmware", "build/generated", "build/strict", ".mypy_cache"):
         if (CHECKOUT / made).is_dir():
             shutil.copytree(CHECKOUT / made, checkout / made)
     return checkout

@@ -52,6 +52,7 @@ from analogrig_emulator.errors import (
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
 from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
+from analogrig_emulator.machine.modes import LinearMode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
 from analogrig_emulator.machine.program import (
     CHANNELS,
@@ -113,6 +114,7 @@ __all__ = [
     "ForceLaw",
     "Function",
     "Grade",
+    "LinearMode",
     "Mass",
     "Mode",
     "ModeError",

@@ -636,6 +636,20 @@ EST_INLINE float weight_of(const est_t* const self) {
 
 #if EST_WITH_ROBUSTNESS
 
+/// Let the next innovation raise an alarm if the blocks of late were high.
+static void find_hidden_change(est_t* const self) {
+    est_scale_t* const scale = &self->scale;
+    est_scale_count_high(scale, self->noise_variance);
+    if ((self->trigger.quiet_n > 0U) || (self->config->trigger.kind != EST_TRIGGER_CUSUM) || (scale->share <= 0.0F)) {
+        scale->high_n = 0U;
+    } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
+        scale->high_n           = 0U;
+        self->trigger.statistic = 2.0F * self->config->trigger.ceiling;
+    } else {
+        // nothing is hidden, or a doubt comes first
+    }
+}
+
 /// Update the scale after a block. A block that ends with a large statistic may contain a change and is discarded.
 /// Two steps, so that none is long.
 static void renew_scale(est_t* const self) {
@@ -649,6 +663,7 @@ static void renew_scale(est_t* const self) {
         }
         scale->followed = true;
     } else {
+        find_hidden_change(self);
         est_scale_relax(scale);
         est_scale_restart(scale, self->noise_variance);
     }

@@ -404,6 +404,7 @@ typedef struct {
     uint8_t left_n;    ///< equations left in this block; 0: it is complete, or an alarm is on trial
     bool    followed;  ///< the noise variance contains this block
     uint8_t trial_n;   ///< equations since the alarm on trial; 0: none is
+    uint8_t high_n;    ///< steps of high blocks
     float   weight;    ///< of a squared innovation in the cumulative sum
     float   sum;    ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
     float   share;  ///< share of this block in the noise variance

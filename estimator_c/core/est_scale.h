@@ -18,6 +18,13 @@
 #define EST_SHARE_MIN 0.032F
 #define EST_SHARE_WARM 0.25F
 
+/// A block is high if its mean square reaches this many noise variances that contain it. A high block counts a step,
+/// each other block takes one off; at the limit an alarm is due. It finds a change that an inflated scale hides: the
+/// residual of a misfit has peaks, a change lasts.
+#define EST_HIGH 5.0F
+#define EST_HIGH_STEP 2U
+#define EST_HIGH_LIMIT 6U
+
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
 #define EST_MARGIN 2.0F
 
@@ -96,6 +103,18 @@ est_scale_follow(est_scale_t* const self, const float noise_variance, const floa
     const float noise   = noise_variance + (self->share * (limited - noise_variance));
     self->share         = est_max(self->share / (1.0F + self->share), share_least);
     return est_max(noise, least);
+}
+
+/// Count a complete block if it is high.
+static inline void est_scale_count_high(est_scale_t* const self, const float noise_variance) {
+    const bool high = (self->sum * EST_MEAN_SQUARE) >= (EST_HIGH * noise_variance * self->weight);
+    if (high && (self->high_n < EST_HIGH_LIMIT)) {
+        self->high_n = (uint8_t)(self->high_n + EST_HIGH_STEP);
+    } else if (!high && (self->high_n > 0U)) {
+        self->high_n--;
+    } else {
+        // at a bound
+    }
 }
 
 /// Let the inflation decrease, and the number of alarms that may be justified increase, by one block.

@@ -195,6 +195,7 @@ class Bench:
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._pace_blocks(performance)
+        self.dut.suit(scenario.program.order)
         self.dut.prepare(performance.of_device, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)

@@ -17,6 +17,7 @@ from analogrig.errors import ConfigurationError
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
 ResetName = Literal["covariance", "all"]
 EdgeInstants = Literal["locked", "may-slip", "anywhere"]
+Orders = Literal["given", "program"]
 
 _MODEL_SETTINGS = (
     *("na", "nb", "nk", "nc", "offset", "noise_estimated", "refresh_n", "stuck_n", "idle_n"),
@@ -25,6 +26,12 @@ _MODEL_SETTINGS = (
 )
 _TRIGGER_SETTINGS = ("trigger", "ceiling", "hold_off_n", "warm_up_n", "absolute", "edge_instants", "reset")
 """Fields with the same name in the device. The coefficients of C come between the two groups."""
+
+_BY_ORDER = ("na", "nb", "c", "refresh_n", "forgetting", "isolation", "misfit")
+"""Fields that ``of_order`` chooses."""
+
+_USUAL_NA, _USUAL_NB, _USUAL_PARAMETERS = 2, 3, 6
+"""EST_NA_MAX, EST_NB_MAX and EST_THETA_MAX of est.h: room of the usual build."""
 
 _WORDS: Mapping[str, Sequence[str]] = {
     "trigger": [trigger.name.lower().replace("_", "-") for trigger in Trigger],
@@ -130,6 +137,9 @@ class EstimatorConfig:
     warm_up_n: int = 550
     absolute: bool = False
     reset: ResetName = "covariance"
+    orders: Orders = "given"
+    """Origin of na, nb, c, refresh_n, forgetting, isolation and misfit: ``given`` here, or chosen by the order of the
+    scenario's ``program``. A device without settings of its own has the latter."""
 
     def __post_init__(self) -> None:
         self._check_prefilter()
@@ -177,10 +187,30 @@ class EstimatorConfig:
             misfit=False,
         )
 
+    def suited(self, order: int) -> Self:
+        """Configuration for a plant of this order, if ``orders`` leaves the choice to the program.
+
+        :raises ValueError: the catalogue has no such order.
+        """
+        if self.orders == "given":
+            return self
+        chosen = self.of_order(order)
+        return dataclasses.replace(self, **{name: getattr(chosen, name) for name in _BY_ORDER})
+
     @property
     def parameters(self) -> int:
         """Number of elements of theta."""
         return self.na + self.nb + self.nc + self.offset
+
+    @property
+    def is_wide(self) -> bool:
+        """True if the usual build of the device has no room for these orders."""
+        return self.na > _USUAL_NA or self.nb > _USUAL_NB or self.parameters > _USUAL_PARAMETERS
+
+    @property
+    def room(self) -> str:
+        """Compiler options of a build with room for these orders."""
+        return f"-DEST_NA_MAX={self.na}U -DEST_NB_MAX={self.nb}U -DEST_THETA_MAX={self.parameters}U"
 
     @property
     def statistic_ceiling(self) -> float | None:
@@ -203,10 +233,13 @@ class EstimatorConfig:
     def changed(self, where: str, settings: Mapping[str, Any]) -> Self:
         """The configuration with other values of some fields; ``where`` begins every error message.
 
+        Orders that depend on the program become given ones if ``settings`` name any of them.
+
         :raises ConfigurationError: there is no such field, or the values are no valid configuration.
         """
+        origin: dict[str, Any] = {} if settings.keys().isdisjoint(_BY_ORDER) else {"orders": "given"}
         try:
-            return dataclasses.replace(self, **settings)
+            return dataclasses.replace(self, **origin | dict(settings))
         except (TypeError, ValueError) as error:
             raise ConfigurationError(f"{where}: {error}") from error
 

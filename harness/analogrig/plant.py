@@ -236,10 +236,10 @@ def discretise(program: Program, parameters: NDArray[np.float64], period_s: floa
     """Discretise plants of a linear program, (p, m) parameters: (p, n, n + 1), the states from states and input."""
     generators = program.generators(parameters)
     generators[:, -1] = 0.0
-    return _exponentials(generators * period_s)[:, :-1]
+    return exponentials(generators * period_s)[:, :-1]
 
 
-def _exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+def exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """Matrix exponentials of (k, n, n), of the same shape. Importing scipy.linalg would take longer than numpy."""
     norms = np.abs(matrices).sum(axis=2).max(axis=1)
     squarings = np.maximum(0, np.frexp(norms)[1] + 4)
@@ -262,6 +262,28 @@ def _exponential(matrices: NDArray[np.float64], squarings: int) -> NDArray[np.fl
     return np.asarray(result)
 
 
+def estimated_response(
+    theta: NDArray[np.floating], model: ModelOrders, input_per_code: float, output_per_code: float, period_s: float
+) -> dict[str, NDArray[np.float64]]:
+    """Response gain s0 / (s^n + ... + s1 s + s0) of estimates theta (k, p) in codes, n = ``model.na``: (k,) by name.
+
+    The poles of A give the denominator, the static gain the gain. Neither depends on the instant of an edge within a
+    sample.
+
+    :param input_per_code: units of the input per code; likewise for the output.
+    :param period_s: time between samples.
+    """
+    order = model.na
+    a = theta[:, :order].astype(np.float64)
+    with np.errstate(all="ignore"):
+        static = theta[:, order : order + model.nb].sum(axis=1, dtype=np.float64) / (1.0 + a.sum(axis=1))
+        denominator = np.ones((len(theta), 1), np.complex128)
+        for root in (np.log(_poles(a)) / period_s).T:
+            denominator = np.pad(denominator, ((0, 0), (0, 1))) - np.pad(denominator, ((0, 0), (1, 0))) * root[:, None]
+        gain = static * output_per_code / input_per_code
+    return {"gain": gain} | {f"s{i}": denominator[:, order - i].real for i in range(order)}
+
+
 def estimated_parameters(
     program: Program,
     theta: NDArray[np.floating],
@@ -272,24 +294,16 @@ def estimated_parameters(
 ) -> NDArray[np.float64]:
     """Parameters ``program.estimates`` (n, m) of estimates theta (n, p) in codes; NaN if a row describes no such plant.
 
-    The poles of A give the denominator of the response, the static gain its gain. Neither depends on the instant of an
-    edge within a sample. The program states which parameters follow from them.
+    The program states which parameters follow from the ``estimated_response``.
 
     :param model: meaning of theta; all NaN unless its ``na`` is the number of the program's states.
-    :param input_per_code: units of the input per code; likewise for the output.
-    :param period_s: problem time between samples.
+    :param period_s: problem time between samples; others as of ``estimated_response``.
     """
-    order, names = len(program.equations.states), program.estimates
-    if model.na != order or not names:
+    names = program.estimates
+    if model.na != len(program.equations.states) or not names:
         return np.full((len(theta), len(names)), np.nan)
-    a = theta[:, :order].astype(np.float64)
+    values = estimated_response(theta, model, input_per_code, output_per_code, period_s)
     with np.errstate(all="ignore"):
-        static = theta[:, order : order + model.nb].sum(axis=1, dtype=np.float64) / (1.0 + a.sum(axis=1))
-        values = {"gain": static * output_per_code / input_per_code}
-        denominator = np.ones((len(theta), 1), np.complex128)
-        for root in (np.log(_poles(a)) / period_s).T:
-            denominator = np.pad(denominator, ((0, 0), (0, 1))) - np.pad(denominator, ((0, 0), (1, 0))) * root[:, None]
-        values |= {f"s{i}": denominator[:, order - i].real for i in range(order)}
         for name, formula in program.equations.estimates.items():
             values[name] = formula.law({})(values)
         out = np.stack([values[name] for name in names], axis=1)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analogrig import config
+from analogrig.catalogue import Change
 from analogrig.errors import ConfigurationError
 from analogrig_emulator import EmulatorError, Equations, ProgramError, ProgramParameter, equations_of, wired
 
@@ -23,6 +24,11 @@ if TYPE_CHECKING:
 MAX_CHARACTERS = 65_536
 MOST_CHANNELS = 4
 """Inputs of the card."""
+
+_KEYS_OF_CHANGES = ("sample", "set", "ramp_n")
+
+_DIAGNOSES = tuple(change.name.lower() for change in (Change.MASS, Change.DAMPING, Change.STIFFNESS))
+"""Parameters in the diagnoses of a device."""
 
 _LINEAR_TO = 1e-9
 """Largest relative deviation from superposition of equations that count as linear."""
@@ -62,6 +68,7 @@ class Program:
             if len(source) > MAX_CHARACTERS:
                 raise ProgramError(f"larger than {MAX_CHARACTERS} characters")
             _check_channels(equations)
+            _check_words(equations)
         except (EmulatorError, RecursionError) as error:
             raise ConfigurationError(f"{where}: {error}") from error
         return cls(source)
@@ -148,6 +155,12 @@ class Program:
         return frozenset(name for line in lines for name in line.formula.divisors())
 
     @functools.cached_property
+    def order(self) -> int:
+        """Order of the plant for a linear model: its number of states if it is linear, otherwise at most 2."""
+        states = len(self.equations.states)
+        return states if self.is_linear else min(states, 2)
+
+    @functools.cached_property
     def is_linear(self) -> bool:
         """True if the plant is linear, starts from equilibrium, and its input does not reach its output at once."""
         n = len(self.equations.states)
@@ -186,6 +199,15 @@ class Program:
 @functools.lru_cache(maxsize=64)
 def _equations(source: str) -> Equations:
     return equations_of(json.loads(source))
+
+
+def _check_words(equations: Equations) -> None:
+    for name, row in equations.parameters.items():
+        if row.alias in _KEYS_OF_CHANGES:
+            raise ProgramError(f"parameters.{name}.alias: {row.alias} is a key of changes in scenarios; choose another")
+        if row.diagnosis and row.diagnosis not in _DIAGNOSES:
+            known = ", ".join(_DIAGNOSES)
+            raise ProgramError(f"parameters.{name}.diagnosis: no device names {row.diagnosis[:40]!r}; there are {known}")
 
 
 def _check_channels(equations: Equations) -> None:

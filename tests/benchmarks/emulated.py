@@ -17,6 +17,7 @@ from analogrig_emulator import (
     Components,
     Excitation,
     PotTurn,
+    ProgramCircuit,
     Sampler,
     SuspensionComputer,
     acquired,
@@ -58,7 +59,7 @@ class Emulated:
 
     draw: Draw
     card: Card = CARD
-    program: str = "front"
+    program: ProgramCircuit | str = "front"
     components: Callable[[int], Components] = lambda seed: NOMINAL  # noqa: ARG005
     """Components of the machine of a seed."""
     disturb: Disturbance | None = None

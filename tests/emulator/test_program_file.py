@@ -77,6 +77,26 @@ def test_motor_is_read() -> None:
 
 
 BAD: dict[str, tuple[Change, str]] = {
+    "alias of two": (
+        lambda text: swapped('"ohm"', '"ohm", alias = "it"')(swapped('"H"', '"H", alias = "it"')(text)),
+        "parameters.L.alias: it is the alias of R already",
+    ),
+    "alias that is a state": (
+        swapped('unit = "H"', 'unit = "H", alias = "i"'),
+        "parameters.L.alias: i is one of states already; choose another",
+    ),
+    "alias of two words": (
+        swapped('unit = "H"', 'unit = "H", alias = "of coil"'),
+        "parameters.L.alias: 'of coil': write a letter",
+    ),
+    "diagnosis of two": (
+        lambda text: swapped('"ohm"', '"ohm", diagnosis = "mass"')(swapped('"H"', '"H", diagnosis = "mass"')(text)),
+        "parameters.L.diagnosis: mass is the diagnosis of R already",
+    ),
+    "estimate of a fixed parameter": (
+        lambda text: text + "[estimates]\nd = '1 / gain'\n",
+        r"estimates.d: no pot shows a parameter 'd'; there are R, L, k, J",
+    ),
     "trailing junk": (lambda text: text + "\n}} end", "is no TOML: .*line"),
     "no text": (lambda text: text.replace("motor", "m\udce9tor"), "is no UTF-8 text: byte"),
     "huge": (lambda text: text + "#" * 70_000, "larger than 65536 bytes"),

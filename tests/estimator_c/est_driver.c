@@ -167,6 +167,9 @@ void driver_age_counters(void) {
                           UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U };
 }
 
+/* Sets the inflation of the scale, as after alarms that were not justified. The weight follows with the next block. */
+void driver_inflate(double inflation) { self.scale.inflation = (float)inflation; }
+
 /* Damages the state in one way, asks for the invariants, and mends it. */
 int driver_invariants_hold_if_damaged(int way) {
     const est_t  kept    = self;

@@ -189,6 +189,10 @@ class Estimator:
         """Sets all counters to one below their limits."""
         self._c.driver_age_counters()
 
+    def inflate(self, inflation: float) -> None:
+        """Sets the inflation of the scale, as after alarms that were not justified."""
+        self._c.driver_inflate(ctypes.c_double(inflation))
+
     def invariants_hold_if_damaged(self, way: int) -> bool:
         """Result of est_invariants_hold() for a state damaged in one of the ways 0 .. 9; 10: not at all."""
         return bool(self._c.driver_invariants_hold_if_damaged(way))

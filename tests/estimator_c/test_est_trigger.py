@@ -20,7 +20,9 @@ from tests.estimator_c.est_driver import (
     CUSUM,
     GATHERING,
     LOCKED,
+    MAY_SLIP,
     MEAN_BETWEEN_FAULTS,
+    NONE,
     PREDICTION_ERROR,
     Estimator,
 )
@@ -181,6 +183,45 @@ def test_only_changes_close_to_the_noise_inflate_the_scale(
         u, y = suspension([(0, FRONT), *changes], np.arange(10.0, 6000.0, 50.0), 6000, 1.0, seed)
         assert estimator.init()
         assert found[0] <= len(estimator.run(u, y).alarms) <= found[1]
+
+
+INFLATION = 1e5
+"""Of the scale; the cumulative sum then stands still whatever the plant does."""
+
+
+def alarms_behind_an_inflated_scale(
+    estimator: Estimator, onset: int, seed: int, **settings: float | tuple[float, float]
+) -> list[int]:
+    """Alarms after the scale was inflated at sample 900 of 2,500, of a front suspension stiffer from the onset on."""
+    u, y = suspension([(0, FRONT), (onset, (115.0, 3021.0, 29400.0))], np.arange(10.0, 2500.0, 50.0), 2500, 1.0, seed)
+    assert estimator.init(**settings)
+    assert not len(estimator.run(u[:900], y[:900]).alarms)
+    estimator.inflate(INFLATION)
+    return (estimator.run(u[900:], y[900:]).alarms + 900).tolist()
+
+
+@pytest.mark.parametrize("edge_instants", [LOCKED, MAY_SLIP])
+@pytest.mark.parametrize("seed", range(10))
+def test_change_behind_an_inflated_scale_is_found_by_its_blocks(
+    estimator: Estimator, edge_instants: int, seed: int
+) -> None:
+    onset = 1200 + 7 * seed
+    first, *_ = alarms_behind_an_inflated_scale(estimator, onset, seed, edge_instants=edge_instants)
+    assert onset < first <= onset + 200
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"noise_estimated": 0}, {"kind": NONE}, {"kind": PREDICTION_ERROR, "ceiling": 1e6}, {"warm_up_n": 2500}],
+    ids=["noise as declared", "no trigger", "trigger without a scale", "not armed"],
+)
+def test_blocks_raise_no_alarm_where_nothing_can_be_hidden(estimator: Estimator, settings: dict[str, float]) -> None:
+    assert alarms_behind_an_inflated_scale(estimator, 1200, 0, **settings) == []
+
+
+def test_noise_behind_an_inflated_scale_raises_no_alarm(estimator: Estimator) -> None:
+    for seed in range(10):
+        assert alarms_behind_an_inflated_scale(estimator, 2500, seed) == []
 
 
 @pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])

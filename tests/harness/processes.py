@@ -36,6 +36,23 @@ def ends(pid: int, within_s: float = LONG_S) -> bool:
         os.close(fd)
 
 
+def is_idle(pid: int) -> bool:
+    """True if all threads of the process slept at one moment: only an event from outside can wake it.
+
+    Two equal looks show that no thread has run between them.
+    """
+    states = _states(pid)
+    return all("\nState:\tS" in state for state in states) and _states(pid) == states
+
+
+def _states(pid: int) -> list[str]:
+    """Status of each thread, with the number of times it was put to sleep; empty if the process has ended."""
+    try:
+        return [(thread / "status").read_text() for thread in sorted(Path(f"/proc/{pid}/task").iterdir())]
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
 def marked(mark: str) -> list[int]:
     """The processes that have it in their environment, as what they start has too."""
     found = []

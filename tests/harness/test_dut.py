@@ -67,7 +67,7 @@ from analogrig.links.link import CanListener, FramedLink, Link
 from analogrig.links.wire import VirtualClock
 from analogrig.run import LOST
 from tests.harness.fed import Fed, fed
-from tests.harness.processes import children
+from tests.harness.processes import LONG_S, children
 
 N = 912
 CHANGE_AT = 700
@@ -296,8 +296,8 @@ def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Fed) -> None:
 def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
     dut = CatalogueDevice(FramedLink(MemoryWire(1)), InprocDevice(name="bob"))
     dut.recover()
-    with pytest.raises(DeviceRefused, match=r"^device bob: nb = 7 was not applied: OUT_OF_RANGE, it has 3$"):
-        dut.configure(nb=7)
+    with pytest.raises(DeviceRefused, match=r"^device bob: nk = 7 was not applied: OUT_OF_RANGE, it has 0$"):
+        dut.configure(nk=7)
 
 
 def test_running_device_cannot_be_configured_or_started() -> None:
@@ -735,7 +735,7 @@ def test_result_without_a_name_is_told_by_its_number(line: FaultyLink) -> None:
 def host() -> Iterator[tuple[CatalogueDevice, int]]:
     """A device that is a process, and its number."""
     wire = host_wire()
-    dut = CatalogueDevice(FramedLink(wire), HostDevice(name="host", timeout_s=2.0))
+    dut = CatalogueDevice(FramedLink(wire), HostDevice(name="host", timeout_s=LONG_S))
     dut.recover()
     dut.configure()
     dut.start()
@@ -757,7 +757,8 @@ def test_process_that_hangs_in_the_run_is_told(host: tuple[CatalogueDevice, int]
     dut, pid = host
     feed(dut, 0, 82)
     os.kill(pid, signal.SIGSTOP)
-    with pytest.raises(LinkTimeout, match=r"no estimate for sample 82 within 2 s \(last message: Stepped 81\)"):
+    dut._talk.timeout_s = 0.1
+    with pytest.raises(LinkTimeout, match=r"no estimate for sample 82 within 0\.1 s \(last message: Stepped 81\)"):
         feed(dut, 82, N)
 
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.recordings import column_reader, columns, imported
+from analogrig.recordings import column_reader, columns
 from analogrig.recordings.columns import read_columns
 from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
+from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
@@ -442,8 +443,19 @@ def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.usefixtures("in_this_process")
 def test_codes_that_the_rig_lacks_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names = ",".join(imported._SIGNALS)
+    names = ",".join(f"{name}_{kind}" for kind in ("code", "clipped") for name in CHANNELS)
     for code, complaint in ((9000, "codes that rig emulator does not have"), (1.5, "no whole numbers")):
         (tmp_path / "a.csv").write_text(f"sample,{names}\n0,{code},1,1,1,0,0,0,0\n")
         assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
         assert complaint in capsys.readouterr().err
+
+
+def test_signals_of_another_program_need_its_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    signals, recording = str(tmp_path / "motor.csv"), str(tmp_path / "motor.npz")
+    assert main(["emulate", "--scenario", "dc-motor", "--seed", "5", "--out", signals]) == 0
+    assert main(["import", signals, "--out", recording]) == 2
+    assert "motor.csv: lacks channels of program front, force, displacement" in capsys.readouterr().err
+    assert main(["import", signals, "--scenario", "dc-motor", "--out", recording]) == 0
+    with open_rig("emulator") as rig:
+        played = np.concatenate([block.codes for block in rig.perform(Scenario.load("dc-motor"), 5).blocks])
+    assert np.array_equal(Run.load(Path(recording)).codes, played)

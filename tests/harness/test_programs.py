@@ -117,11 +117,16 @@ def test_scenario_names_a_program_beside_it_and_its_run_holds_it(tmp_path: Path)
         ("[[tweaks]]\nsample = 5\nset = { stifness = 1.0 }", "tweaks[0]: program front: unknown parameter 'stifness'"),
         ("[[tweaks]]\nsample = 5\nstifness_n_per_m = 1.0", "tweaks[0]: unknown key 'stifness_n_per_m'"),
         ('program = "front"\n[plant]\nset = "front"', "plant: write program = ... and set = { ... } instead"),
+        ('program = "friction.toml"', "M.diagnosis: no device names 'friction'; there are mass, damping, stiffness"),
+        ('program = "sample.toml"', "parameters.M.alias: sample is a key of changes in scenarios; choose another"),
         ('[plant]\nset = "rear"', "no program is called 'rear'"),
     ],
 )
 def test_wrong_program_or_parameter_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "mine.toml"
+    front = config.locate("programs", "front").read_text()
+    (tmp_path / "friction.toml").write_text(front.replace('diagnosis = "mass"', 'diagnosis = "friction"'))
+    (tmp_path / "sample.toml").write_text(front.replace('alias = "mass_kg"', 'alias = "sample"'))
     path.write_text(f"samples = 100\n{text}\n[excitation]\n")
     with pytest.raises(ConfigurationError) as caught:
         Scenario.load(str(path))

@@ -35,8 +35,8 @@ pytestmark = needs_firmware
 
 GCC = "arm-none-eabi-gcc"
 
-TIMEOUT_S = 2.0
-"""Time-out of an answer: longer than a busy machine lets QEMU wait, and as short as a test can bear."""
+TIMEOUT_S = 0.1
+"""Time-out of an answer of a QEMU that is stopped. Any other has LONG_S: on a busy machine it may wait for seconds."""
 LONGEST = 750
 """Samples of a scenario that a test plays under QEMU, at a thousand a second: more than the trigger's warm-up."""
 CHANGE_AT = 600
@@ -80,7 +80,7 @@ def test_every_scenario_gives_the_same_bits_on_every_device(
 ) -> None:
     """The M0 image runs on an M3, since QEMU has no M0 board."""
     scenario, expected = reference
-    run = play(from_table({"name": "bob", "exchange": exchange, **device}, "bob"), scenario)
+    run = play(from_table({"name": "bob", "exchange": exchange, "timeout_s": LONG_S, **device}, "bob"), scenario)
     assert run.conditions.faults == ()
     assert run.theta_hash() == expected.theta_hash()
     assert (run.statistic == expected.statistic).all()
@@ -92,7 +92,7 @@ def test_every_scenario_gives_the_same_bits_on_every_device(
 def test_stm32_gives_the_same_bits(options: str) -> None:
     """The port is the same as that of the other boards, but for the registers of its UARTs."""
     scenario = shortened("thesis")
-    played = play(describe(f"qemu-f405?{options}"), scenario)
+    played = play(describe(f"qemu-f405?{options}&timeout_s={LONG_S}"), scenario)
     assert played.conditions.faults == ()
     assert played.theta_hash() == play(InprocDevice(name="bob"), scenario).theta_hash()
 
@@ -105,7 +105,7 @@ def test_shortened_scenarios_still_have_alarms() -> None:
 def test_firmware_says_which_it_is_and_every_boot_has_its_number(core: str) -> None:
     nonces = set()
     for _ in range(2):
-        with describe(f"qemu-{core}").connect() as dut:
+        with describe(f"qemu-{core}?timeout_s={LONG_S}").connect() as dut:
             identity = dut.description()["identity"]
             assert identity["firmware"] == FIRMWARE_IDS[core]
             nonces.add(identity["boot_nonce"])
@@ -129,7 +129,7 @@ def new_qemu(before: set[int]) -> int:
 def started() -> Iterator[tuple[Device, int]]:
     """A device that is about to run, and the number of the QEMU that it runs in."""
     before = set(descendants(os.getpid()))
-    with QemuM4(name="bob", timeout_s=TIMEOUT_S).connect() as dut:
+    with QemuM4(name="bob", timeout_s=LONG_S).connect() as dut:
         pid = new_qemu(before)
         dut.start()
         yield dut, pid
@@ -149,16 +149,21 @@ def test_qemu_that_is_killed_is_told_with_its_status(started: tuple[Device, int]
         catalogue(dut).status()
 
 
-def test_qemu_that_takes_its_time_to_start_is_waited_for() -> None:
+def test_qemu_that_takes_its_time_to_start_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine; here it is stopped for longer than the time-out of any answer."""
+    monkeypatch.setattr(QemuM4, "starting_s", LONG_S)
     before = set(descendants(os.getpid()))
-    description = QemuM4(name="bob", timeout_s=TIMEOUT_S)
-    opened = description.open()
+    dut = catalogue(QemuM4(name="bob", timeout_s=TIMEOUT_S).open())
     pid = new_qemu(before)
     os.kill(pid, signal.SIGSTOP)
-    timer = threading.Timer(2.0 * TIMEOUT_S, os.kill, (pid, signal.SIGCONT))
+
+    def go_on() -> None:
+        dut._talk.timeout_s = LONG_S
+        os.kill(pid, signal.SIGCONT)
+
+    timer = threading.Timer(5.0 * TIMEOUT_S, go_on)
     timer.start()
-    with catalogue(opened) as dut:
+    with dut:
         assert dut.recover().firmware == "QEMU_M4"
     timer.join()
 
@@ -166,7 +171,8 @@ def test_qemu_that_takes_its_time_to_start_is_waited_for() -> None:
 def test_qemu_that_hangs_is_told_and_ended(started: tuple[Device, int]) -> None:
     dut, pid = started
     os.kill(pid, signal.SIGSTOP)
-    with pytest.raises(LinkTimeout, match="^device bob: no .* within 2 s"):
+    catalogue(dut)._talk.timeout_s = TIMEOUT_S
+    with pytest.raises(LinkTimeout, match=r"^device bob: no .* within 0\.1 s"):
         catalogue(dut).status()
 
 

@@ -5,8 +5,11 @@ Without the record the module is skipped; in CI it is then not collected (tests/
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from analogrig.cli import main
 from analogrig.config import fixtures
 from analogrig.hardware.calibration.recorded import RecordedPlant, fit_program
 from analogrig.judging.verdict import judge
@@ -14,6 +17,8 @@ from analogrig.reporting.measured import mode_of
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig_emulator import load_program
 from tests.benchmarks import bench_silverbox, silverbox
+
+EXAMPLES = Path(__file__).parents[2] / "harness" / "examples"
 
 try:
     silverbox.find_file()
@@ -31,6 +36,16 @@ def test_the_estimate_is_that_of_batch_least_squares() -> None:
     assert expected.resonance_hz == pytest.approx(68.63, abs=0.01)
     assert expected.damping == pytest.approx(0.0478, abs=1e-4)
     assert judge(played).outcome == "unjudged"
+
+
+def test_the_example_is_judged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    example, recording = EXAMPLES / "silverbox", str(tmp_path / "silverbox.npz")
+    settings = ["--map", str(example / "import.toml"), "--scenario", str(example / "silverbox.toml")]
+    assert main(["import", str(silverbox.find_file()), *settings, "--out", recording]) == 0
+    assert main(["replay", recording, "--dut", "inproc", "--out", str(tmp_path / "run")]) == 0
+    told = capsys.readouterr().out
+    assert "truth: that of scenario silverbox" in told
+    assert "false alarms: 1 (at 1147) in 8000 samples" in told
 
 
 def test_the_twin_fitted_to_the_multisines_simulates_the_arrow_head() -> None:

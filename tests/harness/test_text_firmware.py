@@ -113,7 +113,7 @@ def terminal() -> Iterator[str]:
 
 @needs_firmware
 def test_board_is_played_by_the_device_file_of_the_example(terminal: str, played: Run) -> None:
-    table = read_toml(EXAMPLE / "text_firmware.toml") | {"name": "bob", "url": terminal}
+    table = read_toml(EXAMPLE / "text_firmware.toml") | {"name": "bob", "url": terminal, "timeout_s": LONG_S}
     with open_rig("emulator") as rig, from_table(table, "bob").connect() as dut:
         run = Bench(rig, dut).play(Scenario.load("thesis"), seed=7)
     assert run.conditions.faults == ()

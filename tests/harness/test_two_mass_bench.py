@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,9 +9,9 @@ from analogrig.estimator_config import EstimatorConfig
 from tests.benchmarks.bench_two_mass import delays, device, false_alarms
 
 
-def test_changes_of_the_suspension_are_detected_within_the_bound_of_the_benchmark(tmp_path: Path) -> None:
+def test_changes_of_the_suspension_are_detected_within_the_bound_of_the_benchmark() -> None:
     """Of the page's 400 changes none is missed; the mean ratio of eight changes is below 1.6 with certainty."""
-    made = device(tmp_path)
+    made = device()
     for parameter in ("M2", "B2", "K2", "K1"):
         found = delays(made, parameter, 8)
         assert found.missed == 0

@@ -22,6 +22,7 @@ from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
 from analogrig_emulator.errors import PotError
+from analogrig_emulator.machine.modes import LinearMode, linear_mode
 from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scales
 from analogrig_emulator.machine.suspension import SuspensionComputer
 
@@ -111,6 +112,14 @@ class Courses:
         """Moment of sample 0, after a start from rest."""
         ((_, circuit),) = self._turns(values, values, 0)
         return Moment(0, np.zeros(len(circuit.states)))
+
+    def linear_mode(self, values: Mapping[str, float]) -> LinearMode:
+        """State space from the source to the channel, with these values.
+
+        Raises CircuitError for a circuit with multipliers.
+        """
+        ((_, circuit),) = self._turns(values, values, 0)
+        return linear_mode(circuit, SOURCE, self._nodes[0], self.sign)
 
     def course(self, start: Moment, before: Mapping[str, float], after: Mapping[str, float], ramp_n: int = 0) -> Course:
         """Course from a moment on, with pots that turn there from one set of values to another.

@@ -328,6 +328,8 @@ class _Reader:
         if not isinstance(pot, bool):
             raise ProgramError(f"{place}.pot: {pot!r} is neither true nor false")
         alias, diagnosis = (_text(f"{place}.{key}", row.get(key, "")) for key in ("alias", "diagnosis"))
+        if alias and not _NAME.fullmatch(alias):
+            raise ProgramError(f"{place}.alias: {alias[:40]!r}: write a letter, then letters, digits or _, at most 32")
         return ProgramParameter(value, low, high, _unit(place, row), pot, alias, diagnosis)
 
     def _points(self, name: str, row: Mapping[str, Any]) -> Points:
@@ -430,8 +432,9 @@ class _Reader:
         found: dict[str, Formula] = {}
         for name, text in rows.items():
             with _at(f"estimates.{name[:40]}"):
-                if name not in self.parameters or not self.parameters[name].pot:
-                    raise ProgramError(f"no pot shows a parameter {name[:40]!r}{suggestion(name, self.parameters)}")
+                shown = [each for each, row in self.parameters.items() if row.pot]
+                if name not in shown:
+                    raise ProgramError(f"no pot shows a parameter {name[:40]!r}{suggestion(name, shown)}")
                 formula = parse_formula(_text("formula", text))
                 for used in formula.names():
                     if used not in units and used not in CONSTANTS:
@@ -457,6 +460,12 @@ class _Reader:
                 if name in taken:
                     raise ProgramError(f"{key}.{name}: this name is {taken[name]} already; choose another")
                 taken[name] = f"one of {key}"
+        for key, known in (("alias", taken), ("diagnosis", {})):
+            for name, row in self.parameters.items():
+                word = getattr(row, key)
+                if word and word in known:
+                    raise ProgramError(f"parameters.{name}.{key}: {word} is {known[word]} already; choose another")
+                known[word] = f"the {key} of {name}"
 
     def _check_formulas(self, lines: Sequence[Equation]) -> None:
         known = [*self.inputs, *self.states, *self.signals, *self.parameters, *CONSTANTS]

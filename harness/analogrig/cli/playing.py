@@ -244,7 +244,10 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
 
 
 def _as_json(run: Run, verdict: Verdict, identity: Identity, output: OutputFolder) -> dict[str, Any]:
+    from dataclasses import asdict
+
     from analogrig.judging.advice import advice
+    from analogrig.judging.response import step_responses
     from analogrig.judging.verdict import as_json
     from analogrig.output import RUN_FILE
 
@@ -261,6 +264,7 @@ def _as_json(run: Run, verdict: Verdict, identity: Identity, output: OutputFolde
         "samples": run.samples,
         "counters": dict(conditions.counters),
         **as_json(verdict),
+        "step_responses": [asdict(each) for each in step_responses(run)],
         "advice": list(advice(run, verdict)),
         "identity": identity.as_table(),
         "recorded_by": None if conditions.identity is None else conditions.identity.as_table(),

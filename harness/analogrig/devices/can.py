@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -9,8 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from analogrig.devices.can_description import CanBusDescription
 from analogrig.devices.catalogue_description import FrameDevice
 from analogrig.devices.child import Child
-from analogrig.devices.host import HOST_PROGRAM, host_child
-from analogrig.devices.library import LIBRARY
+from analogrig.devices.host import host_child, host_program_for
+from analogrig.devices.library import library_for
 from analogrig.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -20,9 +21,9 @@ _ONE_CONNECTION = frozenset({"slcan", "serial", "robotell", "seeedstudio"})
 """Interfaces of python-can behind a serial port, which only one process can open."""
 
 
-def _start_host(bus: PythonCanBus) -> Child:
+def _start_host(program: Path, bus: PythonCanBus) -> Child:
     """Start the device's process on the bus."""
-    child = host_child(["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])])
+    child = host_child(["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])], program)
     return child.connect(lambda _: child)
 
 
@@ -73,12 +74,15 @@ class CanDevice(CanBusDescription, FrameDevice):
             raise ConfigurationError(f"device {self.name}: {error}") from error
         started = self._started_device(interface)
         if started == "inproc":
-            return InhabitedBus(config)
-        return ChildBus(config, _start_host) if started == "host" else PythonCanBus(config)
+            return InhabitedBus(config, library_for(self.estimator))
+        start = functools.partial(_start_host, host_program_for(self.estimator))
+        return ChildBus(config, start) if started == "host" else PythonCanBus(config)
 
     @property
     def program(self) -> Path | None:
-        return {"inproc": LIBRARY, "host": HOST_PROGRAM}.get(self._started_device(self.interface))
+        started = self._started_device(self.interface)
+        builds = {"inproc": library_for(self.estimator), "host": host_program_for(self.estimator)}
+        return builds.get(started)
 
     def _started_device(self, interface: str) -> str:
         return self.device or ("inproc" if interface == "virtual" else "none")

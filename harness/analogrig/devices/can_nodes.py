@@ -7,10 +7,11 @@ import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from analogrig.devices.child import Child
-from analogrig.devices.library import ALWAYS_ROOM, LibraryDevice
+from analogrig.devices.library import ALWAYS_ROOM, LIBRARY, LibraryDevice
 from analogrig.errors import LinkClosed
 from analogrig.links.can_bus import PythonCanBus
 from analogrig.links.line import CanLine
@@ -68,10 +69,17 @@ class MemoryBus(LibraryDevice):
     damaged = 0
 
     def __init__(
-        self, boot_nonce: int, *, is_fd: bool = False, line: CanLine | None = None, input_blocks: int = ALWAYS_ROOM
+        self,
+        boot_nonce: int,
+        *,
+        is_fd: bool = False,
+        line: CanLine | None = None,
+        input_blocks: int = ALWAYS_ROOM,
+        library: Path = LIBRARY,
     ) -> None:
         """Boot a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
-        super().__init__("can", ctypes.c_bool(is_fd), boot_nonce=boot_nonce, input_blocks=input_blocks)
+        port = ctypes.c_bool(is_fd)
+        super().__init__("can", port, boot_nonce=boot_nonce, input_blocks=input_blocks, library=library)
         self.is_fd, self.line = is_fd, line
         self.clock = VirtualClock()
         self._output = (_Frame * _OUTPUT_N)()
@@ -101,14 +109,16 @@ class MemoryBus(LibraryDevice):
 class InhabitedBus(PythonCanBus):
     """A bus with a device in this process, which a thread serves over a connection of its own."""
 
-    def __init__(self, config: Mapping[str, Any]) -> None:
+    def __init__(self, config: Mapping[str, Any], library: Path = LIBRARY) -> None:
         """Open two connections to the same bus, and boot the device.
 
         :raises ConfigurationError, LinkError: as for ``PythonCanBus``, or the project's library was not built.
         """
         super().__init__(config)
         try:
-            self._device = MemoryBus(secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
+            self._device = MemoryBus(
+                secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS, library=library
+            )
             self._devices_bus = PythonCanBus(config)
         except BaseException:
             super().close()

@@ -12,7 +12,7 @@ from analogrig.datasheet import Datasheet
 from analogrig.devices.can_description import CanLineDescription
 from analogrig.devices.description import Capability, DeviceDescription
 from analogrig.devices.device import Device
-from analogrig.devices.library import LIBRARY
+from analogrig.devices.library import library_for
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.line import SerialLine
@@ -46,7 +46,7 @@ class CatalogueDescription(DeviceDescription):
     computes: Literal["est", "own"] = "est"
     """The estimator that the device computes: that of estimator_c/core, which the shipped properties compare with their
     reference, or one of your own."""
-    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+    estimator: EstimatorConfig = field(default_factory=lambda: EstimatorConfig(orders="program"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,7 +99,7 @@ class CatalogueDescription(DeviceDescription):
     @property
     def estimator_library(self) -> Path:
         """Shared library with the device's estimator, to be run in this process."""
-        return LIBRARY
+        return library_for(self.estimator)
 
     @property
     def can_run_in_blocks(self) -> bool:
@@ -108,6 +108,18 @@ class CatalogueDescription(DeviceDescription):
 
     def as_table(self) -> dict[str, Any]:
         return super().as_table() | {"estimator": self.estimator.as_table()}
+
+
+def suited(description: CatalogueDescription, order: int) -> EstimatorConfig:
+    """Settings of the device for a plant of this order: chosen by the order, or those given.
+
+    :raises ConfigurationError: the estimator has no such order.
+    """
+    try:
+        return description.estimator.suited(order)
+    except ValueError as error:
+        cure = "give the device settings of its own: [estimator]"
+        raise ConfigurationError(f"device {description.name}: a program of order {order}: {error}; {cure}") from error
 
 
 def has_our_estimator(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:

@@ -32,7 +32,7 @@ from analogrig.catalogue import (
     Result,
     Status,
 )
-from analogrig.devices.catalogue_description import CatalogueDescription
+from analogrig.devices.catalogue_description import CatalogueDescription, suited
 from analogrig.devices.device import Device
 from analogrig.errors import (
     CatalogueMismatch,
@@ -82,6 +82,7 @@ class CatalogueDevice(Device):
         self._description: CatalogueDescription = description
         self._as_opened = description.estimator
         self._talk = Conversation(link, description.name, description.timeout_s)
+        self._listener: CanListener | None = None
         self._identity: DeviceIdentity | None = None
         self._run = secrets.randbelow(RUNS)
         """Id of the last run. It starts at random, to differ from that of samples still buffered in the line."""
@@ -122,6 +123,7 @@ class CatalogueDevice(Device):
         return self._talk.link.faulty
 
     def listen(self, listener: CanListener) -> None:
+        self._listener = listener
         self._talk.link.listen(listener)
 
     def limit(self, left_s: float) -> None:
@@ -172,20 +174,44 @@ class CatalogueDevice(Device):
         """
         self._apply(self._as_opened.changed(f"device {self.name}", settings))
 
+    def suit(self, order: int) -> None:
+        """Choose the settings by the order of the plant, for ``prepare`` to apply; errors as ``configure``."""
+        self._describe(suited(self._description, order))
+
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
         """Set the code of zero force; errors as ``configure``."""
         self._apply(dataclasses.replace(self.estimator, force_zero=channels["u"].zero))
 
     def _apply(self, estimator: EstimatorConfig) -> None:
-        self._description = dataclasses.replace(self._description, estimator=estimator)
+        self._describe(estimator)
         for key, value in estimator.settings():
             wanted = float(np.float32(value))  # as the device holds it
             answer = self._talk.ask(Configure(self._talk.next_seq(), key, wanted), Configured)
             if answer.key != key or answer.result != Result.APPLIED or answer.value != wanted:
                 raise DeviceRefused(
                     f"device {self.name}: {key.name.lower()} = {value:g} was not applied:"
-                    f" {_word(Result, answer.result)}, it has {answer.value:g}"
+                    f" {_word(Result, answer.result)}, it has {answer.value:g}{self._lack_of_room()}"
                 )
+
+    def _describe(self, estimator: EstimatorConfig) -> None:
+        """Take settings that are to be applied. A device of this machine is started anew if they need another build."""
+        described = dataclasses.replace(self._description, estimator=estimator)
+        is_other = described.program != self._description.program
+        self._description = described
+        if is_other:
+            self._talk.link.close()
+            self._talk = Conversation(described.open_link(), self.name, described.timeout_s)
+            self._files = described.files()
+            if self._listener is not None:
+                self._talk.link.listen(self._listener)
+            self.recover()
+
+    def _lack_of_room(self) -> str:
+        """Cure of a refusal that may be for want of room; empty where the usual build has it."""
+        if not self.estimator.is_wide:
+            return ""
+        cause = "the program's order needs it: " if self.estimator.orders == "program" else ""
+        return f"; {cause}compile the device with {self.estimator.room}, or give it a lower order in [estimator]"
 
     def pace(self, period_s: float) -> Pace:
         """Pace of a run in real time, with a sample every ``period_s`` on the link's clock.

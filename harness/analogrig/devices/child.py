@@ -23,10 +23,11 @@ PROGRAMS = Path(__file__).parents[1] / "bin"
 """Folder of the programs that the package brings."""
 TETHER = PROGRAMS / "analogrig-tether"
 
-START_TIMEOUT_S = 5.0
-END_TIMEOUT_S = 3.0
-"""Longer than the tether waits before it kills."""
-CLOSED_TIMEOUT_S = 0.5
+START_TIMEOUT_S = 60.0
+"""A loaded machine takes seconds to start a process. One that fails to start ends at once."""
+END_TIMEOUT_S = 10.0
+"""Longer than the tether waits before it kills, also on a loaded machine."""
+CLOSED_TIMEOUT_S = 5.0
 """Time in which a process that has closed its line may end by itself. Its status is then known."""
 
 _COMPLAINT = re.compile(r"[a-z][\w./-]*: ")

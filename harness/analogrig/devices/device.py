@@ -68,6 +68,12 @@ class Device(ABC):
         if settings:
             raise DeviceRefused(f"device {self.name}: has no setting {next(iter(settings))}")
 
+    def suit(self, order: int) -> None:  # noqa: B027 - few devices model the plant
+        """Take the order of the plant, before ``prepare``.
+
+        A device that leaves its orders to the program chooses its settings.
+        """
+
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: B027 - few devices need it
         """Take the scales of the channels ``u`` and ``y``, and the machine time between samples, before ``start``.
 

@@ -11,7 +11,7 @@ import numpy as np
 from analogrig.answers import Answers, RaisedAlarm, Samples
 from analogrig.catalogue import Trigger
 from analogrig.datasheet import Datasheet
-from analogrig.devices.catalogue_description import CatalogueDescription
+from analogrig.devices.catalogue_description import CatalogueDescription, suited
 from analogrig.devices.device import Device
 from analogrig.devices.estimator import Estimator
 from analogrig.estimator_config import EstimatorConfig
@@ -52,6 +52,11 @@ class DirectDevice(Device):
 
     def configure(self, **settings: Any) -> None:
         self._apply(self._as_opened.changed(f"device {self.name}", settings))
+
+    def suit(self, order: int) -> None:
+        estimator = suited(self._description, order)
+        if estimator != self._description.estimator:
+            self._apply(estimator)
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
         zero = channels["u"].zero

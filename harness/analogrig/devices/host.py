@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, ClassVar
 from analogrig.devices.catalogue_description import EitherDevice
 from analogrig.devices.child import PROGRAMS, Child, ChildWire
 from analogrig.errors import LinkError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.wire import PortWire
 
 if TYPE_CHECKING:
     from analogrig.links.can_bus import CanBus
 
 HOST_PROGRAM = PROGRAMS / "analogrig-device"
+WIDE_HOST_PROGRAM = PROGRAMS / "analogrig-device-wide"
+"""The same with room for plants of higher order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +31,21 @@ class HostDevice(EitherDevice):
 
     @property
     def program(self) -> Path:
-        return HOST_PROGRAM
+        return host_program_for(self.estimator)
 
     def wire(self) -> ChildWire:
-        return host_wire()
+        return host_wire(program=self.program)
 
     def bus(self) -> CanBus:
         from analogrig.devices.can_nodes import ChildBus
 
-        child = host_child(["--slcan"])
+        child = host_child(["--slcan"], self.program)
         return child.connect(lambda port: ChildBus(self.slcan(port), lambda _: child, name="slcan"))
+
+
+def host_program_for(estimator: EstimatorConfig) -> Path:
+    """Program of the device with room for these settings."""
+    return WIDE_HOST_PROGRAM if estimator.is_wide else HOST_PROGRAM
 
 
 def host_child(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> Child:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from analogrig.devices.catalogue_description import EitherDevice
-from analogrig.devices.library import LIBRARY, MemoryWire
+from analogrig.devices.library import MemoryWire, library_for
 from analogrig.links.wire import Wire
 from analogrig.trust import Thing, absolute_path
 
@@ -40,7 +40,7 @@ class InprocDevice(EitherDevice):
 
     @property
     def program(self) -> Path:
-        return Path(self.library).absolute() if self.library else LIBRARY
+        return Path(self.library).absolute() if self.library else library_for(self.estimator)
 
     @property
     def estimator_library(self) -> Path:
@@ -63,4 +63,4 @@ class InprocDevice(EitherDevice):
     def bus(self) -> CanBus:
         from analogrig.devices.can_nodes import MemoryBus
 
-        return MemoryBus(boot_nonce=secrets.randbits(32), is_fd=self.fd, line=self.line())
+        return MemoryBus(secrets.randbits(32), is_fd=self.fd, line=self.line(), library=self.program)

@@ -11,10 +11,14 @@ from typing import Literal
 
 from analogrig.catalogue import CATALOGUE_HASH, FirmwareId
 from analogrig.errors import ConfigurationError, LinkError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.wire import VirtualClock
 
 LIBRARY = Path(__file__).parents[1] / "_device.so"
 """The project's own device."""
+
+WIDE_LIBRARY = LIBRARY.with_name("_device_wide.so")
+"""The same with room for plants of higher order."""
 
 EXIT_GUARD = LIBRARY.with_name("_exit_guard.so")
 """exit_guard.c: after exit() in a user's library, the status of this process is no success."""
@@ -55,11 +59,11 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
     if library.exists() and not library.is_file():
         raise ConfigurationError(f"{library}: not a file")
     try:
-        if library != LIBRARY:
+        if library not in (LIBRARY, WIDE_LIBRARY):
             _exit_guard().exit_guard_arm(str(library).encode())
         c = ctypes.CDLL(str(library))
     except OSError as error:
-        if library == LIBRARY:
+        if library in (LIBRARY, WIDE_LIBRARY):
             raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
         reason = str(error).removeprefix(f"{library}: ")
         raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
@@ -67,6 +71,11 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
     if lacking:
         raise ConfigurationError(f"{library}: is no library of a device: it lacks {', '.join(lacking)} ({cure})")
     return c
+
+
+def library_for(estimator: EstimatorConfig) -> Path:
+    """The project's own device, with room for these settings."""
+    return WIDE_LIBRARY if estimator.is_wide else LIBRARY
 
 
 @functools.cache

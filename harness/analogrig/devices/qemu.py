@@ -43,6 +43,9 @@ class QemuDevice(EitherDevice):
     machine: ClassVar[str]
     semihosting: ClassVar[bool] = True
     """True if the firmware reads its boot nonce by semihosting; otherwise it has one of its own."""
+    timeout_s: float = 60.0
+    """Time-out of all answers to one message. On a loaded machine an emulated board stands still for seconds; one that
+    has crashed closes its line at once."""
     firmware: str | None = None
     """An ELF file; None for the project's firmware, which `make firmware` builds."""
 
@@ -63,7 +66,7 @@ class QemuDevice(EitherDevice):
 
         def open_bus(first_line: str) -> ChildBus:
             (terminal,) = re.findall(r"/dev/\S+", first_line) or [""]
-            with _listening(terminal, self.starting_s):
+            with _listening(terminal, self.starting_s + self.timeout_s):
                 return ChildBus(self.slcan(terminal), lambda _: child, name="qemu slcan")
 
         child = self._boot(["-serial", "null", "-chardev", "pty,id=line", "-serial", "chardev:line"])

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChannelFault, MisfitPeriod, Verdict, unreported
 from analogrig.run import Run
@@ -34,6 +35,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     return (
         *_statement(run),
         *_misfits(verdict),
+        *_orders(run),
         *_unjudged_quantities(run, verdict),
         *_theta_without_a_model(run),
         *_assumed_settings(run),
@@ -56,6 +58,21 @@ def _misfits(verdict: Verdict) -> Iterator[str]:
 
 def _cause(period: MisfitPeriod) -> str:
     return period.cause
+
+
+def _orders(run: Run) -> Iterator[str]:
+    """Sentence on the orders of a model that the program chose, or that are below those of the program."""
+    program, model, estimator = run.conditions.program, run.datasheet.model, run.conditions.dut.get("estimator", {})
+    if not run.conditions.segments or model is None or estimator.get("trigger") == "none":
+        return
+    if estimator.get("orders") == "program" and model.na != EstimatorConfig.na:
+        yield (
+            f"the program {program.name}, of order {program.order}, chose the device's settings: na = {model.na},"
+            f" nb = {model.nb}, forgetting = {estimator['forgetting']:g}, C fixed"
+        )
+    elif model.na < program.order:
+        cure = ' set orders = "program" under [estimator]' if estimator else " choose a model of that order"
+        yield f"the device models {model.na} of the {program.order} poles of the program {program.name}:{cure}"
 
 
 def _unjudged_quantities(run: Run, verdict: Verdict) -> Iterator[str]:

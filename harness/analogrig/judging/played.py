@@ -14,7 +14,7 @@ from analogrig.judging.courses import Values
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors, nominal_courses
 from analogrig.run import Run
 from analogrig.scenario import Scenario
-from analogrig_emulator import Course, Courses, Moment
+from analogrig_emulator import Course, Courses, LinearMode, Moment
 
 _PREFIX = "no bound from a play of the machine: "
 
@@ -47,6 +47,14 @@ class Machine:
     def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _Played:
         with emulator_errors(_PREFIX):
             return _Played(self._courses.course(moment, before, after, ramp_n), self._lsb_v)
+
+    def linear_mode(self, values: Values) -> LinearMode:
+        """State space of the circuit from input to output, in volts and seconds of the machine.
+
+        :raises ConfigurationError: it has multipliers.
+        """
+        with emulator_errors("no linear mode of the machine: "):
+            return self._courses.linear_mode(values)
 
     def rival(self, moment: Moment, values: Values) -> _Played | None:
         try:

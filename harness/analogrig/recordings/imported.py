@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import MAX_SAMPLES, Segment
+from analogrig.program import Program
 from analogrig.recordings.columns import ColumnFile, read_columns
 from analogrig.run import Channel, Conditions, Run
-from analogrig.scenario import Scenario
+from analogrig.scenario import DEFAULT_PROGRAM, Scenario
 from analogrig.wording import number_of
-from analogrig_emulator import CHANNELS, Excitation
+from analogrig_emulator import Excitation
 
 if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
@@ -33,9 +34,6 @@ LEAST_BITS, MOST_BITS = 2, 16
 
 _MOST_JITTER = 0.02
 """Largest deviation of a time from the even grid, in sample periods."""
-
-_SIGNALS = tuple(f"{channel}_{kind}" for kind in ("code", "clipped") for channel in CHANNELS)
-"""Columns that ``analogrig emulate`` writes, without its volts."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,8 @@ def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
     """True if a file with columns of these names was written by ``analogrig emulate``."""
     if path.suffix == ".npz":
         return {"codes[0]", "codes[1]", "clipped[0]", "volts[0]"} <= set(names)
-    return set(_SIGNALS) <= set(names)
+    channels = [name.removesuffix("_code") for name in names if name.endswith("_code")]
+    return len(channels) > 1 and {f"{name}_clipped" for name in channels} <= set(names)
 
 
 def import_columns(path: Path, described: ImportDescription, scenario: Scenario | None) -> Run:
@@ -126,10 +125,10 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         raise RecordingError(f"{path}: has no row {described.first}")
     if described.samples is not None and samples < described.samples:
         raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
-    codes, clipped = np.zeros((samples, len(CHANNELS)), np.uint16), np.ones((samples, len(CHANNELS)), np.bool_)
-    channels = {}
-    for name, each in zip(CHANNELS, (described.input, described.output), strict=False):
-        at = CHANNELS.index(name)
+    program = Program.load(DEFAULT_PROGRAM) if scenario is None else scenario.program
+    shape, channels = (samples, len(program.channels)), {}
+    codes, clipped = np.zeros(shape, np.uint16), np.ones(shape, np.bool_)
+    for at, (name, each) in enumerate(zip(program.measured, (described.input, described.output), strict=True)):
         values = columns[each.column] * each.scale + each.offset
         channels[name] = _channel(path, each, described.bits, values)
         codes[:, at], clipped[:, at] = _converted(values, channels[name], is_ranged=each.range is not None)
@@ -143,15 +142,21 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
 
     :param played: scenario whose units the rig states.
     """
+    names = played.program.channels
     if path.suffix == ".npz":
-        wanted = [f"{kind}[{i}]" for kind in ("codes", "clipped") for i in range(len(CHANNELS))]
+        wanted = [f"{kind}[{i}]" for kind in ("codes", "clipped") for i in range(len(names))]
     else:
-        wanted = list(_SIGNALS)
+        wanted = [f"{name}_{kind}" for kind in ("code", "clipped") for name in names]
+        if not set(wanted) <= set(read_columns(path).names):
+            raise RecordingError(
+                f"{path}: lacks channels of program {played.program.name}, {', '.join(names)}: pass the scenario that"
+                " was played with --scenario"
+            )
     found = read_columns(path, wanted)
     values = np.stack([found.columns[name] for name in wanted], axis=1)
     performance = rig.perform(played, 0)
-    codes, clipped = values[:, : len(CHANNELS)], values[:, len(CHANNELS) :]
-    most = [performance.channels[name].codes if name in performance.channels else 1 for name in CHANNELS]
+    codes, clipped = values[:, : len(names)], values[:, len(names) :]
+    most = [performance.channels[name].codes if name in performance.channels else 1 for name in names]
     if not (np.isfinite(values).all() and (codes == np.rint(codes)).all() and (codes >= 0).all()):
         raise RecordingError(f"{path}: its codes are no whole numbers")
     if not (codes < most).all():
@@ -258,6 +263,7 @@ def _run(
             dut={"name": "none", "kind": KIND, "datasheet": {"alarms": False}},
             link="none",
             faults=(UNSEEN,),
+            program=kept.program,
         ),
         codes=codes,
         clipped=clipped,

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.verdict import ChangeVerdict, Verdict, trajectory
-from analogrig.plant import Plant
+from analogrig.plant import Plant, estimated_response
 from analogrig.run import CHUNK_SAMPLES, Run, missing_samples
 
 MOST_POINTS = 100_000
@@ -35,7 +35,9 @@ _LONGEST_REACH = 1_000
 """Samples on either side of a moment."""
 
 _MODE = ("resonance", "damping", "gain")
-"""Estimates of a plant of which nothing is known."""
+"""Estimates of a plant of which nothing is known, by a model of the second order."""
+
+_MODE_ORDER = 2
 
 _DISPLAY_UNITS = {"m": ("mm", 1000.0)}
 """Units that the page displays as others, with the factor."""
@@ -251,13 +253,16 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
 
 def _estimates(run: Run, part: slice) -> tuple[Sequence[str], NDArray[np.float64]]:
     """Names and values (n, m) of the estimates; of an unknown plant its resonance, damping and gain."""
-    found = trajectory(run, part)
-    if run.conditions.segments:
-        return run.conditions.program.estimates, found
+    conditions, model = run.conditions, run.datasheet.model
+    if conditions.segments:
+        return conditions.program.estimates, trajectory(run, part)
+    if model is None or model.na != _MODE_ORDER or not run.theta.shape[1]:
+        return (), np.empty((len(run.theta[part]), 0))
+    scales = conditions.input.lsb, conditions.output.lsb
+    found = estimated_response(run.theta[part], model, *scales, conditions.sample_period_s)
     with np.errstate(all="ignore"):
-        mass, damping, stiffness = found.T
-        resonance_hz = np.sqrt(stiffness / mass) / (2.0 * np.pi) * run.conditions.time_scale
-        return _MODE, np.stack([resonance_hz, damping / (2.0 * np.sqrt(stiffness * mass)), 1.0 / stiffness], axis=1)
+        rate = np.sqrt(found["s0"])
+        return _MODE, np.stack([rate / (2.0 * np.pi), found["s1"] / (2.0 * rate), found["gain"]], axis=1)
 
 
 def _units(run: Run, name: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from analogrig.judging.advice import advice
+from analogrig.judging.response import StepResponse, step_responses
 from analogrig.judging.verdict import (
     ESTIMATES,
     ChangeVerdict,
@@ -62,6 +63,9 @@ def summary(run: Run, verdict: Verdict) -> str:
     elif ESTIMATES not in verdict.not_judged:
         lines += ["", _estimates_head(conditions.program)]
         lines += [_segment_line(segment) for segment in verdict.estimates]
+    if verdict.knows_truth and not conditions.program.estimates and (found := step_responses(run)):
+        lines += ["", "  samples     step response of the estimate, against the circuit's"]
+        lines += [f"  {each.start:5}-{each.end - 1:<6}{response_text(each)}" for each in found]
     digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  {digest}"]
     return "\n".join(lines)
@@ -120,6 +124,11 @@ def change_text(tweak: ChangeVerdict, program: Program) -> str:
     return ", ".join(
         f"{name} {old:g} -> {tweak.after[name]:g} {program.unit(name)}".rstrip() for name, old in tweak.before.items()
     )
+
+
+def response_text(found: StepResponse) -> str:
+    """Difference of a step response: ``0.25% of the static gain``."""
+    return "unstable" if found.error is None else f"{found.error:.2%} of the static gain"
 
 
 def bound_text(tweak: ChangeVerdict) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from analogrig.identity import Identity
 from analogrig.judging.advice import advice
+from analogrig.judging.response import step_responses
 from analogrig.judging.verdict import (
     DIAGNOSES,
     ESTIMATES,
@@ -22,7 +23,7 @@ from analogrig.program import Program
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
 from analogrig.reporting.payload import is_thinned, marked_alarms
-from analogrig.reporting.summary import change_text, lamps_text, load_text
+from analogrig.reporting.summary import change_text, lamps_text, load_text, response_text
 from analogrig.run import Run
 from analogrig.wording import number_of
 
@@ -177,7 +178,8 @@ def estimates(run: Run, verdict: Verdict) -> str:
     """Table of the estimated parameters at the end of each segment, compared with the truth."""
     program = run.conditions.program
     if not program.estimates:
-        return f"<p>Not judged: the program {text(program.name)} relates no estimate to its parameters.</p>"
+        why = f"<p>Not judged: the program {text(program.name)} relates no estimate to its parameters.</p>"
+        return why + _step_responses(run)
     if ESTIMATES in verdict.not_judged:
         return "<p>Not judged: the device does not report estimates of them.</p>"
     if not verdict.estimates:
@@ -189,6 +191,19 @@ def estimates(run: Run, verdict: Verdict) -> str:
     head += heading((), ("estimate", "truth", "error") * len(program.estimates))
     rows = (_segment_row(segment) for segment in verdict.estimates)
     return table("The estimate after the last sample of each segment", head, rows)
+
+
+def _step_responses(run: Run) -> str:
+    """Table of the estimates' step responses against those of the circuit; empty without any."""
+    found = step_responses(run) if run.conditions.segments else ()
+    if not found:
+        return ""
+    head = heading(("Samples", "Largest difference"))
+    rows = (
+        row([f'<th scope="row">{each.start}–{each.end - 1}</th>', f"<td>{text(response_text(each))}</td>"])
+        for each in found
+    )
+    return table("Step response of the estimate after the last sample, against the circuit's", head, rows)
 
 
 def settings(run: Run) -> str:

@@ -19,8 +19,9 @@ from numpy.typing import ArrayLike
 
 from analogrig.judging.bursts import BURST, Design, bound_rate
 from analogrig.judging.exposure import exposure
+from analogrig.judging.response import step_responses
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChangeVerdict, Verdict, judge
-from analogrig.reporting.summary import bound_text
+from analogrig.reporting.summary import bound_text, response_text
 from analogrig.run import Run
 from analogrig.scenario import Statement
 from analogrig.testing.statement import Arguments, Finding, register, statement_of
@@ -141,6 +142,24 @@ class Played:
                 if not abs(error) <= within
             ]
         return Finding(not off, "; ".join(off) or f"{len(self.verdict.estimates)} stretches within {within:.2%}")
+
+    @_statement
+    def responds(self, within: float) -> Finding:
+        """Finding: the step response of the estimate at the end of every stretch is that of the circuit.
+
+        :param within: largest difference, in parts of the circuit's static gain.
+        """
+        found = step_responses(self.run)
+        if not found:
+            return Finding(holds=False, why="not judged: the program is not linear, or the device reports no model")
+        off = [
+            f"{response_text(each)} at sample {each.end}"
+            for each in found
+            if each.error is None or not each.error <= within
+        ]
+        return Finding(
+            not off, "; ".join(off) or f"{number_of(len(found), 'stretch', 'stretches')} within {within:.2%}"
+        )
 
     @_statement
     def follows(self, reference: ArrayLike, tolerance: ArrayLike, time_tolerance: int = 0) -> Finding:

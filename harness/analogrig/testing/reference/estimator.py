@@ -387,7 +387,7 @@ class ReferenceEstimator:
 
     def _watch_scale(self, equation: Vector, square: float) -> None:
         scale = self.trigger.scale
-        scale.enter(
+        is_end = scale.enter(
             square,
             self._residual(equation, scale.old) ** 2 if scale.is_on_trial else 0.0,
             self.since_n,
@@ -395,6 +395,8 @@ class ReferenceEstimator:
             warm=self.trigger.quiet_n >= WARM_N,
             excess=self.trigger.excess,
         )
+        if is_end:
+            self.trigger.find_hidden_change(is_doubted=self.doubt is not None)
 
     @property
     def _considers_c(self) -> bool:

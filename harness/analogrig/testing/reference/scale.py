@@ -11,6 +11,9 @@ BLOCK_N = 32
 SHARE_MIN, SHARE_WARM, WARM_N = 0.032, 0.25, 64
 """Smallest shares of a block in the noise variance, armed and before; equations before which it is armed."""
 
+HIGH, HIGH_STEP, HIGH_LIMIT = 5.0, 2, 6
+"""Mean square of a high block in noise variances that contain it, its step, and the count at which an alarm is due."""
+
 MARGIN, GROWTH_MAX = 2.0, 9.0
 INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 4.0, 0.9998933, 1e6
 TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
@@ -33,6 +36,8 @@ class ReferenceScale:
         self._share = 1.0 if config.noise_estimated else 0.0
         """Share of the next block in the noise variance; 0: it is not followed."""
         self._trial_n, self._balance, self._energy = 0, 0.0, 0.0
+        self.high_n = 0
+        """Steps of high blocks."""
         self._old: Vector = []
         self._least = NOISE_LEAST * config.noise_variance
         self.is_doubtful = False
@@ -85,8 +90,8 @@ class ReferenceScale:
         self._restart()
         self._apply()
 
-    def enter(self, square: float, old_square: float, since_n: int, *, waits: bool, warm: bool, excess: float) -> None:
-        """Enter one equation.
+    def enter(self, square: float, old_square: float, since_n: int, *, waits: bool, warm: bool, excess: float) -> bool:
+        """Enter one equation. Return true iff a block ends with it.
 
         :param square: of its innovation, over the predicted variance in noise variances.
         :param old_square: of its innovation with the estimate on trial.
@@ -102,8 +107,10 @@ class ReferenceScale:
             self._try(square, old_square, since_n)
         elif not waits and self._is_followed:
             self._relax()
+            return True
         elif not waits:
             self._follow(warm=warm, excess=excess)
+        return False
 
     def _try(self, square: float, old_square: float, since_n: int) -> None:
         self._trial_n += 1
@@ -126,7 +133,13 @@ class ReferenceScale:
             self._share = max(self._share / (1.0 + self._share), least)
 
     def _relax(self) -> None:
-        """Let the inflation decrease, and the number of alarms that may be justified increase."""
+        """Count a high block. Let the inflation decrease, and the number of alarms that may be justified increase."""
+        height = self._squares / BLOCK_N / (HIGH * self.noise_variance)
+        self.is_doubtful |= abs(height - 1.0) < NEAR
+        if height < 1.0:
+            self.high_n = max(self.high_n - 1, 0)
+        elif self.high_n < HIGH_LIMIT:
+            self.high_n += HIGH_STEP
         self.inflation = max(self.inflation * INFLATION_DECAY, 1.0)
         self._credit = min(self._credit + CREDIT_PER_BLOCK, CREDIT_MAX)
         self._restart()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.scale import ReferenceScale
+from analogrig.testing.reference.scale import HIGH_LIMIT, ReferenceScale
 
 GAIN, DRIFT = 0.4945, 1.1305
 """Terms of the sum: GAIN z^2 - DRIFT, a multiple of the log-likelihood ratio of a variance 7.1 times as large."""
@@ -80,6 +80,14 @@ class ReferenceTrigger:
     def settle(self) -> None:
         """Continue with the better of the other readings, after a slip."""
         self.statistic = min(self.rivals)
+
+    def find_hidden_change(self, *, is_doubted: bool) -> None:
+        """Let the next innovation raise an alarm if the blocks of late were high. A doubt comes first."""
+        if self.quiet_n or self._config.trigger != "cusum" or not self._config.noise_estimated:
+            self.scale.high_n = 0
+        elif self.scale.high_n >= HIGH_LIMIT and not is_doubted:
+            self.scale.high_n = 0
+            self.statistic = 2.0 * self._ceiling
 
     def enter(
         self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool

@@ -1,0 +1,112 @@
+"""Settings of the estimator by the order of the scenario's program."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from analogrig.bench import Bench, can_be_direct, direct_bench
+from analogrig.cli import main
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.opening import open_dut, reopen_dut
+from analogrig.devices.registry import describe
+from analogrig.errors import ConfigurationError, DeviceRefused
+from analogrig.estimator_config import EstimatorConfig
+from analogrig.judging.verdict import judge
+from analogrig.program import Program
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
+
+TWO_MASS = Scenario.load("two-mass")
+SHORT = dataclasses.replace(TWO_MASS, samples=60, tweaks=())
+
+GIVEN = "[estimator]\nna = 2\nnb = 3\n"
+LEFT = '[estimator]\norders = "program"\narl0 = 1e6\n'
+
+
+def described(folder: Path, settings: str, kind: str = "inproc") -> str:
+    """File of a device."""
+    path = folder / f"{kind}.toml"
+    path.write_text(f'kind = "{kind}"\n{settings}', encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("program", "order"),
+    [("front", 2), ("two-mass", 4), ("dc-motor", 2), ("duffing", 2), ("pendulum", 2), ("two-tanks", 2)],
+)
+def test_order_of_a_linear_program_is_the_number_of_its_states(program: str, order: int) -> None:
+    assert Program.load(program).order == order
+
+
+@pytest.mark.parametrize("device", ["inproc", "host", "can:virtual"])
+def test_program_chooses_the_orders_of_a_device_without_settings(device: str) -> None:
+    with open_rig("emulator") as rig, open_dut(device) as dut:
+        run = Bench(rig, dut).play(SHORT, 1)
+        assert run.theta.shape == (60, 10)
+        again = Bench(rig, dut).play(dataclasses.replace(Scenario.load("thesis"), samples=60, tweaks=()), 1)
+    assert again.theta.shape == (60, 6)
+    with open_rig("emulator") as rig, open_dut(device) as dut:
+        alone = Bench(rig, dut).play(dataclasses.replace(Scenario.load("thesis"), samples=60, tweaks=()), 1)
+    assert again.theta_hash() == alone.theta_hash()
+
+
+def test_blocks_and_messages_have_the_same_estimates_of_order_4() -> None:
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        by_messages = Bench(rig, dut).play(TWO_MASS, 3)
+        assert can_be_direct(rig, describe("inproc"))
+        assert direct_bench(rig, describe("inproc")).play(TWO_MASS, 3).theta_hash() == by_messages.theta_hash()
+        assert judge(by_messages).outcome == "passed"
+        with reopen_dut(by_messages.conditions.dut, "run.npz") as replayed:
+            assert Bench(rig, replayed).play(TWO_MASS, 3).theta_hash() == by_messages.theta_hash()
+
+
+def test_given_orders_stay(tmp_path: Path) -> None:
+    with open_rig("emulator") as rig, open_dut(described(tmp_path, GIVEN)) as dut:
+        assert Bench(rig, dut).play(SHORT, 1).theta.shape == (60, 6)
+
+
+def test_orders_of_the_program_go_with_other_settings(tmp_path: Path) -> None:
+    with open_rig("emulator") as rig, open_dut(described(tmp_path, LEFT)) as dut:
+        estimator = Bench(rig, dut).play(SHORT, 1).conditions.dut["estimator"]
+    assert (estimator["na"], estimator["nb"], estimator["ceiling"]) == (4, 5, pytest.approx(13.8155, abs=1e-3))
+
+
+def test_setting_of_a_test_that_names_an_order_makes_it_a_given_one() -> None:
+    left = EstimatorConfig(orders="program")
+    assert left.changed("", {"arl0": 1e6}).suited(4).na == 4
+    assert left.changed("", {"nb": 2}).suited(4).nb == 2
+    assert left.suited(4).suited(2) == left
+
+
+def test_device_without_room_is_refused_with_its_cure() -> None:
+    narrow = InprocDevice(name="narrow", library=str(InprocDevice(name="").program))
+    with open_rig("emulator") as rig, narrow.connect() as dut, pytest.raises(DeviceRefused) as refused:
+        Bench(rig, dut).play(SHORT, 1)
+    assert str(refused.value) == (
+        "device narrow: na = 4 was not applied: OUT_OF_RANGE, it has 2; the program's order needs it: compile the"
+        " device with -DEST_NA_MAX=4U -DEST_NB_MAX=5U -DEST_THETA_MAX=10U, or give it a lower order in [estimator]"
+    )
+
+
+def test_order_beyond_the_catalogue_is_refused() -> None:
+    with open_dut("inproc") as dut, pytest.raises(ConfigurationError, match=r"a program of order 99: .*\[estimator\]"):
+        dut.suit(99)
+
+
+def test_run_states_the_chosen_orders_and_the_step_response(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["run", "--scenario", "two-mass", "--dut", "inproc", "--out", str(tmp_path)]
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    assert "the program two-mass, of order 4, chose the device's settings: na = 4, nb = 5, forgetting = 0.998" in told
+    assert "step response of the estimate" in told
+    assert main([*command, "--json"]) == 0
+    assert [each["end"] for each in json.loads(capsys.readouterr().out)["step_responses"]] == [1000, 1500]
+
+
+def test_run_states_that_a_model_has_too_few_poles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["run", "--scenario", "two-mass", "--dut", described(tmp_path, GIVEN), "--out", str(tmp_path / "run")])
+    assert 'models 2 of the 4 poles of the program two-mass: set orders = "program"' in capsys.readouterr().out
