@@ -51,7 +51,7 @@ from analogrig_emulator.errors import (
     SamplerError,
 )
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
-from analogrig_emulator.machine.courses import Course, Courses, Moment, WideProgram, Wired
+from analogrig_emulator.machine.courses import Course, Courses, Moment, RepeatedCourses, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.modes import LinearMode
 from analogrig_emulator.machine.noise import ABSOLUTE_ZERO_C, CircuitNoise, NoisySuspension, Supply
@@ -142,6 +142,7 @@ __all__ = [
     "ProgramParameter",
     "RecordedExcitation",
     "Repeat",
+    "RepeatedCourses",
     "RepeatedPlay",
     "Resistor",
     "Sampler",

@@ -81,6 +81,13 @@ class Plant:
         """The same plant with the parameter ``name`` multiplied by ``factor``."""
         return self.changed({name: self.parameters()[name] * factor})
 
+    def response(self) -> dict[str, float]:
+        """Static gain, and s0, s1, ... of the denominator s^n + ... + s1 s + s0, of a linear plant."""
+        matrix = self.program.generators(np.array([self.values]))[0]
+        gain = -matrix[-1, :-1] @ np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])
+        denominator = np.poly(matrix[:-1, :-1])[:0:-1].tolist()
+        return {"gain": float(gain)} | {f"s{i}": value for i, value in enumerate(denominator)}
+
     def interpolate(self, other: Plant, part: float) -> Plant:
         """Plant at the fraction ``part`` (0..1) of a ramp to ``other``, linear in the pots.
 

@@ -204,7 +204,7 @@ def _equations(source: str) -> Equations:
 def _check_words(equations: Equations) -> None:
     for name, row in equations.parameters.items():
         if row.alias in _KEYS_OF_CHANGES:
-            raise ProgramError(f"parameters.{name}.alias: {row.alias} is a key of changes in scenarios; choose another")
+            raise ProgramError(f"parameters.{name}.alias: {row.alias} is a key of scenarios' changes; choose another")
         if row.diagnosis and row.diagnosis not in _DIAGNOSES:
             known, given = ", ".join(_DIAGNOSES), row.diagnosis[:40]
             raise ProgramError(f"parameters.{name}.diagnosis: no device names {given!r}; there are {known}")

@@ -118,6 +118,11 @@ class Channel:
         return self.lsb_v * self.unit_per_v
 
 
+def stack(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """(r, ...) from r arrays of one shape; a view of a single one, which may be long."""
+    return np.stack(arrays) if len(arrays) > 1 else arrays[0][None]
+
+
 def missing_samples(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(n,) bool from (n, c) bool: samples whose input or output was clipped."""
     return np.asarray(clipped[:, INPUT] | clipped[:, OUTPUT])
@@ -248,7 +253,7 @@ class Run:
         """Values of one channel in its physical unit, (n,) float64."""
         return self.conditions.channels[name].physical(self.codes[:, self.conditions.program.channels.index(name)])
 
-    @property
+    @functools.cached_property
     def segments(self) -> tuple[tuple[int, int, Plant], ...]:
         """Stretches (start, end, plant) of the played samples start <= k < end, in order.
 

@@ -205,9 +205,12 @@ class Scenario:
 
     def draw_excitation(self, rng: np.random.Generator) -> Excitation:
         """Excitation of one run, with a random phase if ``random_phase`` is set."""
-        if not self.random_phase:
-            return self.excitation
-        return dataclasses.replace(self.excitation, phase=float(rng.uniform()))
+        phase = self.draw_phase(rng)
+        return self.excitation if phase == self.excitation.phase else dataclasses.replace(self.excitation, phase=phase)
+
+    def draw_phase(self, rng: np.random.Generator) -> float:
+        """Phase of the excitation of one run: its own, or a random one if ``random_phase`` is set."""
+        return float(rng.uniform()) if self.random_phase else self.excitation.phase
 
     @classmethod
     def of_program(cls, program: Program) -> Scenario:

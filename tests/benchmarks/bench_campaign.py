@@ -2,9 +2,9 @@
 
 python -m tests.benchmarks campaign [--trials N] [--stored N]
 
-``--trials``: trials of 300 samples that are played, twice, the second time killed ten times on the way. ``--stored``:
-trials that are stored, counted, shown and compared without being played: copies of some played ones, with errors and
-hashes of their own.
+``--trials``: trials of 300 samples that are played three times, once on a Dask cluster of this machine and once killed
+ten times on the way. ``--stored``: trials that are stored, counted, shown and compared without being played: copies of
+some played ones, with errors and hashes of their own.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import logging
 import sqlite3
 import subprocess
 import sys
@@ -24,7 +25,7 @@ import numpy as np
 
 from analogrig.campaigns.conduct import conduct
 from analogrig.campaigns.plan import Part, Plan
-from analogrig.campaigns.plays import PlayedTask, play_part
+from analogrig.campaigns.plays import PlayedTask, play_part, play_task
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.tally import Task
 from analogrig.campaigns.trials import Trials
@@ -37,7 +38,15 @@ from .figure import Figure
 
 CELLS, KILLS, WORKERS = 25, 10, 2
 
+DEVICE = """\
+kind = "inproc"
+[estimator]
+warm_up_n = 100
+"""
+"""Device whose trigger is armed before the change."""
+
 SPEC = """\
+devices = ["early.toml"]
 samples = 300
 change_at = 200
 trials = {trials}
@@ -47,13 +56,17 @@ stiffness_factor = [0.7, 0.8, 0.9, 0.95, 0.98]
 B = [2500.0, 2750.0, 3021.0, 3200.0, 3400.0]
 """
 
+WORKER_TASKS, WORKER_TRIALS = 8, 500
+
 COPIED = 200
 """Trials of each cell that are played for ``--stored``."""
 
 NOTE = f"""\
-`--trials` are played by {WORKERS} workers in {CELLS} cells, 300 samples each, and again with {KILLS} kills of the
-command by SIGKILL. `--stored` are copies of played trials, which go through the same store, tally, page and comparison.
-Memory is the largest resident set of the command and of any of its workers."""
+Played trials have 300 samples, in {CELLS} cells. {WORKERS} local workers play them. A Dask cluster of {WORKERS}
+workers on this machine plays them again. A third time, SIGKILL ends the command {KILLS} times. The time
+of a worker is that of one process without a command. Stored trials are copies of played ones, which
+go through the same store, tally, page and comparison. Memory is the largest resident set of the
+command and of any of its workers."""
 
 
 def figures(*options: str) -> Iterator[Figure]:
@@ -73,16 +86,43 @@ def _played(folder: Path, trials: int) -> Iterator[Figure]:
     spec = _spec(folder, "played", trials)
     whole, killed = folder / "whole.sqlite", folder / "killed.sqlite"
     of = f"{trials:,} trials played"
+    yield Figure(f"{of}: CPU time of a worker", _worker_us(spec), "us a trial")
     wall_s, cpu_s, memory_mb = _measured("campaign", str(spec), "--workers", str(WORKERS), "--out", str(whole))
     yield Figure(f"{of}: time on the wall", wall_s, "s")
     yield Figure(f"{of}: CPU time of the command without its workers", 1e3 * cpu_s / trials, "ms a trial")
     yield Figure(f"{of}: memory", memory_mb, "MB")
     yield from _sizes(of, whole)
+    yield from _on_dask(of, spec, whole, wall_s)
     kills = _kill_on_the_way(spec, killed, trials)
     _measured("campaign", str(spec), "--workers", str(WORKERS), "--out", str(killed))
     same = whole.with_suffix(".json").read_bytes() == killed.with_suffix(".json").read_bytes()
     yield Figure(f"{of}: results with the same bytes after {kills} kills", float(same), "of 1")
     yield from _compared(of, whole, killed)
+
+
+def _worker_us(spec: Path) -> float:
+    """CPU time of a worker for each trial: the best of some tasks."""
+    plan = Plan.of(CampaignSpec.load(str(spec)))
+    text, best_s = plan.as_json(), float("inf")
+    for task in range(WORKER_TASKS):
+        start_s = time.process_time()
+        play_task(text, [Part(task % plan.size, 0, min(WORKER_TRIALS, plan.spec.trials))])
+        best_s = min(best_s, time.process_time() - start_s)
+    return 1e6 * best_s / min(WORKER_TRIALS, plan.spec.trials)
+
+
+def _on_dask(of: str, spec: Path, whole: Path, local_s: float) -> Iterator[Figure]:
+    """The same campaign on a cluster of this machine, whose start is left out, beside local workers."""
+    from distributed import LocalCluster
+
+    out = whole.with_name("dask.sqlite")
+    with LocalCluster(  # type: ignore[no-untyped-call]  # Dask is annotated in part
+        n_workers=WORKERS, threads_per_worker=1, dashboard_address=None, host="127.0.0.1", silence_logs=logging.CRITICAL
+    ) as cluster:
+        wall_s, _, _ = _measured("campaign", str(spec), "--cluster", cluster.scheduler_address, "--out", str(out))
+    same = whole.with_suffix(".json").read_bytes() == out.with_suffix(".json").read_bytes()
+    yield Figure(f"{of} on Dask: time on the wall", wall_s, "s", "local workers", ratio=local_s / wall_s)
+    yield Figure(f"{of} on Dask: results with the same bytes", float(same), "of 1")
 
 
 def _stored(folder: Path, trials: int) -> Iterator[Figure]:
@@ -137,6 +177,7 @@ class _Copier(ThisProcess):
 
 def _spec(folder: Path, name: str, trials: int) -> Path:
     path = folder / f"{name}.toml"
+    (folder / "early.toml").write_text(DEVICE)
     path.write_text(SPEC.format(trials=max(1, trials // CELLS), name=name.partition("-")[0]))
     return path
 

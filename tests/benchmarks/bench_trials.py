@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
-from analogrig.bench import direct_bench
+from analogrig.bench import DIRECT_BLOCK_SAMPLES, DirectBench, direct_bench
 from analogrig.devices.registry import describe
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
@@ -54,8 +54,11 @@ def figures() -> Iterator[Figure]:
     assert isinstance(rig, EmulatorRig)
     for name, scenario, count in _cases():
         for what, alarms_only in (("alarms alone", True), ("whole run", False)):
-            play = direct_bench(rig, describe("inproc"), alarms_only=alarms_only).play
-            yield Figure(f"trials, {name}: {what}", _rate(play, scenario, count), "samples/s of CPU time")
+            bench = direct_bench(rig, describe("inproc"), alarms_only=alarms_only)
+            yield Figure(f"trials, {name}: {what}", _rate(bench.play, scenario, count), "samples/s of CPU time")
+        if scenario.samples <= DIRECT_BLOCK_SAMPLES:
+            rate = _rate_together(bench, scenario, count)
+            yield Figure(f"trials, {name}: whole runs, {count} together", rate, "samples/s of CPU time")
     alone, together = _processes(1), _processes(2)
     yield Figure("trials: two processes", together, "samples/s of CPU time", "one process", ratio=together / alone)
     one_s, two_s = (_certificate(*LONG_CERTIFICATE, "--workers", count)[0] for count in "12")
@@ -73,6 +76,8 @@ def _cases() -> Iterator[tuple[str, Scenario, int]]:
     longer = dataclasses.replace(thesis, samples=thesis.samples + THESIS_LATER_N, tweaks=later)
     yield f"the thesis's changes in {longer.samples} samples", longer, 20
     yield f"the thesis's changes in {thesis.samples} samples", thesis, 100
+    short = dataclasses.replace(thesis, samples=300, tweaks=(dataclasses.replace(thesis.tweaks[0], sample=200),))
+    yield f"one change in {short.samples} samples", short, 200
 
 
 def _rate(play: Callable[[Scenario, int], object], scenario: Scenario, count: int) -> float:
@@ -85,6 +90,15 @@ def _rate(play: Callable[[Scenario, int], object], scenario: Scenario, count: in
             play(scenario, seed)
         best_s = min(best_s, time.process_time() - start_s)
     return count * scenario.samples / best_s
+
+
+def _rate_together(bench: DirectBench, scenario: Scenario, count: int) -> float:
+    """Rate of runs that are played together; best of REPEATS."""
+
+    def play(_: Scenario, batch: int) -> None:
+        bench.play_all(scenario, range(batch * count, (batch + 1) * count))
+
+    return _rate(play, scenario, 2) * count
 
 
 def rate_of_this_process() -> float:

@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 
 from analogrig_emulator import (
+    Card,
     CircuitError,
+    Courses,
     EngineError,
     Excitation,
     OpAmpModel,
     PotError,
     PotTurn,
+    RepeatedCourses,
     RepeatedPlay,
     SuspensionComputer,
+    Wired,
     drawn_offsets_v,
     is_repeatable,
     preset,
@@ -89,3 +93,34 @@ def test_ramps_and_amplifiers_without_a_pole_are_not_repeatable() -> None:
     with pytest.raises(CircuitError, match="without a pole"):
         RepeatedPlay(SuspensionComputer("front", opamp="ideal"), SAMPLES)
     assert PRESETS["ideal"] == OpAmpModel()
+
+
+def test_courses_of_many_are_each_those_of_a_machine_of_its_own() -> None:
+    """From rest to a change, and from there on; edges fall between samples, and one of them on a sample."""
+    model, seeds, phases = preset("tl07x"), (5, 0, 7), np.array([0.0, 0.123, 0.5])
+    excitation = replace(FULL, clock="free", drift_ppm=3.0)
+    first = fresh(model, "front", 0)
+    offsets = np.stack([offsets_v(model, first, seed) for seed in seeds])
+    together = RepeatedCourses(Wired(first, first), excitation, phases, offsets, SAMPLES, 1)
+    before, after = dict(first.program.values), {**first.program.values, "K": 18000.0}
+    courses, states = together.play(before, 0, 150, None)
+    later, ends = together.play(after, 150, 100, states)
+    for i, seed in enumerate(seeds):
+        own = fresh(model, "front", seed)
+        wired = {1.0: Wired(own, own)}
+        alone = Courses(wired.__getitem__, Card(), replace(excitation, phase=float(phases[i])), SAMPLES, 1)
+        course = alone.course(alone.at_rest(before), before, before)
+        assert course.advance(150).tobytes() == courses[i].tobytes()
+        moment = course.moment()
+        assert (moment.sample, moment.state.tobytes()) == (150, states[i].tobytes())
+        following = alone.course(moment, after, after)
+        assert following.advance(100).tobytes() == later[i].tobytes()
+        assert following.moment().state.tobytes() == ends[i].tobytes()
+
+
+def test_courses_from_states_of_another_machine_are_refused() -> None:
+    first = fresh(preset("tl07x"), "front", 0)
+    offsets = np.zeros((2, first.program.amplifiers))
+    together = RepeatedCourses(Wired(first, first), FULL, np.zeros(2), offsets, SAMPLES, 1)
+    with pytest.raises(EngineError, match=r"the states of the plays have shape \(2, 7\), got \(2, 1\)"):
+        together.play(first.program.values, 10, 20, np.zeros((2, 1)))

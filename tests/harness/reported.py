@@ -74,6 +74,7 @@ def reported_verdict(run: Run) -> Verdict:
         arl0=1e5,
         ceiling=11.5,
         missing_n=20,
+        armed_n=SAMPLES - 40,
         theta_hash=run.theta_hash(),
     )
 

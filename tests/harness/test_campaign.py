@@ -204,6 +204,14 @@ def test_division_into_parts_changes_nothing(tmp_path: Path, reference: Path, co
     assert exported(conduct(plan, ThisProcess(), out)) == exported(reference)
 
 
+def test_trials_played_together_are_those_played_alone_in_any_order(tmp_path: Path) -> None:
+    """Without drawn values the trials of a cell differ in the seed alone, and are played and judged together."""
+    text = planned(tmp_path, SPEC.partition("[draw]")[0]).as_json()
+    for cell in (1, 0):
+        alone = {place: play_part(text, Part(cell, place, 1)) for place in (3, 5, 0, 4, 2, 1)}
+        assert play_part(text, Part(cell, 0, 6)) == [row for place in range(6) for row in alone[place]]
+
+
 @pytest.mark.parametrize("parts", [[], [Part(0, 0, 6)], [Part(1, 2, 3)], [Part(0, 1, 2), Part(0, 4, 2), Part(1, 0, 5)]])
 def test_campaign_goes_on_from_any_parts(tmp_path: Path, reference: Path, parts: list[Part]) -> None:
     plan, out = planned(tmp_path), tmp_path / "out.sqlite"
@@ -602,6 +610,47 @@ def test_command_says_what_came_out_and_writes_the_page(
     assert Path(said["files"]["page"]).read_text().startswith("<!doctype html>")
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 0
     assert Path(said["files"]["results"]).read_bytes() == before
+
+
+def test_parquet_file_has_a_row_for_each_trial_of_the_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is absent: pip install analogrig[parquet]")
+    spec, out, to = tmp_path / "spec.toml", tmp_path / "x.sqlite", tmp_path / "x.parquet"
+    spec.write_text(SPEC + "[stop]\nquantity = 'missed'\nrate = 0.5\n")
+    command = ["campaign", str(spec), "--out", str(out), "--workers", "1", "--parquet"]
+    assert main([*command, str(out)]) == 2
+    assert "is a file of --out" in capsys.readouterr().err
+    monkeypatch.setattr("analogrig.campaigns.parquet.GROUP_ROWS", 4)
+    main([*command, str(to)])
+    file = parquet.ParquetFile(to)
+    assert 1 < file.num_row_groups < 12
+    rows = file.read().to_pylist()
+    with Store.read(out) as store:
+        plan = store.plan()
+        parts = list(store.parts(plan))
+    assert [(row["cell"], row["seed"]) for row in rows] == [
+        (part.cell, seed) for part, _ in parts for seed in plan.seeds(part)
+    ]
+    trials = Trials.joined([trials for _, trials in parts])
+    assert [row["theta"] for row in rows] == trials.theta.tolist()
+    assert [row["latency_n"] for row in rows] == [
+        [None if n < 0 else n for n in latencies] for latencies in trials.latency_n.tolist()
+    ]
+    assert [row["error_K"] for row in rows] == trials.error[:, 2].tolist()
+    assert [row["damping_n_s_per_m"] for row in rows] == trials.drawn[:, 0].tolist()
+    assert {row["stiffness_factor"] for row in rows} == {0.8, 0.9}
+    assert {row["outcome"] for row in rows} <= {"passed", "failed"}
+
+
+def test_parquet_without_pyarrow_is_one_line_before_anything_is_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    out = tmp_path / "x.sqlite"
+    assert main(["campaign", "pot-plane", "--out", str(out), "--parquet", str(tmp_path / "x.parquet")]) == 2
+    assert capsys.readouterr().err.endswith("--parquet needs pyarrow: pip install 'analogrig[parquet]'\n")
+    assert not out.exists()
 
 
 def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,11 +14,16 @@ from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_b
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
-from analogrig.judging.verdict import judge
+from analogrig.judging import information
+from analogrig.judging.verdict import judge, judge_all
+from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
+from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import EmulatorError, Sampler
+
+SHORT = dataclasses.replace(Scenario.load("healthy"), samples=500)
 
 
 def emulator(name: str) -> EmulatorRig:
@@ -121,6 +126,72 @@ def test_plays_of_one_scenario_are_each_those_of_a_rig_of_its_own(rig_name: str)
         assert trial.codes.tobytes() == np.concatenate([block.codes for block in own]).tobytes()
         assert trial.conditions.segments == scenario.segments()
         assert trial.conditions.scenario == scenario.as_table()
+
+
+@pytest.mark.parametrize(
+    ("rig_name", "shape"),
+    [("emulator", "square"), ("emulator-0-10v", "square"), ("emulator-real", "square"), ("emulator", "sine")],
+)
+@pytest.mark.parametrize("alarms_only", [False, True])
+def test_runs_played_and_judged_together_are_those_played_alone_to_the_bit(
+    rig_name: str, shape: str, *, alarms_only: bool
+) -> None:
+    """The ranges of 0 to 10 V clip; with real components each seed has a machine of its own; a sine has no edges."""
+    thesis = Scenario.load("thesis")
+    excitation = dataclasses.replace(thesis.excitation, shape=shape)
+    scenario = dataclasses.replace(thesis, samples=1500, tweaks=thesis.tweaks[:2], excitation=excitation)
+    bench = direct_bench(emulator(rig_name), describe("inproc"), alarms_only=alarms_only)
+    together, alone = bench.play_all(scenario, range(5)), [bench.play(scenario, seed) for seed in range(5)]
+    for one, other in zip(together, alone, strict=True):
+        for field in dataclasses.fields(Run):
+            mine, its = getattr(one, field.name), getattr(other, field.name)
+            assert mine.tobytes() == its.tobytes() if isinstance(mine, np.ndarray) else mine == its, field.name
+    assert any(len(run.alarm_index) for run in together)
+    assert judge_all(together) == [judge(run) for run in alone]
+
+
+@pytest.mark.parametrize(
+    ("program", "rig_name"),
+    [("dc-motor", "emulator"), ("dc-motor", "emulator-0-10v"), ("two-mass", "emulator"), ("duffing", "emulator")],
+)
+def test_runs_of_any_program_are_judged_together_by_the_courses_of_each_to_the_bit(program: str, rig_name: str) -> None:
+    """The multipliers of a Duffing oscillator leave nothing to share."""
+    scenario = dataclasses.replace(Scenario.of_program(Program.load(program)), samples=1100)
+    bench = direct_bench(emulator(rig_name), describe("inproc"))
+    runs = bench.play_all(scenario, range(3))
+    assert [run.theta_hash() for run in runs] == [bench.play(scenario, seed).theta_hash() for seed in range(3)]
+    assert judge_all(runs) == [judge(run) for run in runs]
+    for run, model in zip(runs, information.models_of(runs), strict=True):
+        shared, alone = (information.change_information(run, each) for each in (model, None))
+        assert len(shared) == len(scenario.tweaks)
+        assert [each.tobytes() for each in shared] == [each.tobytes() for each in alone]
+        assert information.isolation_bounds(run, model) == information.isolation_bounds(run)
+
+
+def test_long_runs_are_played_one_by_one() -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=DIRECT_BLOCK_SAMPLES + 100)
+    bench = direct_bench(emulator("emulator"), describe("inproc"), alarms_only=True)
+    (run,) = bench.play_all(scenario, [4])
+    assert run.codes.tobytes() == bench.play(scenario, 4).codes.tobytes()
+
+
+def test_runs_of_several_kinds_are_judged_each_by_its_own_conditions() -> None:
+    bench, thesis = direct_bench(emulator("emulator"), describe("inproc")), Scenario.load("thesis")
+    shorter = dataclasses.replace(thesis, samples=1500, tweaks=thesis.tweaks[:2])
+    runs = [bench.play(scenario, seed) for scenario in (thesis, shorter, thesis) for seed in (1, 2)]
+    assert judge_all(runs) == [judge(run) for run in runs]
+
+
+def test_any_device_answers_whole_records_as_in_plays_of_their_own() -> None:
+    blocks = [block for seed in (1, 2) for block in emulator("emulator").in_blocks(500).perform(SHORT, seed).blocks]
+    records = [block.samples() for block in blocks]
+    with open_dut("inproc", exchange="block") as line, describe("inproc").direct() as direct:
+        for (ours, counted), (theirs, its) in zip(
+            direct.play_records(records), line.play_records(records), strict=True
+        ):
+            assert ours.theta is not None and theirs.theta is not None
+            assert ours.theta.tobytes() == theirs.theta.tobytes()
+            assert counted.items() <= its.items()
 
 
 def test_device_whose_line_matters_is_not_played_without_it() -> None:

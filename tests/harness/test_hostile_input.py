@@ -405,7 +405,7 @@ def test_scheduler_that_dies_is_one_line_and_the_campaign_goes_on_from_there(
 ) -> None:
     address, scheduler = cluster
     spec, out = tmp_path / "spec.toml", tmp_path / "out.sqlite"
-    spec.write_text("trials = 4000\nsamples = 300\n")
+    spec.write_text("trials = 8000\nsamples = 300\n")
     argv = [sys.executable, "-m", "analogrig.cli", "campaign", str(spec), "--out", str(out)]
     with subprocess.Popen([*argv, "--cluster", address], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as campaign:
         log = out.with_name("out.sqlite-wal")
@@ -421,7 +421,7 @@ def test_scheduler_that_dies_is_one_line_and_the_campaign_goes_on_from_there(
     plan = Plan.of(CampaignSpec.load(str(spec)))
     with Store.read(out) as store:
         kept = sum(part.trials for part, _ in store.parts(plan))
-    assert 0 < kept < 4000
+    assert 0 < kept < 8000
     resumed, whole = (conduct(plan, Processes(2), path) for path in (out, tmp_path / "whole.sqlite"))
     assert as_json(resumed) == as_json(whole)
 

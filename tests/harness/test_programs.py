@@ -118,7 +118,7 @@ def test_scenario_names_a_program_beside_it_and_its_run_holds_it(tmp_path: Path)
         ("[[tweaks]]\nsample = 5\nstifness_n_per_m = 1.0", "tweaks[0]: unknown key 'stifness_n_per_m'"),
         ('program = "front"\n[plant]\nset = "front"', "plant: write program = ... and set = { ... } instead"),
         ('program = "friction.toml"', "M.diagnosis: no device names 'friction'; there are mass, damping, stiffness"),
-        ('program = "sample.toml"', "parameters.M.alias: sample is a key of changes in scenarios; choose another"),
+        ('program = "sample.toml"', "parameters.M.alias: sample is a key of scenarios' changes; choose another"),
         ('[plant]\nset = "rear"', "no program is called 'rear'"),
     ],
 )

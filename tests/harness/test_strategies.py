@@ -16,6 +16,7 @@ from analogrig.bench import Bench, direct_bench
 from analogrig.devices.inproc import InprocDevice
 from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import judge
+from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.scenario import PotChange, Scenario
@@ -52,6 +53,25 @@ def test_drawn_scenario_makes_a_valid_run_and_can_be_written_to_a_file(bench: Be
         assert judge(bench.play(scenario, seed)).valid
         table = tomllib.loads(config.to_toml(scenario.as_table()))
         assert Scenario.from_table(table, "the file") == scenario
+
+    check()
+
+
+@pytest.mark.parametrize("name", ["dc-motor", "two-mass", "duffing"])
+def test_scenarios_of_any_program_stay_in_its_ranges_and_are_judged(bench: Bench, name: str) -> None:
+    program = Program.load(name)
+
+    @settings(quick, max_examples=5)
+    @given(scenario=scenarios(program=program, most_changes=1), seed=seeds())
+    def check(scenario: Scenario, seed: int) -> None:
+        assert scenario.program == program
+        for segment in scenario.segments():
+            for parameter, value in segment.plant.parameters().items():
+                row = program.parameters[parameter]
+                assert row.low <= value <= row.high
+        verdict = judge(bench.play(scenario, seed))
+        assert verdict.valid
+        assert len(verdict.tweaks) == 1
 
     check()
 

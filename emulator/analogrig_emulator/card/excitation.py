@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig_emulator.card.smooth import MOST_HARMONIC, MOST_V, multisine, sine, sweep_turns
 from analogrig_emulator.engine import library
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, EdgeRows, Edges
 from analogrig_emulator.errors import ExcitationError
 
 _MOST_TICKS = 2.0**53
@@ -215,34 +215,37 @@ class Excitation:
         hours at 20 kHz).
         Raises ExcitationError for a frequency above half the sample rate, or so low that a period has more ticks.
         """
+        found = self.edges_at(np.array([self.phase]), start_tick, stop_tick, sample_rate_hz)
+        part = slice(int(found.counts[0]))
+        return Edges(found.ticks[0, part], found.levels_v[0, part])
+
+    def edges_at(self, phases: NDArray[np.float64], start_tick: int, stop_tick: int, sample_rate_hz: float) -> EdgeRows:
+        """Edges of edges() for each of these phases (plays,). Raises ExcitationError likewise."""
         period = self.period_ticks(sample_rate_hz)
         # An edge on the card's clock may be up to a sample later than its ideal instant: begin a period early.
         first = math.floor(start_tick / period) - 1
         last = math.ceil(stop_tick / period) + 1
         if start_tick <= 0:
             first = -2
-        periods, levels_v = self._prbs(first, last) if self.shape == "prbs" else self._cycle(first, last)
-        periods *= period
-        ticks = np.empty(periods.size, np.int64)
-        grid = TICKS_PER_SAMPLE if self.clock == "card" else 1
-        addresses = [array.ctypes.data for array in (periods, levels_v, ticks)]
-        count = library.load().engine_edges(periods.size, grid, max(start_tick, 0), stop_tick, *addresses)
-        return Edges(ticks[:count], levels_v[:count])
-
-    def _cycle(self, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Ideal instants in periods, and levels."""
-        periods, levels_v = np.empty((last + 1 - first, 2)), np.empty((last + 1 - first, 2))
-        np.subtract(np.arange(first, last + 1), self.phase, out=periods[:, 0])
-        np.add(periods[:, 0], self.duty, out=periods[:, 1])
-        levels_v[:] = self.high_v, self.low_v
-        return periods.ravel(), levels_v.ravel()
-
-    def _prbs(self, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        bits = _sequence(self.register_length)
         index = np.arange(first, last + 1)
-        high = bits[(index + self.seed) % bits.size]
-        levels_v: NDArray[np.float64] = np.where(high, self.high_v, self.low_v)
-        return index.astype(np.float64) - self.phase, levels_v
+        starts = index - phases[:, None]
+        if self.shape == "prbs":
+            periods, levels_v = starts, self._bit_levels_v(index)
+        else:
+            periods = np.stack((starts, starts + self.duty), axis=-1).reshape(len(phases), -1)
+            levels_v = np.tile((self.high_v, self.low_v), index.size)
+        periods *= period
+        levels_v = np.tile(levels_v, (len(phases), 1))
+        ticks, counts = np.empty(periods.shape, np.int64), np.empty(len(phases), np.int64)
+        grid = TICKS_PER_SAMPLE if self.clock == "card" else 1
+        addresses = [array.ctypes.data for array in (periods, levels_v, ticks, counts)]
+        library.load().engine_edges(*periods.shape, grid, max(start_tick, 0), stop_tick, *addresses)
+        return EdgeRows(counts, ticks, levels_v)
+
+    def _bit_levels_v(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Levels of these bits."""
+        bits = _sequence(self.register_length)
+        return np.where(bits[(index + self.seed) % bits.size], self.high_v, self.low_v)
 
     def _require(self, field: str, holds: object, what: str) -> None:
         if not holds:

@@ -68,7 +68,7 @@ def _trimmed(circuit: Circuit) -> Nodal:
     return Nodal(circuit, untrimmed if untrimmed.can_be_trimmed else None)
 
 
-_KEPT_SYSTEMS = 16
+_KEPT_SYSTEMS = 256
 
 _Place: TypeAlias = tuple[tuple[float, ...], tuple[bool, ...]]
 """Dials of all pots and positions of all switches."""

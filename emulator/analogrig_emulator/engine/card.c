@@ -9,7 +9,8 @@
 
 static bool is_same(double one, double other) { return one <= other && one >= other; }
 
-int64_t engine_edges(
+/// engine_edges() for one play; return the number of edges.
+static int64_t edges_of(
     int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick) {
     int64_t edges = 0, first = 0;
     for (int64_t i = 0; i < count; i++) {
@@ -33,6 +34,20 @@ int64_t engine_edges(
     memmove(tick, &tick[first], (size_t)(edges - first) * sizeof tick[0]);
     memmove(level, &level[first], (size_t)(edges - first) * sizeof level[0]);
     return edges - first;
+}
+
+void engine_edges(int64_t       plays,
+                  int64_t       count,
+                  int64_t       grid,
+                  int64_t       start,
+                  int64_t       stop,
+                  const double* instant,
+                  double*       level,
+                  int64_t*      tick,
+                  int64_t*      edges) {
+    for (int64_t i = 0; i < plays; i++) {
+        edges[i] = edges_of(count, grid, start, stop, &instant[i * count], &level[i * count], &tick[i * count]);
+    }
 }
 
 /// engine_see() for a number of channels that the compiler may know.

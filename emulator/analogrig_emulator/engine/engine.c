@@ -420,6 +420,49 @@ engine_status_t engine_play(engine_t*              self,
     return status == ENGINE_OK && taken < edges ? ENGINE_EDGE : status;
 }
 
+/// Write the numbers of one play to the circuits.
+static void set_numbers(const engine_schedule_t* schedule, const double* constants) {
+    for (int64_t turn = 0; turn < schedule->turns; turn++) {
+        double* const row = &schedule->numbers[turn * schedule->row];
+        for (int64_t i = 0; i < schedule->places; i++) {
+            row[schedule->place[i]] = constants[turn * schedule->places + i];
+        }
+    }
+}
+
+engine_status_t engine_play_all(engine_t*                self,
+                                const engine_schedule_t* schedule,
+                                int64_t                  plays,
+                                const double*            constants,
+                                const double*            start,
+                                const int32_t*           input,
+                                int64_t                  room,
+                                const int64_t*           edges,
+                                const int64_t*           tick,
+                                const double*            level,
+                                double*                  y,
+                                int64_t*                 overdue,
+                                double*                  end) {
+    engine_status_t status = ENGINE_OK;
+    for (int64_t i = 0; status == ENGINE_OK && i < plays; i++) {
+        set_numbers(schedule, &constants[i * schedule->turns * schedule->places]);
+        engine_restart(self);
+        engine_watch(self, schedule->patience);
+        if (start != NULL) {
+            status = engine_set_system(self, schedule->circuit);
+            status = status == ENGINE_OK ? engine_set_state(self, &start[i * self->states]) : status;
+        }
+        if (status == ENGINE_OK) {
+            status = engine_play(self, schedule->turns, schedule->circuit, schedule->until, edges[i], &tick[i * room],
+                                 input, &level[i * room], y);
+        }
+        engine_get_overdue(self, &overdue[i * self->kinks]);
+        engine_get_state(self, &end[i * self->states]);
+        y += self->counts.samples * self->outputs;
+    }
+    return status;
+}
+
 // ---------------------------------------------    WATCH AND COUNTS    ---------------------------------------------
 
 void engine_watch(engine_t* const self, int64_t patience) {

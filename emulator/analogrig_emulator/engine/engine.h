@@ -152,6 +152,38 @@ engine_status_t engine_play(engine_t*              self,
                             const double*          level,
                             double*                y);
 
+/// Circuits of repeated plays, as of engine_play(), and the places in them of the numbers that differ between the plays.
+typedef struct {
+    int64_t                turns;
+    const engine_system_t* circuit;  ///< matrices within the rows of numbers
+    const int64_t*         until;
+    int64_t                patience;  ///< as for engine_watch()
+    double*                numbers;   ///< a row for each turn
+    int64_t                row;       ///< length of a row
+    int64_t                places;
+    const int64_t*         place;  ///< indices in a row
+} engine_schedule_t;
+
+/// Call engine_restart(), engine_watch(), engine_play(), engine_get_overdue() and engine_get_state() for each of `plays` plays,
+/// which differ in their edges and in some numbers. constants: turns x places for each play. start: states for each play, which
+/// the first circuit starts from; NULL: rest. edges: their number in each play, of `room` in its row of tick and level; input: as
+/// for engine_play(), in common. y: the rows of all plays. overdue: kinks for each play. end: states for each play.
+///
+/// Fails as engine_play(), in the first play that does.
+engine_status_t engine_play_all(engine_t*                self,
+                                const engine_schedule_t* schedule,
+                                int64_t                  plays,
+                                const double*            constants,
+                                const double*            start,
+                                const int32_t*           input,
+                                int64_t                  room,
+                                const int64_t*           edges,
+                                const int64_t*           tick,
+                                const double*            level,
+                                double*                  y,
+                                int64_t*                 overdue,
+                                double*                  end);
+
 /// Watch, from the present tick on, for kinks that stay outside their middle piece for `patience` ticks without a break.
 /// Before the first call, patience is one sample period. Cost: none while no mode changes.
 void engine_watch(engine_t* self, int64_t patience);
@@ -206,9 +238,17 @@ void engine_noise_add(int                   n,
 
 /// Round the instants of `count` edges to ticks, and up to a multiple of grid; those before tick 0 move there. Of edges at one
 /// tick keep the last, and of those only the ones that change the level. Write the edges from tick start to stop - 1 to tick and
-/// level, and return their number. instant: rising; level: the level after each instant, overwritten.
-int64_t engine_edges(
-    int64_t count, int64_t grid, int64_t start, int64_t stop, const double* instant, double* level, int64_t* tick);
+/// level, and their number to edges. instant: rising; level: the level after each instant, overwritten. All this for each of
+/// `plays` rows of `count`.
+void engine_edges(int64_t       plays,
+                  int64_t       count,
+                  int64_t       grid,
+                  int64_t       start,
+                  int64_t       stop,
+                  const double* instant,
+                  double*       level,
+                  int64_t*      tick,
+                  int64_t*      edges);
 
 /// Record in seen the input of a card's converter in LSB, for `samples` rows of `channels` voltages. Return 1 iff all are finite.
 /// card: rows of `channels` numbers: gain, droop [V], lower end of the range [V], LSB [V], noise [LSB] and offset [LSB].

@@ -9,13 +9,13 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.engine import library
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, PiecewiseLinear
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, EdgeRows, Edges, PiecewiseLinear
 from analogrig_emulator.errors import EngineError
 
 _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
@@ -46,6 +46,17 @@ class EngineCounts:
     steps: int
     quiet: int
     modes_built: int
+
+
+class Plays(NamedTuple):
+    """Plays of one schedule."""
+
+    volts: NDArray[np.float64]
+    """(plays, samples, outputs) V."""
+    overdue_ticks: NDArray[np.int64]
+    """(plays, kinks), as Engine.overdue_ticks."""
+    states_v: NDArray[np.float64]
+    """(plays, states) V at the last sample."""
 
 
 class Engine:
@@ -229,25 +240,47 @@ class Engine:
         self._advance_clock(samples)
         return volts
 
-    def play(self, schedule: CircuitSchedule, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
-        """Play a schedule from rest: float64 (schedule.samples, outputs), V.
+    def play_all(
+        self,
+        schedule: CircuitSchedule,
+        constants: NDArray[np.float64],
+        edges: Mapping[str, EdgeRows],
+        states_v: NDArray[np.float64] | None = None,
+    ) -> Plays:
+        """Play a schedule once for each row of constants (plays, systems, places) and of edges of one input.
 
-        Equals alternating set_system() and run() on a new engine, at a fraction of the cost. Clock and watch() restart.
+        states_v: (plays, states) V at which the first circuit starts; None: at rest. Each play equals alternating
+        set_system() and run() on a new engine, at a fraction of the cost. Clock and watch() restart.
         Raises EngineError.
         """
         if self._drives:
             raise EngineError("a schedule is for inputs with edges: play drives with run()")
-        self._library.engine_restart(self._handle)
-        self._library.engine_look_ahead(self._handle, self._ahead_ticks)
-        self._library.engine_watch(self._handle, schedule.patience_ticks)
+        ((name, trains),) = edges.items()
+        plays, room = trains.ticks.shape
+        if not (np.isfinite(trains.levels_v).all() and len(constants) == plays):
+            raise EngineError(f"the edges of {name} need as many finite levels as ticks")
+        constants = np.ascontiguousarray(constants, np.float64)
+        inputs = np.full(room, self._names[1].index(name), np.int32)
+        volts = np.empty((plays, schedule.samples, len(self._outputs)))
+        overdue = np.empty((plays, self._kinks), np.int64)
+        ends_v = np.empty((plays, len(self._names[0])))
+        starts_v = None if states_v is None else np.ascontiguousarray(states_v, np.float64)
+        if starts_v is not None and starts_v.shape != ends_v.shape:
+            raise EngineError(f"the states of the plays have shape {ends_v.shape}, got {starts_v.shape}")
+        before, after = [
+            [None if array is None else array.ctypes.data for array in arrays]
+            for arrays in (
+                (constants, starts_v, inputs),
+                (trains.counts, trains.ticks, trains.levels_v, volts, overdue, ends_v),
+            )
+        ]
+        status = self._library.engine_play_all(
+            self._handle, ctypes.byref(schedule.struct), plays, *before, room, *after
+        )
+        self._check(status)
         self._recorded, self._now_tick = 0, -1
-        volts = self._allocate(schedule.samples)
-        trains = self._merge(edges)
-        addresses = [array.ctypes.data for array in (*trains, volts)]
-        turned = (len(schedule.circuits), schedule.circuits, schedule.until_ticks.ctypes.data)
-        self._check(self._library.engine_play(self._handle, *turned, trains[0].size, *addresses))
         self._advance_clock(schedule.samples)
-        return volts
+        return Plays(volts, overdue, ends_v)
 
     def advance(self, tick: int, edges: Mapping[str, Edges] | None = None) -> None:
         """Go to an instant before the next sample without recording; apply the edges up to it.
@@ -339,13 +372,11 @@ def _release(kind: _Kind, handle: int) -> None:
 
 
 class CircuitSchedule:
-    """Circuits of one play in the engine's memory layout, for repeated plays.
+    """Circuits of one play in the engine's memory layout, for repeated plays with other constants.
 
     systems: of the same states, inputs and kinks; last_samples: last sample of each, ascending; patience_ticks: as for
-    Engine.watch.
-
-    blocks: (systems, numbers), a row per circuit. abc_places (n,), cde_places (q,): indices in a row of the last
-    columns of abc and cde, which may be changed.
+    Engine.watch; varied: (row of abc, row of cde or None) of the last columns that constants of a play replace: that of
+    abc only where there is none of cde.
     """
 
     def __init__(
@@ -354,18 +385,27 @@ class CircuitSchedule:
         outputs: Sequence[str],
         last_samples: Sequence[int],
         patience_ticks: int,
+        varied: Sequence[tuple[int, int | None]],
     ) -> None:
         layouts = [system.layout(tuple(outputs)) for system in systems]
         starts = layouts[0].starts
-        self.blocks = np.stack([layout.block for layout in layouts])
-        self.circuits = (library.System * len(systems))(
-            *(library.System(*(row.ctypes.data + start for start in starts)) for row in self.blocks)
-        )
         self.samples = last_samples[-1] + 1
         self.until_ticks = np.array(last_samples, np.int64) * TICKS_PER_SAMPLE
-        self.patience_ticks = patience_ticks
         width = systems[0].abc.shape[1]
-        self.abc_places, self.cde_places = (
-            starts[field] // self.blocks.itemsize + np.arange(1, rows + 1) * width - 1
-            for field, rows in ((0, len(systems[0].states)), (2, len(systems[0].kinks)))
+        abc, cde = (starts[field] // layouts[0].block.itemsize - 1 for field in (0, 2))
+        places = [abc + (pole + 1) * width if kink is None else cde + (kink + 1) * width for pole, kink in varied]
+        self._places = np.array(places, np.int64)
+        self._blocks = np.stack([layout.block for layout in layouts])
+        circuits = (library.System * len(systems))(
+            *(library.System(*(row.ctypes.data + start for start in starts)) for row in self._blocks)
+        )
+        self.struct = library.Schedule(
+            turns=len(systems),
+            circuit=circuits,
+            until=self.until_ticks.ctypes.data,
+            patience=patience_ticks,
+            numbers=self._blocks.ctypes.data,
+            row=self._blocks.shape[1],
+            places=self._places.size,
+            place=self._places.ctypes.data,
         )

@@ -36,6 +36,21 @@ class System(ctypes.Structure):
     _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks", "products"))
 
 
+class Schedule(ctypes.Structure):
+    """The C type engine_schedule_t."""
+
+    _fields_ = (
+        ("turns", c_int64),
+        ("circuit", POINTER(System)),
+        ("until", c_void_p),
+        ("patience", c_int64),
+        ("numbers", c_void_p),
+        ("row", c_int64),
+        ("places", c_int64),
+        ("place", c_void_p),
+    )
+
+
 class Noise(ctypes.Structure):
     """The C type engine_noise_t."""
 
@@ -51,6 +66,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_set_state", c_int, (c_void_p, c_void_p)),
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
     ("engine_play", c_int, (c_void_p, c_int64, POINTER(System), c_void_p, c_int64, *(c_void_p,) * 4)),
+    ("engine_play_all", c_int, (c_void_p, POINTER(Schedule), c_int64, *(c_void_p,) * 3, c_int64, *(c_void_p,) * 6)),
     ("engine_drive", c_int, (c_void_p, c_int, c_int64, c_int64, c_void_p)),
     ("engine_look_ahead", None, (c_void_p, c_int64)),
     ("engine_watch", None, (c_void_p, c_int64)),
@@ -60,7 +76,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
     ("engine_noise_add", None, (c_int, c_int, c_int64, POINTER(Noise), *(c_void_p,) * 4)),
     ("engine_take", None, (c_int64, c_int, c_int64, c_void_p, c_double, *(c_void_p,) * 4)),
-    ("engine_edges", c_int64, (*(c_int64,) * 4, *(c_void_p,) * 3)),
+    ("engine_edges", None, (*(c_int64,) * 5, *(c_void_p,) * 4)),
     ("engine_see", c_int, (c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),
     ("engine_convert", None, (c_int64, c_int, c_void_p, c_uint, c_uint, *(c_void_p,) * 3)),
 )

@@ -39,6 +39,31 @@ def is_integer(number: object) -> bool:
     return isinstance(number, Integral)
 
 
+class EdgeRows(NamedTuple):
+    """Level changes of one input in several plays: the first counts[i] of row i, as in Edges."""
+
+    counts: NDArray[np.int64]
+    """(plays,)"""
+    ticks: NDArray[np.int64]
+    """(plays, room)"""
+    levels_v: NDArray[np.float64]
+    """(plays, room), all finite."""
+
+    def between(self, first: int, last: int) -> EdgeRows:
+        """Level at tick first, with the edges up to tick last, counted from first. Each row has an edge by then."""
+        begins = np.count_nonzero((self.ticks <= first) & self._exist, axis=1) - 1
+        counts = np.count_nonzero((self.ticks <= last) & self._exist, axis=1) - begins
+        places = np.minimum(begins[:, None] + np.arange(counts.max()), self.ticks.shape[1] - 1)
+        ticks = np.take_along_axis(self.ticks, places, axis=1) - first
+        ticks[:, 0] = 0
+        return EdgeRows(counts, ticks, np.take_along_axis(self.levels_v, places, axis=1))
+
+    @property
+    def _exist(self) -> NDArray[np.bool_]:
+        """Mask of the edges of each row, (plays, room)."""
+        return np.arange(self.ticks.shape[1]) < self.counts[:, None]
+
+
 @dataclass(frozen=True)
 class Edges:
     """Level changes of one input: levels_v[i] applies from tick ticks[i] on.

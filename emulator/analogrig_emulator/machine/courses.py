@@ -18,8 +18,9 @@ from analogrig_emulator.card.acquisition import on_card_clock, probe_of_channel,
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card
 from analogrig_emulator.circuit.circuit import Element, Resistor
+from analogrig_emulator.circuit.nodal import analyse
 from analogrig_emulator.circuit.opamp import OpAmpModel
-from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.engine.engine import CircuitSchedule, Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
 from analogrig_emulator.errors import PotError
 from analogrig_emulator.machine.modes import LinearMode, linear_mode
@@ -60,15 +61,15 @@ class Course:
         self._engine = courses.engine(turns[0][1], start.sample)
         self._engine.state = start.state
         self._coming = list(turns[1:])
-        self._run(1 + probe)
 
     def advance(self, samples: int) -> Matrix:
         """Voltages of the next samples, (samples,). Raises EngineError."""
         probes = self._courses.probes
-        return self._courses.sign * self._run(samples * probes)[probes - 1 :: probes, 0]
+        first = 0 if self._engine.recorded else 1 + self._probe
+        return self._courses.sign * self._run(first + samples * probes)[first + probes - 1 :: probes, 0]
 
     def moment(self) -> Moment:
-        """Moment of the last sample. Raises EngineError."""
+        """Moment of the last sample; there must be one. Raises EngineError."""
         samples = (self._engine.recorded - 1) // self._courses.probes
         if not self._probe:
             return Moment(self._start.sample + samples, self._engine.state)
@@ -170,6 +171,48 @@ class Courses:
 
     def _tick(self, sample: int) -> int:
         return sample * self.probes * TICKS_PER_SAMPLE
+
+
+class RepeatedCourses:
+    """Courses of machines that differ in op-amp offsets, each with its phase of the excitation: Courses to the bit.
+
+    wired: machine that is_repeatable(), taken at every sample of the card; phases: (plays,); offsets_v: (plays,
+    amplifiers) V from U1 on; samples, channel: as for Courses. Raises ExcitationError and CircuitError.
+    """
+
+    def __init__(
+        self,
+        wired: Wired,
+        excitation: Excitation,
+        phases: Matrix,
+        offsets_v: Matrix,
+        samples: int,
+        channel: int,
+    ) -> None:
+        self._wired, self._offsets_v = wired, offsets_v
+        machine = wired.machine
+        self._nodal = analyse(machine.circuit)
+        self.at_rest = Moment(0, np.zeros(len(self._nodal.at(machine.dials).states)))
+        self._nodes = (machine.program.channel_nodes[channel],)
+        self._sign = float(machine.program.channel_signs[channel])
+        self._edges = excitation.edges_at(phases, 0, samples * TICKS_PER_SAMPLE, machine.sample_rate_hz)
+
+    def play(
+        self, values: Mapping[str, float], start: int, samples: int, states_v: Matrix | None
+    ) -> tuple[Matrix, Matrix]:
+        """Voltages (plays, samples) after the sample `start`, and states (plays, n) at the last one.
+
+        values: of the parameters; states_v: (plays, n) V at `start`, None: at rest. Raises PotError and EngineError.
+        """
+        dials = {**self._wired.machine.dials, **self._wired.dials.dials_between(values)}
+        system, trim = self._nodal.with_trim(dials)
+        schedule = CircuitSchedule([system], self._nodes, [samples], TICKS_PER_SAMPLE, trim.rows)
+        numbers = [int(name.removeprefix("U")) - 1 for name in trim.amps]
+        constants = (trim.apart_v + self._offsets_v[:, None, numbers]) * trim.gain_rate
+        edges = self._edges.between(start * TICKS_PER_SAMPLE, (start + samples) * TICKS_PER_SAMPLE)
+        engine = Engine(system, self._nodes, self._wired.machine.sample_rate_hz)
+        plays = engine.play_all(schedule, constants, {SOURCE: edges}, states_v)
+        return self._sign * plays.volts[:, 1:, 0], plays.states_v
 
 
 def _between(start: Mapping[str, float], goal: Mapping[str, float], part: float) -> dict[str, float]:

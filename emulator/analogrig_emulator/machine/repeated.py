@@ -50,30 +50,40 @@ class RepeatedPlay:
         for turn in turns:
             dials |= turn.values
             solved.append(nodal.with_trim(dials))
-        systems = [system for system, _ in solved]
+        systems, trim = [system for system, _ in solved], solved[0][1]
         nodes = computer.program.channel_nodes
         last_samples = [*(turn.sample for turn in turns), samples - 1]
-        self._schedule = schedule = CircuitSchedule(systems, nodes, last_samples, computer.machine.lamp_delay_ticks)
+        patience_ticks = computer.machine.lamp_delay_ticks
+        self._schedule = CircuitSchedule(systems, nodes, last_samples, patience_ticks, trim.rows)
         self._engine = Engine(systems[0], nodes, computer.sample_rate_hz)
         self._kinks = systems[0].kinks
         self._signs = computer.program.channel_signs
         self._rate_hz = computer.sample_rate_hz
-        trim = solved[0][1]
         self._amplifiers = trim.amps
         self._numbers = np.array([int(name.removeprefix("U")) - 1 for name in trim.amps])
         self._apart_v = np.stack([each.apart_v for _, each in solved])
         self._gain_rate = trim.gain_rate
-        self._places = np.array(
-            [schedule.abc_places[pole] if kink is None else schedule.cde_places[kink] for pole, kink in trim.rows]
-        )
 
     def play(self, excitation: Excitation, offsets_v: NDArray[np.float64]) -> Repeat:
         """Play with the input offsets offsets_v: (amplifiers,) V from U1 on, as from drawn_offsets_v.
 
         Raises ExcitationError and EngineError.
         """
-        self._schedule.blocks[:, self._places] = (self._apart_v + offsets_v[self._numbers]) * self._gain_rate
-        edges = excitation.edges(0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
-        volts = self._engine.play(self._schedule, {SOURCE: edges})
+        return self.play_all(excitation, np.array([excitation.phase]), offsets_v[None])[0]
+
+    def play_all(
+        self, excitation: Excitation, phases: NDArray[np.float64], offsets_v: NDArray[np.float64]
+    ) -> list[Repeat]:
+        """Play once with each of these phases of the excitation, (plays,), and offsets, (plays, amplifiers).
+
+        Their volts are parts of one array. Raises ExcitationError and EngineError, whichever play fails.
+        """
+        constants = (self._apart_v + offsets_v[:, None, self._numbers]) * self._gain_rate
+        edges = excitation.edges_at(phases, 0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
+        plays = self._engine.play_all(self._schedule, constants, {SOURCE: edges})
+        volts = plays.volts
         volts *= self._signs
-        return Repeat(volts, lamp_samples(self._amplifiers, self._kinks, self._engine.overdue_ticks))
+        return [
+            Repeat(each, lamp_samples(self._amplifiers, self._kinks, ticks))
+            for each, ticks in zip(volts, plays.overdue_ticks, strict=True)
+        ]

@@ -2,6 +2,8 @@
 
 #include "library.h"
 
+#include <string.h>
+
 size_t library_size(void) { return sizeof(library_t); }
 
 void library_init(library_t* const self) { self->settings = settings_default(); }
@@ -16,9 +18,9 @@ static void
 keep(const library_t* const self, const size_t k, const est_step_t* const step, const library_out_t* const out) {
     if (out->theta != 0) {
         const uint8_t count = est_theta_count(&self->estimator);
-        for (uint8_t i = 0U; i < count; i++) {
-            out->theta[(k * count) + i] = est_theta(&self->estimator, i);
-        }
+        float         theta[EST_THETA_MAX];
+        est_copy_theta(&self->estimator, theta);
+        (void)memcpy(&out->theta[k * count], theta, count * sizeof theta[0]);
     }
     if (out->innovation != 0) {
         out->innovation[k] = step->innovation;
@@ -72,6 +74,36 @@ size_t library_run_codes(library_t* const           self,
         alarms += enter(self, k, (float)u[k * stride], (float)y[k * stride], valid, out);
     }
     return alarms;
+}
+
+/// Start of the rows of record r in a result; a null pointer remains one.
+#define ROWS(result, r, size) ((result) == 0 ? 0 : &(result)[(r) * (size)])
+
+bool library_run_records(library_t* const           self,
+                         const size_t               records,
+                         const size_t               n,
+                         const size_t               stride,
+                         const uint16_t* const      u,
+                         const uint16_t* const      y,
+                         const uint8_t* const       valid,
+                         const library_out_t* const out,
+                         est_counters_t* const      counters) {
+    bool started = true;
+    for (size_t r = 0U; started && (r < records); r++) {
+        const library_out_t rows = {
+            .theta      = ROWS(out->theta, r, n * library_theta_count(self)),
+            .innovation = ROWS(out->innovation, r, n),
+            .statistic  = ROWS(out->statistic, r, n),
+            .status     = ROWS(out->status, r, n),
+            .alarm      = ROWS(out->alarm, r, n),
+        };
+        started = library_start(self);
+        if (started) {
+            (void)library_run_codes(self, n, stride, &u[r * n * stride], &y[r * n * stride], ROWS(valid, r, n), &rows);
+            counters[r] = library_counters(self);
+        }
+    }
+    return started;
 }
 
 uint8_t library_theta_count(const library_t* const self) { return est_theta_count(&self->estimator); }

@@ -50,6 +50,18 @@ size_t library_run_codes(library_t*           self,
                          const uint8_t*       valid,
                          const library_out_t* out);
 
+/// Enter `records` records of n codes each, one after the other, as library_run_codes(). The estimator is started before each.
+/// out has room for all samples. counters: those after each record. Return false iff library_start() does.
+bool library_run_records(library_t*           self,
+                         size_t               records,
+                         size_t               n,
+                         size_t               stride,
+                         const uint16_t*      u,
+                         const uint16_t*      y,
+                         const uint8_t*       valid,
+                         const library_out_t* out,
+                         est_counters_t*      counters);
+
 /// Number of parameters.
 uint8_t library_theta_count(const library_t* self);
 

@@ -164,6 +164,8 @@ class Plan:
 
     def draw(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""
+        if not self.spec.draw:
+            return {}
         rng = np.random.default_rng([seed, _DRAWS])
         return {axis: float(rng.uniform(low, high)) for axis, (low, high) in self.spec.draw.items()}
 
@@ -178,6 +180,11 @@ class Plan:
         if NOISE in values:
             rig["card"] = {**rig["card"], NOISE: values[NOISE]}
         return Case(rig, self.devices[cell.device], scenario, seed)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of each trial."""
+        return self._base.samples
 
     @functools.cached_property
     def _base(self) -> Scenario:

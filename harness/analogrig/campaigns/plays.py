@@ -6,14 +6,15 @@ import contextlib
 import dataclasses
 import functools
 import json
+import operator
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
+from analogrig.bench import Bench, DirectBench, can_be_direct, direct_bench, raise_if_interrupted
 from analogrig.campaigns import builds
 from analogrig.campaigns.plan import Case, Cell, Part, Plan, device_of, open_table
 from analogrig.campaigns.rows import Row, row, row_of_none
@@ -21,12 +22,15 @@ from analogrig.campaigns.trials import Trials
 from analogrig.devices.device import Device
 from analogrig.errors import AnalogrigError, ConfigurationError, DeviceError, LinkError, RigError
 from analogrig.judging.exposure import exposure
-from analogrig.judging.verdict import invalid_reasons, judge
+from analogrig.judging.verdict import invalid_reasons, judge_all
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run
 
 MOST_KEPT = 64
 """Largest number of rigs, and of devices, that are open at once."""
+
+BATCH_SAMPLES = 1 << 16
+"""Samples of trials that are judged together; they fit in the cache."""
 
 Kept = TypeVar("Kept")
 
@@ -37,16 +41,21 @@ class _Cache(Generic[Kept]):
     def __init__(self, opened: Callable[..., AbstractContextManager[Kept]]) -> None:
         self._opened = opened
         self._kept: dict[str, tuple[Kept, ExitStack]] = {}
+        self._last: tuple[tuple[Any, ...], Kept] | None = None
+        """Object of the last ``get``: trials of a cell share their tables, which take long to write."""
 
     def get(self, *described: Any) -> Kept:
         """Return the open object of this description; open it first if necessary."""
+        if self._last is not None and all(map(operator.is_, self._last[0], described)):
+            return self._last[1]
         key = json.dumps(described, sort_keys=True)
         if key not in self._kept:
             while len(self._kept) >= MOST_KEPT:
                 self._close(next(iter(self._kept)))
             with ExitStack() as stack:
                 self._kept[key] = stack.enter_context(self._opened(*described)), stack.pop_all()
-        return self._kept[key][0]
+        self._last = described, self._kept[key][0]
+        return self._last[1]
 
     def drop(self, *described: Any) -> None:
         """Close the object of this description, so that the next play reopens it."""
@@ -57,6 +66,7 @@ class _Cache(Generic[Kept]):
             self._close(next(iter(self._kept)))
 
     def _close(self, key: str) -> None:
+        self._last = None
         if key in self._kept:
             with contextlib.suppress(AnalogrigError):
                 self._kept.pop(key)[1].close()
@@ -68,14 +78,14 @@ class _Benches(threading.local):
     def __init__(self) -> None:
         self._rigs: _Cache[Rig] = _Cache(open_table)
         self._devices: _Cache[Device] = _Cache(lambda table: device_of(table).connect())
-        self._direct: _Cache[Bench | None] = _Cache(self._direct_bench)
+        self._direct: _Cache[DirectBench | None] = _Cache(self._direct_bench)
 
     def _direct_bench(
         self,
         rig: Any,
         device: Any,
         alarms_only: bool,  # noqa: FBT001 - part of the key
-    ) -> AbstractContextManager[Bench | None]:
+    ) -> AbstractContextManager[DirectBench | None]:
         opened, planned = self._rigs.get(rig), device_of(device)
         if not can_be_direct(opened, planned):
             return contextlib.nullcontext()
@@ -92,8 +102,8 @@ class _Benches(threading.local):
         """
         bench = self._direct.get(case.rig, case.device, alarms_only)
         try:
-            bench = bench or Bench(self._rigs.get(case.rig), self._devices.get(case.device))
-            run = bench.play(case.scenario, case.seed)
+            used = bench or Bench(self._rigs.get(case.rig), self._devices.get(case.device))
+            run = used.play(case.scenario, case.seed)
         except BaseException as error:
             self._devices.drop(case.device)
             if isinstance(error, RigError):
@@ -102,6 +112,13 @@ class _Benches(threading.local):
         if run.conditions.faults:
             self._devices.drop(case.device)
         return raise_if_interrupted(run)
+
+    def play_together(self, case: Case, seeds: Sequence[int]) -> list[Run]:
+        """Runs of a case with these seeds instead of its own; none where ``play`` must play them one by one."""
+        bench = self._direct.get(case.rig, case.device, False)
+        with contextlib.suppress(AnalogrigError):
+            return [] if bench is None else bench.play_all(case.scenario, seeds)
+        return []
 
     def close(self) -> None:
         for kept in (self._direct, self._devices, self._rigs):
@@ -135,23 +152,30 @@ def play_task(plan: str, task: Sequence[Part]) -> PlayedTask:
 def play_part(plan: str, part: Part) -> list[Row]:
     """Rows of a part; errors as ``play_task``."""
     planned, cells = _plan(plan)
-    rows = []
-    for seed in planned.seeds(part):
-        try:
-            rows.append(_play_trial(planned, cells[part.cell], seed))
-        except ConfigurationError as error:
-            raise ConfigurationError(f"campaign {planned.spec.name}, cell {part.cell}, seed {seed}: {error}") from error
-    return rows
+    seeds = planned.seeds(part)
+    trials = max(1, BATCH_SAMPLES // planned.samples)
+    batches = (seeds[first : first + trials] for first in range(0, len(seeds), trials))
+    return [row for batch in batches for row in _play_batch(planned, part.cell, cells[part.cell], batch)]
 
 
-def _play_trial(plan: Plan, cell: Cell, seed: int) -> Row:
-    """Row of a trial. One that cannot be played is inconclusive: the next one may succeed."""
-    drawn = plan.draw(seed)
+def _play_batch(plan: Plan, number: int, cell: Cell, seeds: Sequence[int]) -> Iterator[Row]:
+    """Rows of some trials, played together where they can be. One that cannot be played is inconclusive."""
+    drawn = [plan.draw(seed) for seed in seeds]
+    played: Sequence[Run | str] = [] if any(drawn) else _benches.play_together(plan.case(cell, seeds[0], {}), seeds)
+    played = played or [_play_trial(plan, number, cell, *each) for each in zip(seeds, drawn, strict=True)]
+    verdicts = iter(judge_all(each for each in played if isinstance(each, Run)))
+    for each, seed, values in zip(played, seeds, drawn, strict=True):
+        yield row(each, next(verdicts), values) if isinstance(each, Run) else row_of_none(seed, values, each)
+
+
+def _play_trial(plan: Plan, number: int, cell: Cell, seed: int, drawn: Mapping[str, float]) -> Run | str:
+    """Run of a trial; the reason if it cannot be played. The next one may succeed."""
     try:
-        run = _benches.play(_fixed_case(plan, cell, seed) if not drawn else plan.case(cell, seed, drawn))
+        return _benches.play(plan.case(cell, seed, drawn) if drawn else _fixed_case(plan, cell, seed))
     except (DeviceError, LinkError, RigError) as error:
-        return row_of_none(seed, drawn, " ".join(str(error).split()))
-    return row(run, judge(run), drawn)
+        return " ".join(str(error).split())
+    except ConfigurationError as error:
+        raise ConfigurationError(f"campaign {plan.spec.name}, cell {number}, seed {seed}: {error}") from error
 
 
 _cases: dict[int, tuple[Cell, Case]] = {}

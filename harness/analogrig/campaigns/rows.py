@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import ChangeVerdict, Verdict
 from analogrig.run import Run
 
@@ -49,7 +48,7 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
         drawn,
         why=verdict.reasons[0] if verdict.reasons else "",
         samples=run.samples,
-        armed=exposure(run).armed,
+        armed=verdict.armed_n,
         false_alarms=len(verdict.false_alarms),
         changes=[list(Change.of(tweak)) for tweak in verdict.tweaks],
         errors=_errors(verdict),

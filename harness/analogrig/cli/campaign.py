@@ -39,6 +39,7 @@ def add(commands: Any) -> None:
         help="SQLite file of the trials; beside it .json with the results, .html with a page"
         " (default: build/campaign/NAME.sqlite)",
     )
+    command.add_argument("--parquet", type=Path, metavar=FILE, help="Parquet file of the trials, for other tools")
     add_workers(command)
     add_allow(command)
     add_json(command)
@@ -68,17 +69,23 @@ def begin(arguments: argparse.Namespace) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
     from analogrig.campaigns.conduct import conduct, ended_results, unreachable
+    from analogrig.campaigns.parquet import check_available, write_parquet
     from analogrig.campaigns.plan import Plan, device_of, one_worker_only
     from analogrig.campaigns.spec import CampaignSpec
-    from analogrig.errors import WorkerError
+    from analogrig.errors import ConfigurationError, WorkerError
     from analogrig.identity import Identity
     from analogrig.output import move_aside
     from analogrig.reporting.campaign import as_json, places_of, text, write_json
     from analogrig.reporting.campaign_page import write_page
 
+    if arguments.parquet is not None:
+        check_available()
     plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.sqlite"
     summary, page = places_of(out)
+    parquet = arguments.parquet
+    if parquet is not None and parquet.resolve() in {each.resolve() for each in (out, summary, page)}:
+        raise ConfigurationError(f"--parquet {parquet}: is a file of --out; choose another")
     results = ended_results(plan, out)
     if results is None:
         move_aside(summary)
@@ -100,6 +107,9 @@ def _run(arguments: argparse.Namespace) -> int:
             return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
     write_json(results, summary)
     write_page(results, page)
+    if parquet is not None:
+        move_aside(parquet)
+        write_parquet(out, parquet)
     if arguments.json:
         places = {"trials": str(out), "results": str(summary), "page": str(page)}
         played_by = [each.as_table() for each in results.played_by]

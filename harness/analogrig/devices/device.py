@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 from analogrig.answers import Answers, Samples
@@ -112,6 +112,13 @@ class Device(ABC):
         :raises DeviceError: the record is not valid, for example because the device was reset.
         """
         return {}
+
+    def play_records(self, records: Sequence[Samples]) -> Iterator[tuple[Answers, Mapping[str, int]]]:
+        """Feed whole records of one length, and yield the answers to each, with the counters of ``stop``."""
+        for samples in records:
+            self.start()
+            (answers,) = self.play([samples])
+            yield answers, self.stop()
 
     def limit(self, left_s: float) -> None:  # noqa: B027 - a device that answers at once has nothing to wait for
         """Set a time limit ``left_s`` from now; ``math.inf`` removes it.

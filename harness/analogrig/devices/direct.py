@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from analogrig.catalogue import Trigger
 from analogrig.datasheet import Datasheet
 from analogrig.devices.catalogue_description import CatalogueDescription, suited
 from analogrig.devices.device import Device
-from analogrig.devices.estimator import Estimator
+from analogrig.devices.estimator import Estimator, EstimatorOutput
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.protocol.pace import Pace
 from analogrig.run import Channel
@@ -85,18 +85,26 @@ class DirectDevice(Device):
                 self._estimator.run(nothing, nothing, np.zeros(skipped_n, np.bool_), with_theta=False)
             self._next_index = block.first + len(block)
             steps = self._estimator.run(block.u, block.y, block.valid, with_theta=not self._alarms_only)
-            indices = steps.alarms.tolist()
-            statistics = steps.statistic[steps.alarms].tolist()
-            yield Answers(
-                flags=steps.flags,
-                alarms=tuple(
-                    RaisedAlarm(block.first + index, self._trigger, statistic)
-                    for index, statistic in zip(indices, statistics, strict=True)
-                ),
-                theta=steps.theta,
-                innovation=steps.innovation,
-                statistic=steps.statistic,
-            )
+            yield self._answers(steps, block.first)
+
+    def play_records(self, records: Sequence[Samples]) -> Iterator[tuple[Answers, Mapping[str, int]]]:
+        u, y, valid = (np.stack([getattr(each, name) for each in records]) for name in ("u", "y", "valid"))
+        for steps, counters in self._estimator.run_records(u, y, valid, with_theta=not self._alarms_only):
+            yield self._answers(steps), counters
+
+    def _answers(self, steps: EstimatorOutput, first: int = 0) -> Answers:
+        """Answers to a block from sample ``first`` on."""
+        statistics = steps.statistic[steps.alarms].tolist()
+        return Answers(
+            flags=steps.flags,
+            alarms=tuple(
+                RaisedAlarm(first + index, self._trigger, statistic)
+                for index, statistic in zip(steps.alarms.tolist(), statistics, strict=True)
+            ),
+            theta=steps.theta,
+            innovation=steps.innovation,
+            statistic=steps.statistic,
+        )
 
     def stop(self) -> Mapping[str, int]:
         return self._estimator.counters

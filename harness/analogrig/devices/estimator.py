@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import enum
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,6 +52,8 @@ class EstimatorOutput:
         return np.frombuffer(self.status.tobytes().translate(_FLAGS), np.uint8)
 
 
+_Arrays = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_]]
+
 _NO_ALARMS = np.empty(0, np.int64)
 
 
@@ -64,11 +67,15 @@ _COUNTERS = dict.fromkeys(("updated", "missing"), ctypes.c_uint32) | dict.fromke
 """Fields of est_counters_t with their C types."""
 
 
+_COUNTERS_TYPE = np.dtype(list(_COUNTERS.items()), align=True)
+"""The C type est_counters_t."""
+
+
 class _Counters(ctypes.Structure):
     _fields_ = list(_COUNTERS.items())
 
 
-_FUNCTIONS = ("size", "init", "set", "start", "run", "run_codes", "theta_count", "counters")
+_FUNCTIONS = ("size", "init", "set", "start", "run", "run_codes", "run_records", "theta_count", "counters")
 """Functions of estimator_c/ports/library/library.h, without their prefix."""
 
 
@@ -83,7 +90,14 @@ def _load(library: Path) -> ctypes.CDLL:
         *(ctypes.c_void_p,) * 3,
         ctypes.POINTER(_Out),
     ]
-    c.library_start.restype = ctypes.c_bool
+    c.library_start.restype = c.library_run_records.restype = ctypes.c_bool
+    c.library_run_records.argtypes = [
+        ctypes.c_void_p,
+        *(ctypes.c_size_t,) * 3,
+        *(ctypes.c_void_p,) * 3,
+        ctypes.POINTER(_Out),
+        ctypes.c_void_p,
+    ]
     c.library_theta_count.restype = ctypes.c_uint8
     c.library_counters.restype = _Counters
     return c
@@ -112,7 +126,10 @@ class Estimator:
         :raises ConfigurationError: the fields of the configuration do not go together.
         """
         if not self._c.library_start(self._state):
-            raise ConfigurationError("the estimator refuses this configuration: its fields do not go together")
+            self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        raise ConfigurationError("the estimator refuses this configuration: its fields do not go together")
 
     @property
     def parameters(self) -> int:
@@ -141,11 +158,7 @@ class Estimator:
         if u.ndim != 1 or u.shape != y.shape or (mask is not None and mask.shape != u.shape):
             raise ValueError("u, y and valid must be one-dimensional and of one length")
         n = len(u)
-        theta = np.empty((n, self.parameters if with_theta else 0), np.float32)
-        innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
-        status, alarm = np.empty(n, np.uint8), np.empty(n, np.bool_)
-        arrays = (theta, innovation, statistic, status, alarm)
-        out = _Out(*(array.ctypes.data if array.size else None for array in arrays))
+        arrays, out = self._room((n,), with_theta=with_theta)
         valid_at = None if mask is None else mask.ctypes.data
         if u.dtype == y.dtype == np.uint16 and u.strides == y.strides and u.strides[0] > 0:
             where = (u.strides[0] // u.itemsize, u.ctypes.data, y.ctypes.data, valid_at)
@@ -153,7 +166,34 @@ class Estimator:
         else:
             u, y = (np.ascontiguousarray(x, dtype=np.float32) for x in (u, y))
             alarms_n = self._c.library_run(self._state, n, u.ctypes.data, y.ctypes.data, valid_at, ctypes.byref(out))
-        return EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm) if alarms_n else _NO_ALARMS)
+        return EstimatorOutput(*arrays[:-1], np.flatnonzero(arrays[-1]) if alarms_n else _NO_ALARMS)
+
+    def run_records(
+        self, u: NDArray[np.uint16], y: NDArray[np.uint16], valid: NDArray[np.bool_], *, with_theta: bool = True
+    ) -> Iterator[tuple[EstimatorOutput, Mapping[str, int]]]:
+        """Output for each of r records of n samples, with the counters of the record. It restarts before each.
+
+        :param u: (r, n) contiguous codes of force; y and valid likewise, as of ``run``.
+        """
+        arrays, out = self._room(u.shape, with_theta=with_theta)
+        counters = np.empty(len(u), _COUNTERS_TYPE)
+        codes = [array.ctypes.data for array in (u, y, valid)]
+        if not self._c.library_run_records(self._state, *u.shape, 1, *codes, ctypes.byref(out), counters.ctypes.data):
+            self._refuse()
+        for theta, innovation, statistic, status, alarm, counted in zip(*arrays, counters.tolist(), strict=True):
+            output = EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm))
+            yield output, dict(zip(_COUNTERS, counted, strict=True))
+
+    def _room(self, shape: tuple[int, ...], *, with_theta: bool) -> tuple[_Arrays, _Out]:
+        """Arrays for theta, innovation, statistic, status and alarm of samples of this shape."""
+        arrays = (
+            np.empty((*shape, self.parameters if with_theta else 0), np.float32),
+            np.empty(shape, np.float32),
+            np.empty(shape, np.float32),
+            np.empty(shape, np.uint8),
+            np.empty(shape, np.bool_),
+        )
+        return arrays, _Out(*(array.ctypes.data if array.size else None for array in arrays))
 
     def save(self) -> NDArray[np.uint8]:
         """State after the last sample, for ``branch`` of the same object; (size,)."""

@@ -371,8 +371,8 @@ class _Analysis:
     def _nominal(self) -> tuple[float, float]:
         """Mass and damping per unit of the spring, in samples."""
         sample_s = self.sample_period_s * self.time_scale
-        mass, damping, stiffness = self.plant.parameters().values()
-        return mass / stiffness / sample_s**2, damping / stiffness / sample_s
+        response = self.plant.response()
+        return 1.0 / response["s0"] / sample_s**2, response["s1"] / response["s0"] / sample_s
 
     @cached_property
     def _response(self) -> Response:
@@ -386,7 +386,7 @@ class _Analysis:
     def _gains(self) -> tuple[float, float]:
         """Deviation of the displacement's static gain, by the force as measured and as commanded."""
         unit_per_v = self.displacement.channel.unit_per_v / self.force.channel.unit_per_v
-        measured = self._response.gain.value * self.plant.parameters()["K"] * unit_per_v - 1.0
+        measured = self._response.gain.value / self.plant.response()["gain"] * unit_per_v - 1.0
         return measured, measured if self._is_clipped else (1.0 + measured) * (1.0 + self._force_gain.value) - 1.0
 
     @cached_property

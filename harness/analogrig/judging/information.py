@@ -19,7 +19,7 @@ real rig or a CAN log, use the program under the measured input if it is linear 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,35 +36,34 @@ if TYPE_CHECKING:
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
 
 
-def change_information(run: Run) -> list[NDArray[np.float64]]:
+def change_information(run: Run, model: Model | None = None) -> list[NDArray[np.float64]]:
     """I(1), I(2), ... of each change of ``run``, up to the next change or the end: float64 arrays; empty if unknown.
 
     Both courses start from the true state at the change. Samples that the device could not use carry no information.
 
+    :param model: as of ``model_of``, if known.
     :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
     """
-    model, weight = _model(run), weights(run.missing, run.conditions.output.noise_lsb)
+    model, weight = model or model_of(run), weights(run.missing, run.conditions.output.noise_lsb)
     if model is None:
         return [np.zeros(0) for _ in run.segments[1:]]
     return [information_of(model, change, weight) for change in _run_changes(run, model)]
 
 
 def is_bounded(run: Run) -> bool:
-    """True if the information in ``run`` is known: a machine played it, or its program is linear.
-
-    :raises ConfigurationError: as ``change_information``.
-    """
-    return _model(run) is not None
+    """True if the information in ``run`` is known: a machine played it, or its program is linear."""
+    return played.is_played(run) or run.conditions.program.is_linear
 
 
-def isolation_bounds(run: Run) -> list[int | None]:
+def isolation_bounds(run: Run, model: Model | None = None) -> list[int | None]:
     """Isolation bound of each change of ``run`` in samples; None: not before the next change or the end.
 
     The rival hypotheses are changes of one other parameter by any factor from 1/4 to 4.
 
+    :param model: as of ``model_of``, if known.
     :raises ConfigurationError: as ``change_information``.
     """
-    model, weight = _model(run), weights(run.missing, run.conditions.output.noise_lsb)
+    model, weight = model or model_of(run), weights(run.missing, run.conditions.output.noise_lsb)
     if model is None:
         return [None for _ in run.segments[1:]]
     return [
@@ -106,8 +105,16 @@ def predicted_bounds(
     ]
 
 
-def _model(run: Run) -> Model | None:
-    """Model of the plant in ``run``: its machine, or its program under the measured input if that is linear."""
+def models_of(runs: Sequence[Run]) -> Sequence[Model | None]:
+    """Model of each run, as of ``model_of``; machines of runs that differ in the seed alone are played together."""
+    return played.machines_of(runs) or [model_of(run) for run in runs]
+
+
+def model_of(run: Run) -> Model | None:
+    """Model of the plant in ``run``: its machine, or its program under the measured input if that is linear.
+
+    :raises ConfigurationError: as ``change_information``.
+    """
     machine = played.machine_of(run)
     if machine is None and run.conditions.program.is_linear:
         return LinearPlant.of(run)

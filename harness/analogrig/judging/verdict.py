@@ -13,8 +13,9 @@ if the hypotheses disagree, or if a change cannot be found in the samples.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -25,8 +26,8 @@ from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
-from analogrig.judging.courses import first_at_level
-from analogrig.judging.exposure import Exposure, exposure
+from analogrig.judging.courses import Model, first_at_level
+from analogrig.judging.exposure import Exposure, exposures
 from analogrig.plant import Segment, estimated_parameters
 from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
@@ -261,6 +262,8 @@ class Verdict:
     ceiling: float | None
     """Alarm threshold of the trigger's statistic; None without a trigger, or if it is not known."""
     missing_n: int
+    armed_n: int
+    """Samples in which the trigger was armed."""
     theta_hash: str
     """``Run.theta_hash``; empty if the device reports no estimate."""
     alarm_hash: str = ""
@@ -304,11 +307,38 @@ def judge(run: Run) -> Verdict:
 
     :raises ConfigurationError: the recorded scenario has an invalid expectation.
     """
-    expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
+    return judge_all([run])[0]
+
+
+def judge_all(runs: Iterable[Run]) -> list[Verdict]:
+    """Verdict on each run, as of ``judge``.
+
+    Consecutive runs that differ in seed and samples alone are judged together, in a part of the time.
+    """
+    return [verdict for _, alike in itertools.groupby(runs, _common) for verdict in _judge_alike(list(alike))]
+
+
+def _common(run: Run) -> tuple[object, ...]:
+    """Values that runs have in common which are judged together."""
+    known = run.conditions
+    return run.samples, known.segments, known.records, known.channels, known.scenario, known.dut, known.rig
+
+
+def _judge_alike(runs: Sequence[Run]) -> Iterator[Verdict]:
+    expect = config.build(Expectations, runs[0].conditions.scenario.get("expect", {}), "the recorded scenario: expect")
+    models = information.models_of(runs) if _is_exact(runs[0]) else [None] * len(runs)
+    for run, model, shown, estimates in zip(runs, models, exposures(runs), _segment_estimates(runs), strict=True):
+        yield _judge(run, model, expect, shown, estimates)
+
+
+def _judge(
+    run: Run, model: Model | None, expect: Expectations, shown: Exposure, estimates: tuple[SegmentEstimate, ...]
+) -> Verdict:
+    """Verdict on a run with this model of its plant, exposure and estimates."""
     sheet = run.datasheet
     level = sheet.log_arl0(expect.arl0)
-    results = _evaluate_hypotheses(run, expect, level)
-    invalid = invalid_reasons(run, exposure(run), expect)
+    results = _evaluate_hypotheses(run, model, expect, level)
+    invalid = invalid_reasons(run, shown, expect)
     outcome, reasons = _decide_outcome(results, expect)
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
     possible = {index for each in results for index in each.false_alarms}
@@ -321,10 +351,11 @@ def judge(run: Run) -> Verdict:
         tweaks=_merge_hypotheses(results),
         false_alarms=tuple(sorted(certain)),
         doubtful_alarms=tuple(sorted(possible - certain)),
-        estimates=_segment_estimates(run.with_change_instants(Segment.earliest)),
+        estimates=estimates,
         arl0=math.exp(min(level, LARGEST_LEVEL)),
         ceiling=sheet.ceiling,
         missing_n=int(np.count_nonzero(run.missing)),
+        armed_n=shown.armed,
         theta_hash=run.theta_hash(),
         alarm_hash=run.alarm_hash(),
         not_judged=not_judged(run),
@@ -397,8 +428,12 @@ def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArra
 
     The columns are those of ``Program.estimates``.
     """
+    return _parameters_of(run, run.theta[samples])
+
+
+def _parameters_of(run: Run, theta: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Parameters, as of ``trajectory``, of estimates (n, p) of a device as in ``run``."""
     conditions, model = run.conditions, run.datasheet.model
-    theta = run.theta[samples]
     if model is None or not theta.shape[1]:
         return np.full((len(theta), len(conditions.program.estimates)), np.nan)
     return estimated_parameters(
@@ -471,14 +506,14 @@ class _HypothesisResult:
     failures: tuple[str, ...]
 
 
-def _evaluate_hypotheses(run: Run, expect: Expectations, level: float) -> list[_HypothesisResult]:
+def _evaluate_hypotheses(run: Run, model: Model | None, expect: Expectations, level: float) -> list[_HypothesisResult]:
     """Results at the likeliest instants and, unless these are exact, at the earliest and the latest."""
     runs = [run]
-    if not all(segment.is_exact for segment in run.conditions.segments):
+    if not _is_exact(run):
         runs += [run.with_change_instants(Segment.earliest), run.with_change_instants(Segment.latest)]
     out = []
     for supposed in runs:
-        tweaks, false_alarms = _attribute_alarms(supposed, expect, level)
+        tweaks, false_alarms = _attribute_alarms(supposed, model, expect, level)
         out.append(_HypothesisResult(tweaks, false_alarms, tuple(_failure_reasons(tweaks, false_alarms, expect))))
     return out
 
@@ -522,6 +557,8 @@ def _undecided_reason(tweak: ChangeVerdict) -> str:
 def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[ChangeVerdict, ...]:
     """Verdicts at the likeliest instants, each with the differing verdicts of the other hypotheses."""
     likeliest, *others = (each.tweaks for each in results)
+    if not others:
+        return likeliest
     return tuple(
         dataclasses.replace(tweak, alternatives=tuple(each[i] for each in others if each[i] != tweak))
         for i, tweak in enumerate(likeliest)
@@ -529,7 +566,7 @@ def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[ChangeVerdi
 
 
 def _attribute_alarms(
-    run: Run, expect: Expectations, level: float
+    run: Run, model: Model | None, expect: Expectations, level: float
 ) -> tuple[tuple[ChangeVerdict, ...], tuple[int, ...]]:
     """Verdict on each change, and the samples of the false alarms."""
     alarms = run.alarm_index.tolist()
@@ -538,9 +575,10 @@ def _attribute_alarms(
     tweaks = []
     diagnosed, is_bounded = run.conditions.program.diagnosed, information.is_bounded(run)
     isolates = len(run.diagnosis_index) and diagnosed
-    isolation_bounds = information.isolation_bounds(run) if isolates else [None] * len(run.segments)
+    model = model or information.model_of(run)
+    isolation_bounds = information.isolation_bounds(run, model) if isolates else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
-        run.segments, run.segments[1:], information.change_information(run), isolation_bounds, strict=False
+        run.segments, run.segments[1:], information.change_information(run, model), isolation_bounds, strict=False
     ):
         if start in run.conditions.records:
             continue  # a device that restarts has no earlier plant to compare with
@@ -659,14 +697,26 @@ def _failure_reasons(
     return reasons
 
 
-def _segment_estimates(run: Run) -> tuple[SegmentEstimate, ...]:
-    """Last estimate of each segment whose plant is known."""
+def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]:
+    """Last estimate of each segment whose plant is known, for each run."""
+    run = runs[0] if _is_exact(runs[0]) else runs[0].with_change_instants(Segment.earliest)
     unseen = {segment.start for segment in run.conditions.segments if segment.unseen}
-    segments = [segment for segment in run.segments if segment[0] not in unseen]
-    lasts, names = trajectory(run, [end - 1 for _, end, _ in segments]), run.conditions.program.estimates
-    out = []
-    for (start, end, plant), last in zip(segments, lasts, strict=True):
-        estimate = None if np.isnan(last).any() or not names else dict(zip(names, last.tolist(), strict=True))
-        truth = plant.parameters()
-        out.append(SegmentEstimate(start, end, {name: truth[name] for name in names}, estimate))
-    return tuple(out)
+    names = run.conditions.program.estimates
+    segments = [
+        (start, end, {name: plant.parameters()[name] for name in names})
+        for start, end, plant in run.segments
+        if start not in unseen
+    ]
+    ends = [end - 1 for _, end, _ in segments]
+    lasts = _parameters_of(run, np.concatenate([each.theta[ends] for each in runs]))
+    is_known = np.asarray(~np.isnan(lasts).any(axis=1))
+    estimates = (
+        dict(zip(names, last, strict=True)) if known and names else None
+        for last, known in zip(lasts.tolist(), is_known, strict=True)
+    )
+    return [tuple(SegmentEstimate(*each, next(estimates)) for each in segments) for _ in runs]
+
+
+def _is_exact(run: Run) -> bool:
+    """True if the instants of all changes are known."""
+    return all(segment.is_exact for segment in run.conditions.segments)

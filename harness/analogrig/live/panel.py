@@ -96,7 +96,7 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "missing": session.notes.missing_n,
         "mode": session.mode,
         "lamps": list(session.lamps),
-        "values": dict(session.values),
+        "values": session.ordered_values,
         "generator": {"on": session.is_on, **_settings(session.excitation)},
         "faults": sorted(session.injected),
         "line_faults": list(line.lasting) if (line := session.device.faulty_line) is not None else [],

@@ -66,6 +66,8 @@ class Ring:
         until_wrap = min(n, RING_N - at)
         for name, value in values.items():
             column = self.columns[name]
+            if column.shape[1:] != value.shape[1:]:  # a device may take its orders from the program of the take
+                column = self.columns[name] = np.zeros((RING_N, *value.shape[1:]), column.dtype)
             column[at : at + until_wrap] = value[:until_wrap]
             column[: n - until_wrap] = value[until_wrap:]
         self._end += n

@@ -77,18 +77,27 @@ class BenchServer:
     """Server of one session for the clients of its page and for other viewers."""
 
     def __init__(
-        self, session: LiveSession, *, token: str = "", origins: Collection[str] = (), slow_s: float = SLOW_S
+        self,
+        session: LiveSession,
+        *,
+        token: str = "",
+        origins: Collection[str] = (),
+        slow_s: float = SLOW_S,
+        frame_s: float = FRAME_S,
     ) -> None:
         """Prepare the page.
 
         :param token: by default a random one.
         :param origins: origins of other pages that may use the endpoint of viewers.
+        :param slow_s: a client that takes nothing for so long is dropped.
+        :param frame_s: least time between two frames.
         :raises RecordingError: uPlot is not installed by the build.
         """
         self.session = session
         self.token = token or secrets.token_urlsafe(16)
         self._origins = frozenset(origins)
         self._slow_s = slow_s
+        self._frame_s = frame_s
         self._clients: list[_PageClient] = []
         self._viewers = 0
         self._driver: _PageClient | None = None
@@ -245,7 +254,7 @@ class BenchServer:
             await self._send(client, json.dumps({"bench": bench_table(self.session)}))
             told_s, version = 0.0, -1
             while True:
-                due_s = time.monotonic() + FRAME_S
+                due_s = time.monotonic() + self._frame_s
                 frame = client.screen.frame(self.session)
                 if frame is not None:
                     await self._send(client, frame)

@@ -259,6 +259,13 @@ class LiveSession:
             self._note_fault(fault)
 
     @property
+    def ordered_values(self) -> dict[str, float]:
+        """Values that the pots have, or get before the next block."""
+        with self._lock:
+            waiting = [command for command, _ in self._waiting if isinstance(command, commands.Turn)]
+        return {**self.values, **self._turns, **{turn.name: turn.value for turn in waiting}}
+
+    @property
     def line_faults(self) -> tuple[str, ...]:
         """Kinds of faults that the line of the device can have."""
         return () if self.device.faulty_line is None else self.device.faulty_line.KINDS

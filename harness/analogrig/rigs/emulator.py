@@ -40,6 +40,7 @@ from analogrig_emulator import (
     Pot,
     PotTurn,
     ProgramCircuit,
+    RepeatedCourses,
     RepeatedPlay,
     Resistor,
     Sampler,
@@ -324,6 +325,7 @@ class EmulatorRig(Rig):
         )  # refused here, and not when it is first played
         self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._last_prepared: _Prepared | None = None
+        self._cards: dict[tuple[str, ...], Card] = {}
         self._table = dataclasses.asdict(description)  # to write it takes as long as to play a thousand samples
         self._block_samples = block_samples
 
@@ -339,7 +341,9 @@ class EmulatorRig(Rig):
 
     def card(self, program: Program) -> Card:
         """Card with the channels of a program."""
-        return self._description.card.card(program.channels)
+        if program.channels not in self._cards:
+            self._cards[program.channels] = self._description.card.card(program.channels)
+        return self._cards[program.channels]
 
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:
         """Machine as the scenario starts it, with the excitation and the changes to play on it.
@@ -375,11 +379,33 @@ class EmulatorRig(Rig):
         excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         return Courses(wired, card, excitation, samples, OUTPUT)
 
+    def courses_together(self, scenario: Scenario, seeds: Sequence[int], samples: int) -> RepeatedCourses | None:
+        """Courses without ramps of the machines of several plays; None where these differ in more than offsets.
+
+        :raises EmulatorError: as ``courses``.
+        """
+        program, card = scenario.program, self.card(scenario.program)
+        if not self._draws_offsets_and_phase_alone(scenario):
+            return None
+        machine = _drawn_machine(self._description.computer, program.circuit, seeds[0], card.true_rate_hz)
+        if not is_repeatable(machine, ()):
+            return None
+        wired = Wired(machine, _nominal(program) if self._description.computer.pots == "dial" else machine)
+        phases, offsets_v = self._drawn(scenario, seeds, machine)
+        return RepeatedCourses(wired, scenario.excitation, phases, offsets_v, samples, OUTPUT)
+
+    def _drawn(
+        self, scenario: Scenario, seeds: Sequence[int], computer: SuspensionComputer
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Phases (seeds,) and offsets of the amplifiers (seeds, amplifiers) in volts."""
+        count, offset_v = computer.program.amplifiers, self._description.computer.offset_v
+        generators = (Stream.COMPONENTS.generator(seed) for seed in seeds)
+        offsets_v = np.stack([drawn_offsets_v(self._amplifier, count, rng, offset_v) for rng in generators])
+        return np.array([scenario.draw_phase(Stream.EXCITATION.generator(seed)) for seed in seeds]), offsets_v
+
     def perform(self, scenario: Scenario, seed: int) -> Performance:
-        if scenario.samples <= self._block_samples:
-            prepared = self._prepare(scenario, seed)
-            if prepared.play is not None:
-                return self._repeat(prepared, prepared.play, scenario, seed)
+        if repeated := self._repeat(scenario, [seed]):
+            return repeated[0]
         computer, excitation, changes = self.set_up(scenario, seed)
         card = self.card(scenario.program)
         with emulator_errors(f"scenario {scenario.name}: "):
@@ -403,6 +429,9 @@ class EmulatorRig(Rig):
                 scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(card))
             ),
         )
+
+    def perform_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
+        return self._repeat(scenario, seeds) or super().perform_all(scenario, seeds)
 
     def perform_in_steps(
         self,
@@ -442,39 +471,58 @@ class EmulatorRig(Rig):
             card = self.card(scenario.program)
             with emulator_errors(f"scenario {scenario.name}: "):
                 excitation.check_rate(computer.sample_rate_hz)
-                able = self._draws_offsets_alone(card) and is_repeatable(computer, changes)
-                able &= not excitation.is_smooth
+                able = self._draws_offsets_and_phase_alone(scenario) and is_repeatable(computer, changes)
                 play = RepeatedPlay(computer, scenario.samples, changes) if able else None
             channels = _channels(card, computer, scenario.program)
             self._last_prepared = _Prepared(key, computer, card, play, channels, scenario.segments())
         return self._last_prepared
 
-    def _draws_offsets_alone(self, card: Card) -> bool:
-        drawn = self._description.computer
+    def _draws_offsets_and_phase_alone(self, scenario: Scenario) -> bool:
+        """True if plays of the scenario differ in the amplifiers' offsets and the phase of their edges alone."""
+        card, drawn = self.card(scenario.program), self._description.computer
         is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm
         is_nominal &= not drawn.noise and not drawn.supply_hum_v
         is_nominal &= drawn.specimen is None and drawn.values is None
         is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
-        return is_nominal and is_on_time
+        return is_nominal and is_on_time and not scenario.excitation.is_smooth
 
-    def _repeat(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
-        count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
-        offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
-        excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
-        lit: dict[str, int] = {}
+    def _repeat(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
+        """Performances whose blocks are computed together with the first one; none if there is no repeated play."""
+        if scenario.samples > self._block_samples:
+            return []
+        prepared = self._prepare(scenario, seeds[0])
+        if (play := prepared.play) is None:
+            return []
+        taken: list[tuple[Block, Mapping[str, int]]] = []
 
-        def volts() -> Iterator[NDArray[np.float64]]:
-            repeat = play.play(excitation, offsets_v)
-            lit.update(_lit_lamps(repeat.lamps, 1))
-            yield repeat.volts
+        def blocks(i: int) -> Iterator[Block]:
+            if not taken:
+                taken.extend(self._repeated_blocks(prepared, play, scenario, seeds))
+            yield taken[i][0]
 
-        return Performance(
-            sample_period_s=1.0 / prepared.card.rate_hz,
-            time_scale=prepared.computer.scales.time,
-            channels=prepared.channels,
-            blocks=_sample(volts(), Sampler(prepared.card, Stream.CARD.generator(seed))),
-            hindsight=lambda: Hindsight(prepared.segments, lit),
-        )
+        def hindsight(i: int) -> Hindsight:
+            return Hindsight(prepared.segments, taken[i][1] if taken else {})
+
+        return [
+            Performance(
+                sample_period_s=1.0 / prepared.card.rate_hz,
+                time_scale=prepared.computer.scales.time,
+                channels=prepared.channels,
+                blocks=blocks(i),
+                hindsight=functools.partial(hindsight, i),
+            )
+            for i in range(len(seeds))
+        ]
+
+    def _repeated_blocks(
+        self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seeds: Sequence[int]
+    ) -> Iterator[tuple[Block, Mapping[str, int]]]:
+        """Samples and lit lamps of each seed."""
+        phases, offsets_v = self._drawn(scenario, seeds, prepared.computer)
+        with emulator_errors(as_error=RigError):
+            for seed, (volts, lamps) in zip(seeds, play.play_all(scenario.excitation, phases, offsets_v), strict=True):
+                codes, clipped = Sampler(prepared.card, Stream.CARD.generator(seed)).sample(volts)
+                yield Block(0, volts, codes, clipped), _lit_lamps(lamps, 1)
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         card = self.card(scenario.program)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from analogrig.program import Program
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
 from analogrig.scenario import DEFAULT_PROGRAM, Expectations, PotChange, Scenario
 from analogrig.testing import profiles
-from analogrig_emulator import Excitation
+from analogrig_emulator import Excitation, ProgramParameter
 
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}
 DAMPING_RATIO = (0.4, 1.2)
@@ -90,6 +90,24 @@ def suspensions() -> st.SearchStrategy[Plant]:
     return st.builds(_suspension, mass, stiffness, _usually(None, _number(*DAMPING_RATIO, 2)))
 
 
+def plants(program: Program) -> st.SearchStrategy[Plant]:
+    """Plants of a program with each parameter anywhere in its range; the usual ones are the program's own values."""
+    drawn = {
+        name: _usually(row.value, st.floats(row.low, row.high).map(_round).filter(_within(row)))
+        for name, row in _ranged(program).items()
+    }
+    return st.fixed_dictionaries(drawn).map(lambda values: Plant.of(program, values))
+
+
+def _ranged(program: Program) -> dict[str, ProgramParameter]:
+    """Parameters whose pots have a range."""
+    return {name: row for name, row in program.parameters.items() if row.low < row.high}
+
+
+def _within(row: ProgramParameter) -> Callable[[float], bool]:
+    return lambda value: row.low <= value <= row.high
+
+
 def random_suspensions(count: int, seed: int) -> list[Plant]:
     """Random suspensions, drawn evenly: for statistics over plants, where hypothesis would look for the extreme."""
     rng = np.random.default_rng(seed)
@@ -116,6 +134,9 @@ def _round(value: float) -> float:
 
 
 def _within_reach(plant: Plant) -> bool:
+    if plant.program != _front().program:
+        values = plant.parameters()
+        return all(_within(row)(values[name]) for name, row in _ranged(plant.program).items())
     ratio = _damping_ratio(plant)
     values = plant.parameters()
     return DAMPING_RATIO[0] <= ratio <= DAMPING_RATIO[1] and all(
@@ -133,7 +154,7 @@ def changes(
     draw: st.DrawFn,
     plant: Plant | None = None,
     *,
-    parameters: Sequence[str] = ("K", "B", "M"),
+    parameters: Sequence[str] = (),
     sizes: tuple[float, float] = (0.1, 0.3),
     at: st.SearchStrategy[int] | None = None,
     together: int = 1,
@@ -141,15 +162,17 @@ def changes(
 ) -> PotChange:
     """Changes of the pots during a play.
 
-    :param plant: the plant that changes; None: the front suspension.
+    :param plant: the plant that changes, within the ranges of its program; None: the front suspension.
+    :param parameters: names of those that may change; none: K, B and M of the front suspension, or all with a range.
     :param sizes: the least and the largest relative change, up or down as the pots allow.
     :param at: the sample; None: the first after the warm-up.
     :param together: so many parameters may change at once.
     :param longest_ramp_n: 0: only jumps.
     """
     changed = plant or _front()
+    usual = ("K", "B", "M") if changed.program == _front().program else tuple(_ranged(changed.program))
     count = draw(st.integers(1, together))
-    names = draw(st.lists(st.sampled_from(parameters), min_size=count, max_size=count, unique=True))
+    names = draw(st.lists(st.sampled_from(tuple(parameters) or usual), min_size=count, max_size=count, unique=True))
     for name in names:
         size = draw(_number(sizes[0], sizes[1], 2))
         ways = [changed.scaled(name, factor) for factor in (1.0 - size, 1.0 + size)]
@@ -289,13 +312,17 @@ def scenarios(
     longest_ramp_n: int = 0,
     free: bool = False,
     expect: Expectations | None = None,
+    program: Program | None = None,
 ) -> Scenario:
-    """Scenarios: a suspension, an excitation, and changes with time to learn in between.
+    """Scenarios: a plant, an excitation, and changes with time to learn in between.
 
-    Whether they can be seen is for ``detectable`` to say.
+    ``detectable`` selects the changes that can be seen.
+
+    :param program: program of the plant, excited by the square wave of its trial play; None: the front suspension,
+        with any of ``excitations``.
     """
-    plant = draw(suspensions())
-    excitation = draw(excitations(free=free))
+    plant = draw(suspensions() if program is None else plants(program))
+    excitation = draw(excitations(free=free)) if program is None else Scenario.of_program(program).excitation
     tweaks: list[PotChange] = []
     sample, now, passed = WARM_UP_N, plant, [plant]
     for _ in range(draw(st.integers(min(1, most_changes), most_changes))):
@@ -307,7 +334,7 @@ def scenarios(
         sample += tweak.ramp_n + SETTLING_N
     return Scenario(
         samples=sample if tweaks else QUIET_N,
-        excitation=_within_range(excitation, passed),
+        excitation=_within_range(excitation, passed) if program is None else excitation,
         program=plant.program,
         set=plant.overrides,
         tweaks=tuple(tweaks),

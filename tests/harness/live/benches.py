@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import signal
+import subprocess
+import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+from analogrig.cli.bench import NO_FAULTS, REPORT_INTERVAL_N
 from analogrig.devices.device import Device
+from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.live.commands import Command
 from analogrig.live.server import BenchServer
@@ -20,6 +28,11 @@ from analogrig.scenario import Scenario
 SEED = 7
 
 Action = Command | Callable[[LiveSession], None]
+
+
+def linked() -> Device:
+    """Device behind a line into which a hand can inject faults, as the command opens it."""
+    return open_dut("inproc", exchange="block", report_interval_n=REPORT_INTERVAL_N, wire_faults=NO_FAULTS)
 
 
 class ScriptedClock:
@@ -70,13 +83,24 @@ def scripted_session(
 
 
 class LiveBench:
-    """Bench that is served from a thread of its own, in real time: what ``analogrig bench`` does, without a process."""
+    """Bench that is served from a thread of its own, in real time: what ``analogrig bench`` does, without a process.
+
+    It sends few frames a second, since drawing them is most of the work of a test in a browser.
+    """
 
     def __init__(
-        self, folder: Path, *, token: str = "", port: int = 0, dut: str = "inproc", slow_s: float = 10.0
+        self,
+        folder: Path,
+        *,
+        token: str = "",
+        port: int = 0,
+        device: Callable[[], Device] = lambda: describe("inproc").direct(),
+        scenario: str | Scenario = "thesis",
+        slow_s: float = 10.0,
     ) -> None:
-        self._folder, self._dut = folder, dut
-        self._settings: dict[str, Any] = {"token": token, "slow_s": slow_s}
+        self._folder, self._device = folder, device
+        self._scenario = Scenario.load(scenario) if isinstance(scenario, str) else scenario
+        self._settings: dict[str, Any] = {"token": token, "slow_s": slow_s, "frame_s": 0.1}
         self._port = port
         self._ready: Future[BenchServer] = Future()
         self._stop: asyncio.Event | None = None
@@ -95,8 +119,8 @@ class LiveBench:
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        with open_rig("emulator") as rig, describe(self._dut).direct() as device:
-            session = LiveSession(rig, Scenario.load("thesis"), device, SEED, folder=self._folder)
+        with open_rig("emulator") as rig, self._device() as device:
+            session = LiveSession(rig, self._scenario, device, SEED, folder=self._folder)
             playing = asyncio.create_task(asyncio.to_thread(session.run))
             try:
                 server = BenchServer(session, **self._settings)
@@ -110,3 +134,18 @@ class LiveBench:
             finally:
                 session.close()
                 await playing
+
+
+@contextmanager
+def benched(*options: str, folder: Path) -> Iterator[Any]:
+    """Address and token of a running command; it is ended by SIGTERM."""
+    command = [sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--json", "--out", str(folder), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            address = json.loads(process.stdout.readline())["address"]
+            yield SimpleNamespace(address=address, token=address.rpartition("=")[2])
+        finally:
+            process.send_signal(signal.SIGTERM)
+            errors = process.communicate()[1]
+    assert (process.returncode, errors) == (130, "analogrig: interrupted\n")

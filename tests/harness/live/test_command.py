@@ -2,42 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from analogrig import cli
 from analogrig.live.commands import SetRecording
 from analogrig.run import Run
-from tests.harness.live.benches import scripted_session
+from tests.harness.live.benches import benched, scripted_session
 from tests.harness.live.test_server import Client, open_client, played
 from tests.served.serving import serving
 
 SHOWN = 12
 """Alarms of a state: later ones displace that of the change."""
-
-
-@contextmanager
-def benched(*options: str, folder: Path) -> Iterator[Any]:
-    """Address and token of a running command; it is ended by SIGTERM."""
-    command = [sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--json", "--out", str(folder), *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            address = json.loads(process.stdout.readline())["address"]
-            yield SimpleNamespace(address=address, token=address.rpartition("=")[2])
-        finally:
-            process.send_signal(signal.SIGTERM)
-            errors = process.communicate()[1]
-    assert (process.returncode, errors) == (130, "analogrig: interrupted\n")
 
 
 @pytest.mark.parametrize("dut", ["host", "mean-between-faults"])

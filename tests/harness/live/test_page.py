@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
@@ -12,13 +13,18 @@ from playwright.sync_api import Browser, Page, expect
 from analogrig import cli
 from analogrig.live.commands import Restart, SetPlaying, Step
 from analogrig.live.server import BenchServer
+from analogrig.program import Program
 from analogrig.run import Run
+from analogrig.scenario import Scenario
+from tests import tools
 from tests.browser import Watched
-from tests.harness.live.benches import LiveBench
+from tests.harness.live.benches import LiveBench, benched, linked
+from tests.served.serving import serving
 
 expect.set_options(timeout=600_000)
 
 TOKEN = "again"  # noqa: S105 - of a server that lives for one test
+PROGRAMS = tools.ROOT / "fixtures" / "programs"
 K = '[data-parameter="K"]'
 
 
@@ -35,7 +41,8 @@ def opened(browser: Browser, bench: BenchServer) -> Iterator[Watched]:
     watched.page.close()
 
 
-def opened_at(browser: Browser, bench: BenchServer) -> Watched:
+def opened_at(browser: Browser, bench: Any) -> Watched:
+    """Page of anything with an address."""
     watched = Watched(browser, bench.address)
     watched.page.set_default_timeout(600_000)
     watched.page.wait_for_selector("html[data-connected][data-role]")
@@ -46,17 +53,25 @@ def wait_for_frames(page: Page, count: int) -> None:
     page.wait_for_function("(count) => Number(document.documentElement.dataset.frames ?? 0) >= count", arg=count)
 
 
+def drag_by_touch(page: Page, x: float, start_y: float, end_y: float) -> None:
+    session = page.context.new_cdp_session(page)
+    for kind, y in (("touchStart", start_y), ("touchMove", end_y - 1.0), ("touchMove", end_y), ("touchEnd", None)):
+        points = [] if y is None else [{"x": x, "y": y}]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
 def frames_of(page: Page) -> int:
     return int(page.evaluate("Number(document.documentElement.dataset.frames ?? 0)"))
 
 
-def test_scope_moves_without_a_complaint_or_a_request_elsewhere(opened: Watched, bench: BenchServer) -> None:
+def test_scope_moves_without_a_fault_or_a_request_elsewhere(opened: Watched, bench: BenchServer) -> None:
+    """Light and dark, wide and narrow, by axe-core."""
     wait_for_frames(opened.page, frames_of(opened.page) + 5)
     assert min(opened.pixels((0, 114, 178))) > 100
     expect(opened.page.locator("#triggered")).to_have_text("triggered")
     expect(opened.page.locator('tr[data-signal="force"]')).to_contain_text("200 Hz")
-    assert opened.complaints == []
     assert opened.requests == [bench.address]
+    assert opened.faults() == []
 
 
 def test_pot_turned_by_the_keyboard_raises_an_alarm_within_twice_its_bound(opened: Watched, bench: BenchServer) -> None:
@@ -115,6 +130,9 @@ def test_pots_turn_by_wheel_drag_and_number(opened: Watched, bench: BenchServer)
     page.mouse.move(box["x"] + 40, box["y"] + 60, steps=4)
     page.mouse.up()
     expect(knob).to_have_attribute("aria-valuetext", re.compile("^K 18"))
+    before = values["K"]
+    drag_by_touch(page, box["x"] + 40, box["y"] + 40, box["y"] + 60)
+    page.wait_for_function("(most) => document.querySelector('[data-parameter=K]').ariaValueNow < most", arg=before)
     page.wait_for_function("() => document.querySelector('#felt').textContent !== '–'")
     assert values["K"] < 19802
     page.locator(".knob").filter(has=knob).locator("input").fill("1e9")
@@ -193,6 +211,43 @@ def test_page_connects_again_when_the_server_has_been_restarted(browser: Browser
         page.close()
 
 
-def test_page_has_no_faults_light_and_dark_wide_and_narrow(opened: Watched) -> None:
-    wait_for_frames(opened.page, 2)
-    assert opened.faults() == []
+def test_page_drives_a_served_instrument_in_another_process(browser: Browser, tmp_path: Path) -> None:
+    with serving() as served:
+        rig = f"{served.rigs_file(tmp_path)}:bench"
+        with benched("--rig", rig, "--allow", served.address, folder=tmp_path / "out") as bench:
+            watched = opened_at(browser, bench)
+            page = watched.page
+            page.get_by_role("button", name="Switch on").click()
+            wait_for_frames(page, 1)
+            page.locator(K).press("PageDown")
+            expect(page.locator("#alarms")).to_contain_text("K")
+            assert watched.complaints == []
+            page.close()
+
+
+def test_cut_line_is_reported_and_mended(browser: Browser, tmp_path: Path) -> None:
+    with LiveBench(tmp_path, device=linked) as server:
+        watched = opened_at(browser, server)
+        page = watched.page
+        page.locator("#line-fault").select_option("disconnect")
+        page.get_by_role("button", name="Inject into the next frame").click()
+        expect(page.locator("#notice")).to_contain_text("the line is cut")
+        expect(page.locator("#line-faults")).to_have_text("in force: disconnect")
+        page.get_by_role("button", name="Mend the line").click()
+        expect(page.locator("#line-faults")).to_be_empty()
+        page.get_by_role("button", name="Run", exact=True).click()
+        expect(page.locator("#clock")).to_contain_text("take 2, ")
+        expect(page.locator("#frames")).not_to_have_text("–")
+        assert watched.complaints == []
+        page.close()
+
+
+def test_every_shipped_program_opens_without_a_complaint(browser: Browser, tmp_path: Path) -> None:
+    for path in sorted(PROGRAMS.glob("*.toml")):
+        scenario = Scenario.of_program(Program.load(path.stem))
+        with LiveBench(tmp_path, scenario=scenario) as server:
+            watched = opened_at(browser, server)
+            wait_for_frames(watched.page, 2)
+            assert watched.page.get_by_role("slider").count() >= len(server.session.knobs) > 0
+            assert watched.complaints == []
+            watched.page.close()

@@ -13,7 +13,6 @@ import pytest
 from analogrig import cli
 from analogrig.catalogue import BLOCK_SAMPLES
 from analogrig.cli.bench import NO_FAULTS
-from analogrig.devices.device import Device
 from analogrig.devices.opening import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge
@@ -44,7 +43,7 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import SuspensionComputer
-from tests.harness.live.benches import SEED, scripted_session
+from tests.harness.live.benches import SEED, linked, scripted_session
 
 RATE_HZ = 20_000
 BLOCK_N = int(RATE_HZ * BLOCK_S)
@@ -281,11 +280,6 @@ def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> No
     session = scripted_session(script, tmp_path, dut=open_dut("inproc"))
     assert not session.notices
     assert session.ring.end > 0.1 * RATE_HZ
-
-
-def linked() -> Device:
-    """Device behind a line into which a hand can inject faults."""
-    return open_dut("inproc", exchange="block", wire_faults=NO_FAULTS)
 
 
 def test_frame_lost_by_hand_is_counted_and_recorded(tmp_path: Path) -> None:

@@ -49,6 +49,7 @@
 
   function send(name, table = {}) {
     if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ do: name, id: ++number, ...table }));
+    return number;
   }
 
   function told(message) {
@@ -61,11 +62,10 @@
     } else if (message.state) {
       state = message.state;
       show();
-    } else if (message.error) {
-      complain(message.error);
-      if (state) show();
     } else {
-      complain("");
+      for (const knob of knobs.values()) knob.answered(message.re);
+      complain(message.error ?? "");
+      if (message.error && state) show();
     }
   }
 
@@ -280,7 +280,7 @@
       this.knob = knob;
       this.value = knob.low;
       this.held = false;
-      this.due = 0;
+      this.awaited = 0; // number of the last turn, until it is answered: earlier states hold older values
       const { name, unit, pots } = knob;
       this.element = document.createElement("div");
       this.element.className = "knob";
@@ -329,7 +329,11 @@
       const within = Math.min(Math.max(value, low), high);
       this.input.blur();
       this.show(within);
-      send("turn", { name, value: within, ramp_n: ramp });
+      this.awaited = send("turn", { name, value: within, ramp_n: ramp });
+    }
+
+    answered(turn) {
+      if (turn === this.awaited) this.awaited = 0;
     }
 
     key(event) {
@@ -452,7 +456,7 @@
     for (const [name, knob] of knobs) {
       knob.input.disabled = !drives;
       knob.slider.setAttribute("aria-disabled", String(!drives));
-      if (!knob.held && state.values[name] !== undefined) knob.show(state.values[name]);
+      if (!knob.held && !knob.awaited && state.values[name] !== undefined) knob.show(state.values[name]);
     }
     for (const each of settings) {
       const value = state.generator[each.dataset.key];
