@@ -197,7 +197,7 @@ def alarms_behind_an_inflated_scale(
     assert estimator.init(**settings)
     assert not len(estimator.run(u[:900], y[:900]).alarms)
     estimator.inflate(INFLATION)
-    return (estimator.run(u[900:], y[900:]).alarms + 900).tolist()
+    return [900 + int(alarm) for alarm in estimator.run(u[900:], y[900:]).alarms]
 
 
 @pytest.mark.parametrize("edge_instants", [LOCKED, MAY_SLIP])
