@@ -224,6 +224,25 @@ def test_noise_behind_an_inflated_scale_raises_no_alarm(estimator: Estimator) ->
         assert alarms_behind_an_inflated_scale(estimator, 2500, seed) == []
 
 
+@pytest.mark.parametrize(
+    ("edges", "trial_n"),
+    [([], 120), ([1030.0], 56), ([1080.0], 80)],
+    ids=["no edge", "edge within 56", "edge after 80"],
+)
+def test_alarm_is_on_trial_until_an_edge_but_not_for_ever(
+    estimator: Estimator, edges: list[float], trial_n: int
+) -> None:
+    """The noise variance is followed again a block of 32 equations after the trial."""
+    u, y = suspension([(0, FRONT)], np.append(np.arange(10.0, 960.0, 50.0), edges), 1200, 1.0, 0)
+    y[1000] += 100.0
+    assert estimator.init(edge_instants=LOCKED)
+    before = estimator.run(u[:1001], y[:1001])
+    assert before.alarms.tolist() == [1000]
+    followed = [estimator.run(u[k : k + 1], y[k : k + 1]).noise_variance for k in range(1001, 1200)]
+    frozen_n = int(np.argmax(np.array(followed) != before.noise_variance))
+    assert trial_n + 32 <= frozen_n <= trial_n + 40
+
+
 @pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
 @pytest.mark.parametrize("seed", range(5))
 def test_edges_that_cross_a_sampling_instant_raise_no_alarm(estimator: Estimator, slip: int, seed: int) -> None:
