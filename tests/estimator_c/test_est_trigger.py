@@ -400,8 +400,9 @@ def test_edges_that_are_never_where_the_last_one_was_are_edges_anywhere(
     """With MAY_SLIP: the innovations after several edges show it."""
     u, y = suspension([(0, FRONT)], np.arange(10.3, 4000.0, 33.37), 4000, 1.0, 1)
     assert estimator.init(noise_estimated=noise_estimated)
-    alarms = estimator.run(u, y).alarms
-    assert (alarms < 1000).all()
+    result = estimator.run(u, y)
+    assert (result.alarms < 1000).all()
+    assert (result.noise_variance != estimator.default()["noise_variance"]) == bool(noise_estimated)
 
 
 def test_missing_samples_do_not_move_the_statistic(estimator: Estimator) -> None:
