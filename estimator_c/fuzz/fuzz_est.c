@@ -96,6 +96,10 @@ static void expect(const bool holds) {
 
 static bool number_is_finite(const float x) { return (x - x) == 0.0F; }
 
+/// Largest distance of an onset from the last alarm: the earliest onset that is tried, and the samples in which further
+/// alarms belong to the same diagnosis.
+#define ONSET_MAX_N (20U + 99U)
+
 /// Enter a step into the isolation, and call est_isolation_work() this many times, whatever it returns.
 static void isolate(est_isolation_t* const isolation,
                     const est_t* const     estimator,
@@ -109,7 +113,7 @@ static void isolate(est_isolation_t* const isolation,
     const est_diagnosis_t diagnosis = est_isolation_diagnosis(isolation);
     expect(number_is_finite(diagnosis.extent) && (diagnosis.change <= EST_CHANGE_DISPLACEMENT_NOISE));
     expect((diagnosis.onset_low_n <= diagnosis.onset_n) && (diagnosis.onset_n <= diagnosis.onset_high_n));
-    expect(diagnosis.onset_high_n < EST_ISOLATION_KEPT_N);
+    expect(diagnosis.onset_high_n <= ONSET_MAX_N);
 }
 
 /// Enter a step into the watch of the fit.

@@ -197,8 +197,7 @@ def alarms_behind_an_inflated_scale(
     assert estimator.init(**settings)
     assert not len(estimator.run(u[:900], y[:900]).alarms)
     estimator.inflate(INFLATION)
-    alarms: list[int] = (estimator.run(u[900:], y[900:]).alarms + 900).tolist()
-    return alarms
+    return [900 + int(alarm) for alarm in estimator.run(u[900:], y[900:]).alarms]
 
 
 @pytest.mark.parametrize("edge_instants", [LOCKED, MAY_SLIP])
@@ -223,6 +222,25 @@ def test_blocks_raise_no_alarm_where_nothing_can_be_hidden(estimator: Estimator,
 def test_noise_behind_an_inflated_scale_raises_no_alarm(estimator: Estimator) -> None:
     for seed in range(10):
         assert alarms_behind_an_inflated_scale(estimator, 2500, seed) == []
+
+
+@pytest.mark.parametrize(
+    ("edges", "trial_n"),
+    [([], 120), ([1030.0], 56), ([1080.0], 80)],
+    ids=["no edge", "edge within 56", "edge after 80"],
+)
+def test_alarm_is_on_trial_until_an_edge_but_not_for_ever(
+    estimator: Estimator, edges: list[float], trial_n: int
+) -> None:
+    """The noise variance is followed again a block of 32 equations after the trial."""
+    u, y = suspension([(0, FRONT)], np.append(np.arange(10.0, 960.0, 50.0), edges), 1200, 1.0, 0)
+    y[1000] += 100.0
+    assert estimator.init(edge_instants=LOCKED)
+    before = estimator.run(u[:1001], y[:1001])
+    assert before.alarms.tolist() == [1000]
+    followed = [estimator.run(u[k : k + 1], y[k : k + 1]).noise_variance for k in range(1001, 1200)]
+    frozen_n = int(np.argmax(np.array(followed) != before.noise_variance))
+    assert trial_n + 32 <= frozen_n <= trial_n + 40
 
 
 @pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
@@ -382,8 +400,9 @@ def test_edges_that_are_never_where_the_last_one_was_are_edges_anywhere(
     """With MAY_SLIP: the innovations after several edges show it."""
     u, y = suspension([(0, FRONT)], np.arange(10.3, 4000.0, 33.37), 4000, 1.0, 1)
     assert estimator.init(noise_estimated=noise_estimated)
-    alarms = estimator.run(u, y).alarms
-    assert (alarms < 1000).all()
+    result = estimator.run(u, y)
+    assert (result.alarms < 1000).all()
+    assert (result.noise_variance != estimator.default()["noise_variance"]) == bool(noise_estimated)
 
 
 def test_missing_samples_do_not_move_the_statistic(estimator: Estimator) -> None:
