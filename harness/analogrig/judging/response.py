@@ -6,6 +6,7 @@ of the circuit includes its real components. A run of a rig without a machine is
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,12 +52,17 @@ def step_responses(run: Run) -> tuple[StepResponse, ...]:
         return ()
     unseen = {segment.start for segment in conditions.segments if segment.unseen}
     machine, out = played.machine_of(run), []
+
+    @functools.lru_cache(maxsize=8)  # of 320 kB each
+    def true_step(plant: Plant, samples: int) -> NDArray[np.float64]:
+        mode = _of_program(run, plant) if machine is None else machine.linear_mode(plant.parameters())
+        return _step(mode, conditions.sample_period_s / _STEPS, (samples + _LATEST_N) * _STEPS)
+
     for start, end, plant in run.segments:
         if start in unseen:
             continue
-        mode = _of_program(run, plant) if machine is None else machine.linear_mode(plant.parameters())
         samples = _length(run, plant)
-        truth = _step(mode, conditions.sample_period_s / _STEPS, (samples + _LATEST_N) * _STEPS)
+        truth = true_step(plant, samples)
         found = _estimated_step(run.theta[end - 1], model, samples) * conditions.output.lsb_v / conditions.input.lsb_v
         late = [truth[first : first + samples * _STEPS : _STEPS] for first in range(_LATEST_N * _STEPS)]
         error = min(float(np.abs(found - each).max()) for each in late) / abs(truth[-1])
