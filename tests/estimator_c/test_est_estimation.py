@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import lfilter
 
 from analogrig.estimator_config import EstimatorConfig
-from tests.estimator_c.est_driver import GATHERING, MISSING, NONE, REFUSED, UPDATED, Estimator
+from tests.estimator_c.est_driver import CUSUM, GATHERING, LOCKED, MISSING, NONE, REFUSED, UPDATED, Estimator
 
 # y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1): the example of thesis section 3.5.
 A, B = [1.0, 0.5, 0.8], [0.0, -0.9]
@@ -99,7 +99,8 @@ def test_offset_and_its_variance_are_those_at_codes_of_zero(estimator: Estimator
     """With c(k) relative to the first codes: offset = relative offset + y(0) (1 + a1 + a2) - u(0) (b0 + b1)."""
     data = record(noise=3.0)
     u_0, y_0 = 500.0, 300.0
-    assert estimator.init(**SETTINGS, c=(0.0, 0.0), forgetting=1.0)
+    settings = SETTINGS | {"kind": CUSUM, "ceiling": 1e9, "edge_instants": LOCKED}
+    assert estimator.init(**settings, c=(0.0, 0.0), forgetting=1.0)
     result = estimator.run(data.u - data.u[0] + u_0, data.y - data.y[0] + y_0)
     u, y = data.u - data.u[0], data.y - data.y[0]
     phi = np.column_stack([-delayed(y, 1), -delayed(y, 2), u, delayed(u, 1), np.ones(len(u))])[2:]
