@@ -60,9 +60,9 @@ SIZES = [f"M4F, code of the core at -Os, {what}" for what in ("everything", "tri
 LIMITED = [*STEPS, *(f"{name}, worst" for name in STEPS), *SIZES]
 
 BEYOND = {
-    "M4F, n = 4, edges locked, worst": 469,
-    "M4F, n = 6, edges may slip, worst": 808,
-    "M4F, n = 6, edges may slip, fixed, worst": 740,
+    "M4F, n = 4, edges locked, worst": 470,
+    "M4F, n = 6, edges may slip, worst": 809,
+    "M4F, n = 6, edges may slip, fixed, worst": 741,
     "M3, n = 4, edges locked, worst": 8415,
     "M4F, code of the core at -Os, everything": 6024,
     "M4F, code of the core at -Os, trigger alone": 1550,

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import lfilter
 
 from analogrig.estimator_config import EstimatorConfig
-from tests.estimator_c.est_driver import GATHERING, MISSING, NONE, REFUSED, UPDATED, Estimator
+from tests.estimator_c.est_driver import CUSUM, GATHERING, LOCKED, MISSING, NONE, REFUSED, UPDATED, Estimator
 
 # y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1): the example of thesis section 3.5.
 A, B = [1.0, 0.5, 0.8], [0.0, -0.9]
@@ -95,17 +95,20 @@ def test_variance_is_that_of_least_squares(estimator: Estimator, forgetting: flo
     assert variance == pytest.approx(np.diag(covariance), rel=1e-2)
 
 
-def test_variance_of_the_offset_is_that_at_codes_of_zero(estimator: Estimator) -> None:
+def test_offset_and_its_variance_are_those_at_codes_of_zero(estimator: Estimator) -> None:
     """With c(k) relative to the first codes: offset = relative offset + y(0) (1 + a1 + a2) - u(0) (b0 + b1)."""
     data = record(noise=3.0)
     u_0, y_0 = 500.0, 300.0
-    assert estimator.init(**SETTINGS, c=(0.0, 0.0), forgetting=1.0)
-    variance = estimator.run(data.u - data.u[0] + u_0, data.y - data.y[0] + y_0).variance
+    settings = SETTINGS | {"kind": CUSUM, "ceiling": 1e9, "edge_instants": LOCKED}
+    assert estimator.init(**settings, c=(0.0, 0.0), forgetting=1.0)
+    result = estimator.run(data.u - data.u[0] + u_0, data.y - data.y[0] + y_0)
     u, y = data.u - data.u[0], data.y - data.y[0]
     phi = np.column_stack([-delayed(y, 1), -delayed(y, 2), u, delayed(u, 1), np.ones(len(u))])[2:]
     covariance = np.linalg.inv(phi.T @ phi + np.diag([0.1, 0.1, 0.1, 0.1, 1e-4]))
     by_offset = np.array([y_0, y_0, -u_0, -u_0, 1.0])
-    assert variance[4] == pytest.approx(by_offset @ covariance @ by_offset, rel=1e-2)
+    assert result.variance[4] == pytest.approx(by_offset @ covariance @ by_offset, rel=1e-2)
+    offset = by_offset @ covariance @ phi.T @ y[2:] + y_0
+    assert result.theta[-1, 4] == pytest.approx(offset, rel=2e-3)
 
 
 def test_noise_free_estimate_is_the_plant(estimator: Estimator) -> None:
