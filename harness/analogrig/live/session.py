@@ -146,8 +146,13 @@ class LiveSession:
         self._woken.set()
 
     def make_safe(self) -> None:
-        """Switch the generator off before the next block; a recording under way is saved."""
-        self._is_made_safe = True
+        """Switch the generator off before the next block; a recording under way is saved.
+
+        Commands that wait for the block are dropped.
+        """
+        with self._lock:
+            self._waiting.clear()
+            self._is_made_safe = True
         self._woken.set()
 
     def close(self) -> None:
@@ -209,6 +214,10 @@ class LiveSession:
 
     def _play_take(self) -> None:
         """Play from rest until something demands a new start."""
+        if not self.desk.is_stepped:
+            self._wait_to_play()
+            if self._is_closed:
+                return
         self._begin_take()
         keeps = self.take.is_recorded
         bench = Bench(
@@ -234,8 +243,6 @@ class LiveSession:
         excitation = self.excitation
         if not self.is_on:
             excitation = dataclasses.replace(excitation, low_v=0.0, high_v=0.0)
-        if not self.desk.is_stepped:
-            self._wait_to_play()
         scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))
         tweaks: tuple[PotChange, ...] = ()
         if not self.desk.is_stepped and self._turns:

@@ -43,7 +43,7 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import SuspensionComputer
-from tests.harness.live.benches import SEED, linked, scripted_session
+from tests.harness.live.benches import SEED, RecordsRig, linked, scripted_session
 
 RATE_HZ = 20_000
 BLOCK_N = int(RATE_HZ * BLOCK_S)
@@ -179,6 +179,32 @@ def test_generator_that_is_off_gives_no_volts(tmp_path: Path) -> None:
     session = scripted_session(((0.05, Generate(on=False)), (0.1, SetPlaying(on=False))), tmp_path)
     end = session.ring.end
     assert np.abs(session.ring.read("probed", end - 500, end)).max() < 0.1
+
+
+def test_commands_of_a_gone_driver_do_not_undo_the_switch_off(tmp_path: Path) -> None:
+    def leave(session: LiveSession) -> None:
+        session.do(Generate(on=True, high_v=5.0))
+        session.do(SetRecording(on=True))
+        session.make_safe()
+
+    session = scripted_session(((0.05, leave), (0.1, SetPlaying(on=False))), tmp_path)
+    assert (session.is_on, session.is_recording, session.take_number) == (False, False, 2)
+    assert not session.saved
+    assert not session.ring.read("codes", 0, session.ring.end).std(axis=0).max() > 2
+
+
+def test_rig_of_whole_records_plays_only_while_the_generator_is_on(tmp_path: Path) -> None:
+    levels_v: list[float] = []
+    sessions: list[LiveSession] = []
+
+    def note(scenario: Scenario) -> None:
+        levels_v.append(scenario.excitation.high_v)
+        sessions[0].make_safe()
+
+    script = ((1.0, sessions.append), (2.0, Generate(on=True, high_v=4.0)), (3.0, SetPlaying(on=True)))
+    session = scripted_session(script, tmp_path, rig=RecordsRig(note))
+    assert levels_v == [4.0]
+    assert session.take_number == 1
 
 
 def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path: Path) -> None:
