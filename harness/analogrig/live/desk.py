@@ -18,6 +18,7 @@ from analogrig.judging.played import Machine
 from analogrig.live.commands import Fault, Mode
 from analogrig.live.faults import ChannelFaults, labels
 from analogrig.live.knobs import Knob, knobs_of
+from analogrig.live.take import MOST_KEPT_CHANGES
 from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
 from analogrig.rigs.rig import Performance, Rig
 from analogrig.run import OUTPUT
@@ -30,8 +31,6 @@ RECORD_N = 4000
 """Samples of a record of a rig that plays records."""
 CHANGE_N = 2000
 """Sample of a record after which the pots turn, if the hand has turned them."""
-MOST_MOMENTS = 50
-"""Turns of pots whose moments are kept."""
 
 Lengths = Callable[[], Iterator[int]]
 """Function that yields the length of each next block when it is due."""
@@ -155,7 +154,7 @@ class SteppedDesk(Desk):
             self.computer.set(ramp_n * self._probes_per_sample, **settings)
         if self.mode == "OPERATE":
             self.moments[sample] = Moment(sample, self.computer.machine.state)
-        if len(self.moments) > MOST_MOMENTS:
+        if len(self.moments) > MOST_KEPT_CHANGES:
             del self.moments[min(self.moments)]
 
     @property

@@ -126,7 +126,9 @@ class Notes:
         record, which begins at rest.
         """
         segments, performance = self._take.segments(), self._desk.performance
-        number = next(i for i, segment in enumerate(segments) if segment.start == change)
+        number = next((i for i, segment in enumerate(segments) if segment.start == change), 0)
+        if not number:  # no longer kept
+            return None
         end = min([end, *(segment.start for segment in segments[number + 1 :])])
         before, after = (segment.plant.parameters() for segment in segments[number - 1 : number + 1])
         if performance is None:

@@ -74,8 +74,7 @@ def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
 
 def state_table(session: LiveSession) -> dict[str, Any]:
     """State of the bench."""
-    take = session.take
-    truth = take.segments()[-1].plant.parameters()
+    truth = session.desk.scenario.plant.changed(session.values).parameters()
     estimates = session.notes.estimates()
     end = session.ring.end
     return {

@@ -17,6 +17,9 @@ from analogrig.scenario import PotChange, Scenario, segments_of
 MOST_RECORDED_N = 2_000_000
 """Samples of the longest recording: 100 s at 20,000 samples/s, 80 MB."""
 
+MOST_KEPT_CHANGES = 50
+"""Changes that a take keeps if it is not recorded: bounds are looked for after the last ones only."""
+
 Watch = Callable[[Block, Answers], None]
 
 
@@ -25,7 +28,7 @@ class Take:
     """One play: its scenario so far, and the changes that were made by hand."""
 
     scenario: Scenario
-    """Scenario at its first sample."""
+    """Scenario at its first sample; older changes of an unrecorded take are part of it."""
     is_recorded: bool = False
     changes: list[PotChange] = field(default_factory=list)
     caveats: list[str] = field(default_factory=list)
@@ -39,6 +42,9 @@ class Take:
             self.changes[-1] = dataclasses.replace(self.changes[-1], set={**self.changes[-1].set, **values})
         else:
             self.changes.append(PotChange(sample, values, ramp_n))
+        if not self.is_recorded and len(self.changes) > MOST_KEPT_CHANGES:
+            oldest = self.changes.pop(0)
+            self.scenario = self.scenario.with_plant(self.scenario.plant.changed(oldest.set))
 
     def segments(self) -> tuple[Segment, ...]:
         """True plant from the start and after each change."""

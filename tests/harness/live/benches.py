@@ -38,7 +38,7 @@ def linked() -> Device:
 
 
 class RecordsRig(Rig):
-    """Rig that plays whole records, as a real one does; calls ``begun`` with the scenario of each at its first block."""
+    """Rig that plays whole records, as a real one does; calls ``begun`` with the scenario of each."""
 
     def __init__(self, begun: Callable[[Scenario], None]) -> None:
         self._begun = begun

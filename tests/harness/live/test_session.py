@@ -37,6 +37,7 @@ from analogrig.live.commands import (
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.session import BLOCK_S, LiveSession
+from analogrig.live.take import MOST_KEPT_CHANGES
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
@@ -280,6 +281,13 @@ def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None
     session = scripted_session(((0.0, Tempo(0.001)), (0.005, note), (0.02, note)), tmp_path)
     assert held[0] == held[1]
     assert session.ring.end > session.ring.start > 0
+
+
+def test_turned_pots_of_an_unrecorded_take_need_bounded_memory(tmp_path: Path) -> None:
+    turns = [(0.01 * k, Turn("K", 18000.0 + 50.0 * k)) for k in range(1, 2 * MOST_KEPT_CHANGES)]
+    session = scripted_session((*turns, (2.0, SetPlaying(on=False))), tmp_path)
+    assert len(session.take.changes) == MOST_KEPT_CHANGES
+    assert session.take.segments()[-1].plant.parameters()["K"] == turns[-1][1].value == session.values["K"]
 
 
 def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
