@@ -111,6 +111,9 @@ class LiveSession:
         self.notices: deque[tuple[int, str]] = deque(maxlen=_MOST_NOTED)
         self.saved: deque[Saved] = deque(maxlen=_MOST_NOTED)
         self.counters: Mapping[str, int] = {}
+        """Counters of the last take."""
+        self.link_counters: Mapping[str, int] = dict(device.link_counters)
+        """Counters of the link after the last block. Those of the device belong to the thread that plays."""
         self.meter = RateMeter(device)
         self.is_recording = False
         self.version = 0
@@ -452,6 +455,7 @@ class LiveSession:
         """Take note of an answered block."""
         now_s = self.clock()
         self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
+        self.link_counters = dict(self.device.link_counters)
         self.ring.add(block, self.desk.probed(len(block.codes)), answers)
         self._spoil()
         self.meter.count(len(answers), now_s)
@@ -487,6 +491,7 @@ class LiveSession:
 
     def _stop_after(self, reason: str) -> None:
         """Pause after a failure."""
+        self.link_counters = dict(self.device.link_counters)
         self.notify(f"stopped: {reason}")
         self.is_playing, self._steps, self.is_recording, self._has_failed = False, 0, False, True
 

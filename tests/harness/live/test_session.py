@@ -36,6 +36,7 @@ from analogrig.live.commands import (
 )
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
+from analogrig.live.panel import state_table
 from analogrig.live.session import BLOCK_S, LiveSession
 from analogrig.live.take import MOST_KEPT_CHANGES
 from analogrig.program import Program
@@ -310,6 +311,20 @@ def test_frame_lost_by_hand_is_counted_and_recorded(tmp_path: Path) -> None:
     (fault,) = run.conditions.faults
     assert re.fullmatch(r"line fault drop, to the device: injected by hand at sample \d+", fault)
     assert cli.main(["judge", str(session.saved[0].run), "--out", str(tmp_path / "judged")]) == 3
+
+
+def test_state_reads_no_counters_of_the_device_that_another_thread_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states: list[dict[str, Any]] = []
+
+    def note(session: LiveSession) -> None:
+        with monkeypatch.context() as patched:
+            patched.setattr(type(session.device), "link_counters", property(lambda _: pytest.fail("read")))
+            states.append(state_table(session))
+
+    session = scripted_session(((0.02, Spoil("drop", "to")), (0.1, note)), tmp_path, dut=linked())
+    assert states[0]["link_counters"] == {k: v for k, v in session.device.link_counters.items() if v} != {}
 
 
 def test_cut_line_stops_the_session_until_it_is_mended(tmp_path: Path) -> None:
