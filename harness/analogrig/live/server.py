@@ -157,7 +157,10 @@ class BenchServer:
 
     def _refusal(self, request: Request) -> tuple[HTTPStatus, str] | None:
         """Status and reason if the request is refused."""
-        url = urlsplit(request.path)
+        try:
+            url = urlsplit(request.path)
+        except ValueError:
+            return HTTPStatus.BAD_REQUEST, "the address is malformed\n"
         token = parse_qs(url.query).get("token", [""])[0]
         if _one(request.headers, "Host") not in self._hosts:
             return HTTPStatus.FORBIDDEN, "this Host is not served\n"

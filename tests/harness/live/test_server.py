@@ -103,6 +103,7 @@ def test_page_needs_the_token_and_a_host_of_this_server(bench: BenchServer) -> N
     assert status_of(base) == 403
     assert status_of(f"{base}/etc/passwd?token={bench.token}") == 404
     assert status_of(bench.address, Host="evil.example") == 403
+    assert status_of(f"{base}//[") == 400
 
 
 @pytest.mark.parametrize("path", ["/live", "/foxglove"])
