@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,7 @@ from analogrig.live.commands import (
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.panel import state_table
+from analogrig.live.scope import Screen, Trigger, View, unpacked
 from analogrig.live.session import BLOCK_S, LiveSession
 from analogrig.live.take import MOST_KEPT_CHANGES
 from analogrig.program import Program
@@ -45,7 +48,7 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import SuspensionComputer
-from tests.harness.live.benches import SEED, RecordsRig, linked, scripted_session
+from tests.harness.live.benches import SEED, Action, RecordsRig, linked, scripted_session
 
 RATE_HZ = 20_000
 BLOCK_N = int(RATE_HZ * BLOCK_S)
@@ -323,7 +326,7 @@ def test_state_reads_no_counters_of_the_device_that_another_thread_writes(
             patched.setattr(type(session.device), "link_counters", property(lambda _: pytest.fail("read")))
             states.append(state_table(session))
 
-    session = scripted_session(((0.02, Spoil("drop", "to")), (0.1, note)), tmp_path, dut=linked())
+    session = scripted_session(((0.02, Spoil("flip", "from")), (0.1, note)), tmp_path, dut=linked())
     assert states[0]["link_counters"] == {k: v for k, v in session.device.link_counters.items() if v} != {}
 
 
@@ -365,6 +368,26 @@ def test_every_line_fault_has_a_label(name: str, line: type[FaultyLine[Any, Any]
     with open_dut(name, wire_faults=NO_FAULTS) as device:
         assert isinstance(device.faulty_line, line)
     assert set(line.KINDS) <= set(LINE_LABELS)
+
+
+def test_single_shot_shows_the_first_trigger_after_it_was_armed_in_every_view(tmp_path: Path) -> None:
+    screen = Screen()
+    view = View(("force",), Trigger("force", level=5.0, mode="single"), samples=40)
+    shots: list[Any] = []
+
+    def shoot(session: LiveSession) -> None:
+        frame = screen.frame(session)
+        shots.append(None if frame is None else unpacked(frame)[0])
+
+    def show(samples: int) -> Callable[[LiveSession], None]:
+        return lambda _: screen.change(replace(view, samples=samples))
+
+    script: tuple[Action, ...] = (SetPlaying(on=False), show(40), shoot, Step(250), shoot, show(80), shoot, shoot)
+    session = scripted_session([(0.1 + 0.1 * i, each) for i, each in enumerate(script)], tmp_path)
+    armed = session.ring.end - 250
+    assert [shot is not None for shot in shots] == [False, True, True, False]
+    assert armed <= shots[1]["trigger"] < armed + 100 + 1  # a period of the force
+    assert (shots[2]["trigger"], shots[2]["samples"]) == (shots[1]["trigger"], 80)
 
 
 @pytest.mark.parametrize(
