@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import socket
 import urllib.error
@@ -19,7 +20,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.http11 import USER_AGENT
 
 from analogrig.live.scope import unpacked
-from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, BenchServer
+from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from analogrig.run import Run
 from tests.harness.live.benches import LiveBench
 
@@ -252,17 +253,31 @@ def test_client_that_takes_nothing_is_dropped_and_holds_up_nobody(tmp_path: Path
         played(lambda: work(bench))
 
 
-def test_newcomer_is_turned_away_when_all_places_are_taken(bench: BenchServer) -> None:
+def test_newcomers_are_turned_away_when_all_places_are_taken(bench: BenchServer) -> None:
     async def work() -> None:
-        async with asyncio.TaskGroup() as group:
-            clients = [group.create_task(open_client(bench).__aenter__()) for _ in range(MOST_CLIENTS)]
-        with pytest.raises(InvalidStatus) as refused:
-            async with open_client(bench):
-                pass
-        assert refused.value.response.status_code == 503
-        await asyncio.gather(*(each.result().close() for each in clients))
+        opening = [open_client(bench).__aenter__() for _ in range(MOST_CLIENTS + 4)]
+        clients = await asyncio.gather(*opening, return_exceptions=True)
+        refused = [each for each in clients if isinstance(each, InvalidStatus)]
+        assert [each.response.status_code for each in refused] == [503] * 4
+        await asyncio.gather(*(each.close() for each in clients if isinstance(each, ClientConnection)))
+        while True:  # a place is free as soon as the server has seen the end
+            with contextlib.suppress(InvalidStatus):
+                async with open_client(bench) as newcomer:
+                    await Client(newcomer).until(lambda state: state["drives"])
+                    return
 
     played(work)
+
+
+def test_sockets_without_a_request_are_limited(bench: BenchServer) -> None:
+    host, _, port = host_of(bench).rpartition(":")
+    with contextlib.ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(MOST_SOCKETS + 1)]
+        with contextlib.suppress(ConnectionError):
+            assert silent[-1].recv(1) == b""
+        silent[0].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            silent[0].recv(1)
 
 
 def test_frames_hold_what_the_card_has_seen(bench: BenchServer) -> None:
