@@ -4,7 +4,8 @@
     /live?token=T         WebSocket of the page: frames and states out, views and commands in
     /foxglove?token=T     WebSocket with the subprotocol foxglove.websocket.v1 (foxglove.py)
 
-One client of the page drives, the others watch. When the driver is gone, the generator is switched off.
+One client of the page drives, the others watch; a viewer sets pots only while no page drives. When the driver is
+gone, the generator is switched off.
 
 Limits of a client:
 
@@ -124,6 +125,8 @@ class BenchServer:
         self._open: dict[ServerConnection, bool] = {}
         """Connections with an open socket; true for those that have a place."""
         self._driver: _PageClient | None = None
+        self._setter: ServerConnection | None = None
+        """Viewer that sets parameters while no client of the page drives."""
         self._server: Server | None = None
         self._hosts: frozenset[str] = frozenset()
         self._page = page()
@@ -136,8 +139,10 @@ class BenchServer:
     async def listen(self, host: str = "127.0.0.1", port: int = 0) -> None:
         """Listen at an address of this machine; port 0: any free one.
 
-        :raises ConfigurationError: listening there failed.
+        :raises ConfigurationError: listening there failed, or the address is that of all networks.
         """
+        if host in ("", "0.0.0.0", "::"):  # noqa: S104 - refused
+            raise ConfigurationError(f"cannot listen at {host!r}: name the one address that browsers open")
         try:
             self._server = await serve(
                 self._serve_socket,
@@ -210,9 +215,18 @@ class BenchServer:
         path = "" if socket.request is None else urlsplit(socket.request.path).path
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             if path == _FOXGLOVE:
-                await foxglove.Viewer(socket, self.session, may_set=lambda: self._driver is None).serve()
+                try:
+                    await foxglove.Viewer(socket, self.session, may_set=lambda: self._may_set(socket)).serve()
+                finally:
+                    self._setter = None if self._setter is socket else self._setter
             else:
                 await self._serve_client(_PageClient(socket))
+
+    def _may_set(self, viewer: ServerConnection) -> bool:
+        """True if a viewer may set parameters: it is the one that does."""
+        if self._driver is None and self._setter is None:
+            self._setter = viewer
+        return self._driver is None and self._setter is viewer
 
     # ---- clients of the page
 

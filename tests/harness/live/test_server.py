@@ -19,6 +19,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 from websockets.http11 import USER_AGENT
 
+from analogrig.errors import ConfigurationError
 from analogrig.live.scope import unpacked
 from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from analogrig.run import Run
@@ -275,9 +276,16 @@ def test_sockets_without_a_request_are_limited(bench: BenchServer) -> None:
         silent = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(MOST_SOCKETS + 1)]
         with contextlib.suppress(ConnectionError):
             assert silent[-1].recv(1) == b""
-        silent[0].setblocking(False)
+        silent[0].settimeout(0.0)
         with pytest.raises(BlockingIOError):
             silent[0].recv(1)
+
+
+@pytest.mark.parametrize("host", ["", "0.0.0.0", "::"])  # noqa: S104
+def test_address_of_all_networks_is_refused(host: str, bench: BenchServer) -> None:
+    other = BenchServer(bench.session)
+    with pytest.raises(ConfigurationError, match="name the one address"):
+        asyncio.run(other.listen(host))
 
 
 def test_frames_hold_what_the_card_has_seen(bench: BenchServer) -> None:
