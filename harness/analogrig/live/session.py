@@ -11,7 +11,7 @@ import itertools
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,16 @@ MOST_WAITING = 256
 _MOST_NOTED = 50
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """Ordered turn of a pot."""
+
+    value: float
+    ramp_n: int
+    at_s: float | None
+    """Time of the order; None: paused."""
 
 
 @dataclass(frozen=True)
@@ -128,9 +138,8 @@ class LiveSession:
         self._is_closed, self._is_made_safe = False, False
         self._pace: tuple[float, int] | None = None
         """Time and sample from which the pace is counted."""
-        self._turns: dict[str, float] = {}
-        self._ramp_n = 0
-        self._turned_at: list[float] = []
+        self._turns: dict[str, _Turn] = {}
+        """Turns that have not taken effect, by parameter."""
         self._taken = 0
         """Samples of this take that the rig has been asked for."""
 
@@ -183,6 +192,8 @@ class LiveSession:
                 self._refuse_while_recording("the mode")
             case commands.Spoil() if command.kind not in self.line_faults:
                 raise ConfigurationError(f"the line of this device has no fault {command.kind!r} to inject")
+            case commands.Spoil() if len(self._spoils) >= MOST_WAITING:
+                raise ConfigurationError("too many faults of the line wait for the next block")
             case commands.Inject() if command.fault not in self.desk.faults:
                 raise ConfigurationError(f"this rig has no fault {command.fault!r} to inject")
         if not self.desk.is_stepped and isinstance(command, commands.Operate | commands.Step | commands.ClearLamps):
@@ -235,6 +246,8 @@ class LiveSession:
         except AnalogrigError as error:
             self._stop_after(str(error))
             return
+        if not self.desk.is_stepped and self.ring.end > CHANGE_N:
+            self._end_turns(self._turns, {name: turn.value for name, turn in self._turns.items()})
         self.counters = {**run.conditions.counters, **run.conditions.link_counters}
         if keeps:
             self._conclude(run)
@@ -249,9 +262,7 @@ class LiveSession:
         scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))
         tweaks: tuple[PotChange, ...] = ()
         if not self.desk.is_stepped and self._turns:
-            tweaks = (PotChange(CHANGE_N, self._turns),)
-            self.values |= self._turns
-            self._turns, self._turned_at = {}, []
+            tweaks = (PotChange(CHANGE_N, {name: turn.value for name, turn in self._turns.items()}),)
         scenario = dataclasses.replace(scenario, excitation=excitation, tweaks=tweaks, seed=self.seed)
         self.take_number += 1
         self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
@@ -260,6 +271,8 @@ class LiveSession:
         self._taken = 0
         self.ring.restart()
         self.notes.begin(self.take, self.take_number)
+        if tweaks:
+            self._await_turns(CHANGE_N + 1, self._turns.values())
         self.version += 1
         for fault in self.injected if self.is_recording else ():
             self._note_fault(fault)
@@ -269,7 +282,8 @@ class LiveSession:
         """Values that the pots have, or get before the next block."""
         with self._lock:
             waiting = [command for command, _ in self._waiting if isinstance(command, commands.Turn)]
-        return {**self.values, **self._turns, **{turn.name: turn.value for turn in waiting}}
+            turned = {name: turn.value for name, turn in self._turns.items()}
+            return {**self.values, **turned, **{turn.name: turn.value for turn in waiting}}
 
     @property
     def line_faults(self) -> tuple[str, ...]:
@@ -281,12 +295,16 @@ class LiveSession:
         """Faults in force."""
         return set(self.desk.injected) if isinstance(self.desk, SteppedDesk) else set()
 
+    @property
+    def _plays(self) -> bool:
+        """True unless paused; rigs of whole records are silent while the generator is off."""
+        return self.is_playing and (self.is_on or self.desk.is_stepped)
+
     def _wait_to_play(self) -> None:
         """Outside a take: apply the commands, and wait while there is nothing to play."""
         while True:
             self._apply_commands()
-            is_due = self.is_playing and (self.is_on or self.desk.is_stepped)
-            if is_due or self._steps or self._is_closed:
+            if self._plays or self._steps or self._is_closed:
                 return
             self._wait(None)
 
@@ -358,29 +376,33 @@ class LiveSession:
                 if not self._waiting:
                     break
                 command, at_s = self._waiting.popleft()
+                if isinstance(command, commands.Turn):
+                    self._turns[command.name] = _Turn(command.value, command.ramp_n, at_s if self._plays else None)
             try:
                 self._check(command)  # again: the bench may have changed since
-                self._apply(command, at_s)
+                self._apply(command)
             except (AnalogrigError, EmulatorError) as error:
                 self.notify(str(error))
+                if isinstance(command, commands.Turn):
+                    self._end_turns({command.name: self._turns[command.name]}, {})
             self.version += 1
         if isinstance(self.desk, SteppedDesk):
             self._turn_pots(self.desk)
 
-    def _apply(self, command: Command, at_s: float) -> None:
+    def _apply(self, command: Command) -> None:
         match command:
             case commands.Turn():
-                self._turns[command.name] = command.value
-                self._ramp_n = command.ramp_n
-                self._turned_at.append(at_s)
+                pass  # it is noted as it leaves the queue
             case commands.Generate():
                 self.excitation = self._generated(command)
                 self.is_on = self.is_on if command.on is None else command.on
                 self._ends_take = True
             case commands.SetPlaying():
                 self.is_playing, self._steps, self._pace = command.on, 0, None
+                self._forget_times()
             case commands.Step():
                 self.is_playing, self._steps = False, self._steps + command.samples
+                self._forget_times()
             case commands.Tempo():
                 self.factor, self._pace = command.factor, None
             case commands.Restart():
@@ -413,7 +435,7 @@ class LiveSession:
         self.mode, self.lamps = desk.mode, tuple(desk.lamps)
 
     def _note_fault(self, fault: commands.Fault) -> None:
-        self.take.caveats.append(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
+        self.take.add_caveat(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
 
     def _turn_pots(self, desk: SteppedDesk) -> None:
         """Turn the pots that the hand has turned, unless one is still turning."""
@@ -425,21 +447,37 @@ class LiveSession:
             return
         sample = self._taken - 1
         is_fresh = sample > (self.take.changes[-1].sample if self.take.changes else 0)
-        ramp_n = self._ramp_n if is_fresh else 0
-        turns, self._turns = self._turns, {}
-        times_s, self._turned_at = self._turned_at, []
-        turns = {name: value for name, value in turns.items() if value != self.values[name]}
-        if not turns:
-            return
+        ramp_n = next(iter(self._turns.values())).ramp_n
+        if ramp_n and self.take.changes and not is_fresh:
+            return  # a change has one ramp: this one begins at the next sample
+        ramped = {name: turn for name, turn in self._turns.items() if turn.ramp_n == ramp_n}
+        values = {name: turn.value for name, turn in ramped.items() if turn.value != self.values[name]}
+        ramp_n = ramp_n if is_fresh else 0
         try:
-            desk.turn(self.values | turns, turns, sample, ramp_n)
+            if values:
+                desk.turn(self.values | values, values, sample, ramp_n)
+                self.take.change(sample, values, ramp_n)
+                self._await_turns(sample + 1, [ramped[name] for name in values])
+                self.version += 1
         except AnalogrigError as error:
             self.notify(str(error))
-            return
-        self.values |= turns
-        self.take.change(sample, turns, ramp_n)
-        self.notes.await_turn(sample + 1, times_s)
-        self.version += 1
+            values = {}
+        self._end_turns(ramped, values)
+
+    def _await_turns(self, sample: int, turns: Iterable[_Turn]) -> None:
+        """Time the turns that this sample feels first."""
+        self.notes.await_turn(sample, [turn.at_s for turn in turns if turn.at_s is not None])
+
+    def _forget_times(self) -> None:
+        """Time no turns that were ordered until now: a pause would count as their delay."""
+        self.notes.forget_turns()
+        self._turns = {name: dataclasses.replace(turn, at_s=None) for name, turn in self._turns.items()}
+
+    def _end_turns(self, turns: Mapping[str, _Turn], values: Mapping[str, float]) -> None:
+        """Note the values that turns have reached."""
+        with self._lock:
+            self.values |= values
+            self._turns = {name: turn for name, turn in self._turns.items() if name not in turns}
 
     def _spoil(self) -> None:
         """Inject the faults of the line that were asked for."""
@@ -447,7 +485,7 @@ class LiveSession:
         if self.device.faulty_line is not None:
             for each in spoils:
                 self.device.faulty_line.inject(each.kind, each.direction)
-                self.take.caveats.append(
+                self.take.add_caveat(
                     f"line fault {each.kind}, {each.direction} the device: injected by hand at sample {self.ring.end}"
                 )
 
@@ -494,6 +532,7 @@ class LiveSession:
         self.link_counters = dict(self.device.link_counters)
         self.notify(f"stopped: {reason}")
         self.is_playing, self._steps, self.is_recording, self._has_failed = False, 0, False, True
+        self._forget_times()
 
     def _bring_back(self) -> None:
         """Bring the device back as soon as a hand wants to go on."""

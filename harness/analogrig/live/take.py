@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from analogrig.answers import Answers
 from analogrig.bench import RunBuilder
 from analogrig.datasheet import Datasheet
-from analogrig.plant import Segment
+from analogrig.plant import MAX_CHANGES, Segment
 from analogrig.rigs.rig import Block
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario, segments_of
@@ -45,6 +45,11 @@ class Take:
         if not self.is_recorded and len(self.changes) > MOST_KEPT_CHANGES:
             oldest = self.changes.pop(0)
             self.scenario = self.scenario.with_plant(self.scenario.plant.changed(oldest.set))
+
+    def add_caveat(self, reason: str) -> None:
+        """Note a reason that the recording cannot be judged."""
+        if self.is_recorded and len(self.caveats) < MAX_CHANGES:
+            self.caveats.append(reason)
 
     def segments(self) -> tuple[Segment, ...]:
         """True plant from the start and after each change."""

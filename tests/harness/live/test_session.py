@@ -16,7 +16,7 @@ from analogrig import cli
 from analogrig.catalogue import BLOCK_SAMPLES
 from analogrig.cli.bench import NO_FAULTS
 from analogrig.devices.opening import open_dut
-from analogrig.errors import ConfigurationError
+from analogrig.errors import ConfigurationError, RigError
 from analogrig.judging.verdict import judge
 from analogrig.links.faulty_bus import FaultyBus
 from analogrig.links.wire_faults import FaultyLine, FaultyWire
@@ -138,6 +138,50 @@ def test_digital_pots_that_show_two_parameters_follow_both(tmp_path: Path) -> No
 def test_pot_is_felt_within_one_block(recorded: LiveSession) -> None:
     assert len(recorded.notes.felt_s) == 3
     assert max(recorded.notes.felt_s) <= 2 * BLOCK_S
+
+
+def test_turns_at_once_keep_their_own_ramps(tmp_path: Path) -> None:
+    script = ((0.05, Turn("K", 18000.0)), (0.05, Turn("B", 3453.0, 100)), (0.1, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path)
+    assert [(change.set, change.ramp_n) for change in session.take.changes] == [
+        ({"K": 18000.0}, 0),
+        ({"B": 3453.0}, 100),
+    ]
+    assert not session._turns
+
+
+def test_turn_while_paused_is_not_timed(tmp_path: Path) -> None:
+    script = (
+        *((0.05, SetPlaying(on=False)), (0.1, Turn("K", 18000.0)), (50.0, SetPlaying(on=True))),
+        *((50.1, Turn("K", 19000.0)), (50.2, SetPlaying(on=False))),
+    )
+    felt_s = scripted_session(script, tmp_path).notes.felt_s
+    assert len(felt_s) == 1
+    assert felt_s[0] <= 2 * BLOCK_S
+
+
+def test_turn_on_a_rig_of_whole_records_lasts_and_is_timed_in_the_record_that_feels_it(tmp_path: Path) -> None:
+    sessions: list[LiveSession] = []
+    values: list[tuple[float, float]] = []
+
+    def begin(_: Scenario) -> None:
+        (session,) = sessions
+        values.append((session.values["K"], session.ordered_values["K"]))
+        match len(values):
+            case 1:
+                session.do(Turn("K", 18000.0))
+            case 2:
+                raise RigError("the card is gone")
+            case 3:
+                session.do(Turn("K", 19000.0))
+            case _:
+                session.make_safe()
+
+    script = ((1.0, sessions.append), (2.0, Generate(on=True)), (9.0, SetPlaying(on=True)))
+    session = scripted_session(script, tmp_path, rig=RecordsRig(begin))
+    assert values == [(24500.0, 24500.0), (24500.0, 18000.0), (24500.0, 18000.0), (18000.0, 19000.0)]
+    assert session.values["K"] == 19000.0
+    assert len(session.notes.felt_s) == 1  # not the turn that has waited for a hand to go on
 
 
 def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) -> None:
