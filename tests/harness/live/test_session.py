@@ -39,7 +39,7 @@ from analogrig.live.commands import (
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.panel import state_table
-from analogrig.live.scope import Screen, Trigger, View, unpacked
+from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
 from analogrig.live.session import BLOCK_S, LiveSession
 from analogrig.live.take import MOST_KEPT_CHANGES
 from analogrig.program import Program
@@ -194,6 +194,18 @@ def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) 
         ((0.0, SetPlaying(on=False)), (1.0, note), (2.0, Step(1)), (3.0, note), (4.0, Step(7)), (5.0, note)), tmp_path
     )
     assert ends == [0, 1, 8]
+
+
+def test_amplifiers_are_shown_with_the_block_of_their_channels(tmp_path: Path) -> None:
+    pause, steps = (0.1, SetPlaying(on=False)), ((0.2, Step(10)), (0.3, Step(100)), (0.4, Step(1)))
+    tempo = ((0.5, Tempo(10.0)), (0.5, SetPlaying(on=True)), (0.8, Tempo(0.1)), (0.81, SetPlaying(on=False)))
+    session = scripted_session((pause, *steps, *tempo), tmp_path, dut=linked())
+    signals, end = signals_of(session), session.ring.end
+    (same,) = [
+        each.id for each in signals.values() if each.id != "displacement" and each.node == signals["displacement"].node
+    ]
+    seen, probed = (read_signal(session, name, 0, end) for name in ("displacement", same))
+    assert np.abs(seen - probed).max() < 0.05
 
 
 def test_time_factor_slows_and_hastens_the_session(tmp_path: Path) -> None:
