@@ -98,8 +98,7 @@ class LiveSession:
         self._folder = folder
         self._identity = identity
         self.clock = clock or WallClock()
-        self._lock = threading.Lock()
-        self._woken = threading.Event()
+        self._lock, self._woken = threading.Lock(), threading.Event()
         self._waiting: deque[tuple[Command, float]] = deque()
         parameters = self.desk.scenario.plant.parameters()
         self.values = {name: parameters[name] for name in self.knobs}
@@ -134,8 +133,7 @@ class LiveSession:
         self._spoils: list[commands.Spoil] = []
         """Faults of the line that wait for the next answered block: handshake and configuration are spared."""
         self._steps = 0
-        self._ends_take = False
-        self._is_closed, self._is_made_safe = False, False
+        self._ends_take, self._is_closed, self._is_made_safe = False, False, False
         self._pace: tuple[float, int] | None = None
         """Time and sample from which the pace is counted."""
         self._turns: dict[str, _Turn] = {}
@@ -274,8 +272,10 @@ class LiveSession:
         if tweaks:
             self._await_turns(CHANGE_N + 1, self._turns.values())
         self.version += 1
-        for fault in self.injected if self.is_recording else ():
+        for fault in self.injected:
             self._note_fault(fault)
+        for kind in () if self.device.faulty_line is None else self.device.faulty_line.lasting:
+            self.take.add_caveat(f"line fault {kind}: injected by hand before the recording")
 
     @property
     def ordered_values(self) -> dict[str, float]:

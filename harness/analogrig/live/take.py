@@ -66,6 +66,10 @@ class Take:
     def concluded(self, run: Run) -> Run:
         """Run with the scenario that was played by hand, instead of the endless one."""
         scenario = self.played(run.samples)
+        if scenario.tweaks and scenario.tweaks[-1].ramp_n < next(
+            change.ramp_n for change in self.changes if change.sample == scenario.tweaks[-1].sample
+        ):
+            self.add_caveat("the recording ends while a pot turns: its scenario turns the pot faster")
         conditions = dataclasses.replace(
             run.conditions,
             samples_asked=run.samples,

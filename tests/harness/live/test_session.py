@@ -386,6 +386,20 @@ def test_state_reads_no_counters_of_the_device_that_another_thread_writes(
     assert states[0]["link_counters"] == {k: v for k, v in session.device.link_counters.items() if v} != {}
 
 
+def test_lasting_line_fault_from_before_the_recording_makes_it_inconclusive(tmp_path: Path) -> None:
+    script = ((0.02, Spoil("babble", "to")), (0.05, SetRecording(on=True)), (0.1, SetRecording(on=False)))
+    session = scripted_session(script, tmp_path, dut=linked())
+    (saved,) = session.saved
+    assert "line fault babble: injected by hand before the recording" in Run.load(saved.run).conditions.faults
+
+
+def test_recording_that_ends_within_a_ramp_is_inconclusive(tmp_path: Path) -> None:
+    script = ((0.0, SetRecording(on=True)), (0.05, Turn("K", 18000.0, 2000)), (0.1, SetRecording(on=False)))
+    (saved,) = scripted_session(script, tmp_path).saved
+    assert any("while a pot turns" in fault for fault in Run.load(saved.run).conditions.faults)
+    assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
+
+
 def test_cut_line_stops_the_session_until_it_is_mended(tmp_path: Path) -> None:
     ends: list[tuple[bool, int]] = []
 
