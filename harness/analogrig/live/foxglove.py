@@ -117,7 +117,7 @@ class Viewer:
             await _OPERATIONS[operation](self, table)
         except AnalogrigError as error:
             await self._tell("status", level=_ERROR, message=one_line(str(error)))
-        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError):
             await self._tell("status", level=_ERROR, message="the message is not as the protocol describes it")
 
     async def _subscribe(self, table: Mapping[str, Any]) -> None:
@@ -138,16 +138,16 @@ class Viewer:
     async def _set_parameters(self, table: Mapping[str, Any]) -> None:
         if not self._may_set():
             raise ConfigurationError("another client drives: close it to set parameters here")
-        names = []
+        turns = []
         for each in table["parameters"]:
             name, value = str(each["name"]), each["value"]
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise TypeError(name)
-            self._session.do(Turn(name, float(value)))
-            names.append(name)
+            turns.append(Turn(name, float(value)))
+        self._session.do(*turns)
         if table.get("id") is not None:
             await asyncio.sleep(2 * _PERIOD_S)  # the pots turn before the next block
-            await self._tell_parameters(names, table["id"])
+            await self._tell_parameters({turn.name for turn in turns}, table["id"])
 
     async def _watch_parameters(self, table: Mapping[str, Any]) -> None:
         self._watched |= self._named(table)

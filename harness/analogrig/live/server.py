@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import SplitResult, parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, quote, urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
@@ -134,7 +134,7 @@ class BenchServer:
     @property
     def address(self) -> str:
         """URL of the page."""
-        return f"http://{self._host}/?token={self.token}"
+        return f"http://{self._host}/?token={quote(self.token, safe='')}"
 
     async def listen(self, host: str = "127.0.0.1", port: int = 0) -> None:
         """Listen at an address of this machine; port 0: any free one.
@@ -159,8 +159,9 @@ class BenchServer:
                 server_header=None,
                 create_connection=functools.partial(_Connection, noted=self._open),  # type: ignore[arg-type]
             )
-        except OSError as error:
-            raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror or error}") from error
+        except (OSError, UnicodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else one_line(str(error))
+            raise ConfigurationError(f"cannot listen at {host[:80]!r}:{port}: {reason}") from error
         for listening in self._server.sockets:  # accepted connections inherit the options
             listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_RCVBUF, BUFFERED_BYTES)
             listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_SNDBUF, BUFFERED_BYTES)

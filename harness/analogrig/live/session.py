@@ -6,6 +6,7 @@ reads the ring and the state. Commands take effect between two blocks; the sessi
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import logging
@@ -143,16 +144,17 @@ class LiveSession:
 
     # ---- from other threads
 
-    def do(self, command: Command) -> None:
-        """Check a command, and let it take effect before the next block.
+    def do(self, *wanted: Command) -> None:
+        """Check commands, and let them take effect before the next block: all or none.
 
-        :raises ConfigurationError: it is not possible on this bench, or too many commands wait.
+        :raises ConfigurationError: one is not possible on this bench, or too many commands wait.
         """
-        self._check(command)
+        for command in wanted:
+            self._check(command)
         with self._lock:
-            if len(self._waiting) >= MOST_WAITING:
+            if len(self._waiting) + len(wanted) > MOST_WAITING:
                 raise ConfigurationError("too many commands at once: wait for the next block")
-            self._waiting.append((command, self.clock()))
+            self._waiting.extend((command, self.clock()) for command in wanted)
         self._woken.set()
 
     def make_safe(self) -> None:
@@ -506,12 +508,12 @@ class LiveSession:
         """Save a recorded take, unless it has no samples."""
         if not run.samples:
             return
-        concluded = self.take.concluded(run)
-        if self._identity is not None:
-            concluded = concluded.with_identity(dataclasses.replace(self._identity, devices=self.device.files()))
         try:
+            concluded = self.take.concluded(run)
+            if self._identity is not None:
+                concluded = concluded.with_identity(dataclasses.replace(self._identity, devices=self.device.files()))
             self._folder.mkdir(parents=True, exist_ok=True)
-            number = next(n for n in itertools.count(1) if not self._file(n, "npz").exists())
+            number = self._reserve_number()
             table = {k: v for k, v in concluded.conditions.scenario.items() if v != "" and k not in ("name", "rig")}
             with replace_file(self._file(number, "toml")) as file:
                 file.write(config.to_toml(table).encode())
@@ -523,6 +525,18 @@ class LiveSession:
         self.saved.append(saved)
         held = f"{number_of(run.samples, 'sample', form=',')}, {number_of(saved.alarms, 'alarm')}"
         self.notify(f"saved {saved.run}: {held}; scenario: {saved.scenario}")
+
+    def _reserve_number(self) -> int:
+        """Number of the next recording; its scenario is created, so that no other bench takes it.
+
+        :raises OSError: the folder cannot be written to.
+        """
+        for number in itertools.count(1):
+            if not self._file(number, "npz").exists():
+                with contextlib.suppress(FileExistsError):
+                    self._file(number, "toml").open("x").close()
+                    return number
+        raise AssertionError
 
     def _file(self, number: int, suffix: str) -> Path:
         return self._folder / f"take-{number}.{suffix}"

@@ -164,6 +164,14 @@ def test_parameters_obey_the_limits_and_the_driver(bench: BenchServer) -> None:
             status = await text(socket, "status")
             assert status["level"] == 2
             assert "K must be" in status["message"]
+            huge = 10**400  # beyond the range of a float
+            for values in ({"K": 16000.0, "M": 1e9}, {"K": 16000.0, "M": huge}):
+                settings = [{"name": name, "value": value} for name, value in values.items()]
+                await socket.send(json.dumps({"op": "setParameters", "parameters": settings}))
+                assert (await text(socket, "status"))["level"] == 2
+            await socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1e999, "channelId": 1}]}))
+            assert "as the protocol describes" in (await text(socket, "status"))["message"]
+            assert bench.session.ordered_values["K"] == 24500.0
             setting = json.dumps({"op": "setParameters", "parameters": [{"name": "K", "value": 2e4}]})
             async with open_viewer(bench) as second:
                 await second.send(setting)

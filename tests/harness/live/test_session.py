@@ -41,7 +41,7 @@ from analogrig.live.faults import LINE_LABELS
 from analogrig.live.panel import state_table
 from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
 from analogrig.live.session import BLOCK_S, LiveSession
-from analogrig.live.take import MOST_KEPT_CHANGES
+from analogrig.live.take import MOST_KEPT_CHANGES, Take
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
@@ -398,6 +398,28 @@ def test_recording_that_ends_within_a_ramp_is_inconclusive(tmp_path: Path) -> No
     (saved,) = scripted_session(script, tmp_path).saved
     assert any("while a pot turns" in fault for fault in Run.load(saved.run).conditions.faults)
     assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
+
+
+def test_recording_takes_no_number_that_another_file_has(tmp_path: Path) -> None:
+    (tmp_path / "take-1.toml").write_text("mine")
+    (tmp_path / "take-2.npz").write_text("mine")
+    script = ((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False)))
+    (saved,) = scripted_session(script, tmp_path).saved
+    assert saved.scenario.name == "take-3.toml"
+    assert (tmp_path / "take-1.toml").read_text() == "mine"
+
+
+def test_recording_that_cannot_be_saved_is_named_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(Take, "concluded", fail)
+    script = ((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False)), (0.05, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path)
+    assert "could not be saved: [Errno 24] Too many open files" in session.notices[0][1]
+    assert session.take_number == 3
 
 
 def test_cut_line_stops_the_session_until_it_is_mended(tmp_path: Path) -> None:
