@@ -32,11 +32,11 @@ from playwright.sync_api import Page, sync_playwright
 from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
-from analogrig.live.commands import Tempo
+from analogrig.live.commands import Tempo, Turn
 from analogrig.live.session import LiveSession
 from analogrig.run import Run
 from tests import tools
-from tests.harness.live.benches import scripted_session
+from tests.harness.live.benches import Action, scripted_session
 from tests.harness.processes import descendants, marked
 
 from .figure import Figure
@@ -281,7 +281,10 @@ async def _attack(bench: _Process, path: str, seed: int, until_s: float) -> int:
 
 
 def _memory(minutes: float) -> Iterator[Figure]:
-    """Growth of this process while a session plays so many minutes of machine time, after the first."""
+    """Growth of this process while a session plays so many minutes of machine time, after the first.
+
+    A hand turns a pot in every second.
+    """
     seen: list[float] = []
 
     def note(_: LiveSession) -> None:
@@ -289,7 +292,9 @@ def _memory(minutes: float) -> Iterator[Figure]:
         seen.append(next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")))
 
     fast = 1e-3
-    script = ((0.0, Tempo(fast)), (60.0 * fast, note), (60.0 * minutes * fast, note))
+    turns = ((fast * s, Turn("K", 22000.0 + 500.0 * (s % 2))) for s in range(1, int(60.0 * minutes)))
+    notes = ((60.0 * fast, note), (60.0 * minutes * fast, note))
+    script: list[tuple[float, Action]] = [(0.0, Tempo(fast)), *sorted((*turns, *notes), key=lambda each: each[0])]
     with tempfile.TemporaryDirectory() as folder:
         scripted_session(script, Path(folder))
     yield Figure(f"growth of memory from 1 to {minutes:g} minutes of machine time", seen[1] - seen[0], "MB")

@@ -7,6 +7,7 @@ rig plays one record after another, and what the hand does takes effect in the n
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -18,8 +19,9 @@ from analogrig.judging.played import Machine
 from analogrig.live.commands import Fault, Mode
 from analogrig.live.faults import ChannelFaults, labels
 from analogrig.live.knobs import Knob, knobs_of
+from analogrig.live.take import MOST_KEPT_CHANGES
 from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
-from analogrig.rigs.rig import Performance, Rig
+from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import OUTPUT
 from analogrig.scenario import Scenario
 from analogrig_emulator import Mode as Relays
@@ -30,8 +32,6 @@ RECORD_N = 4000
 """Samples of a record of a rig that plays records."""
 CHANGE_N = 2000
 """Sample of a record after which the pots turn, if the hand has turned them."""
-MOST_MOMENTS = 50
-"""Turns of pots whose moments are kept."""
 
 Lengths = Callable[[], Iterator[int]]
 """Function that yields the length of each next block when it is due."""
@@ -77,7 +77,7 @@ class Desk(Rig):
         return self.performance
 
     def probed(self, samples: int) -> NDArray[np.float64]:
-        """Volts of the amplifiers in the last block, (samples, amplifiers)."""
+        """Volts of the amplifiers in the next answered block, (samples, amplifiers); to be called once for each."""
         return np.empty((samples, 0))
 
     @property
@@ -105,6 +105,8 @@ class SteppedDesk(Desk):
         super().__init__(rig, scenario, seed)
         self._probes_per_sample = probes_per_sample(self._card)
         self._playing = self.scenario
+        self._probed: deque[NDArray[np.float64]] = deque()
+        """Volts of the amplifiers in each block that is not answered."""
         self.moments: dict[int, Moment] = {}
         """State of the machine at the last turns of pots, by sample."""
         self.faults = labels(scenario.program.channels[OUTPUT].replace("_", " "))
@@ -129,9 +131,11 @@ class SteppedDesk(Desk):
         self._faults = ChannelFaults(float(self._card.lsb_v[OUTPUT]), self._card.rate_hz, np.random.default_rng(seed))
         for fault in on:
             self._faults.switch(fault, on=True)
-        self.performance = self._emulated.perform_in_steps(
+        performance = self._emulated.perform_in_steps(
             set_up, self.program, seed, self._lengths(), self.nodes, self._faults.alter
         )
+        self._probed.clear()
+        self.performance = dataclasses.replace(performance, blocks=self._probe(performance.blocks))
         return self.performance
 
     def machine(self, samples: int, lsb_v: float) -> Machine:
@@ -143,7 +147,13 @@ class SteppedDesk(Desk):
             return Machine(self._emulated.courses(self._playing, self._seed, samples), lsb_v)
 
     def probed(self, samples: int) -> NDArray[np.float64]:
-        return self.computer.probed[:: self._probes_per_sample][:samples]
+        return self._probed.popleft()[:samples]
+
+    def _probe(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        """Keep the volts of the amplifiers with each block: the next one is played before it is answered."""
+        for block in blocks:
+            self._probed.append(self.computer.probed[:: self._probes_per_sample].copy())
+            yield block
 
     def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:
         """Turn pots after the last sample taken, to values of which these parameters have changed.
@@ -155,7 +165,7 @@ class SteppedDesk(Desk):
             self.computer.set(ramp_n * self._probes_per_sample, **settings)
         if self.mode == "OPERATE":
             self.moments[sample] = Moment(sample, self.computer.machine.state)
-        if len(self.moments) > MOST_MOMENTS:
+        if len(self.moments) > MOST_KEPT_CHANGES:
             del self.moments[min(self.moments)]
 
     @property

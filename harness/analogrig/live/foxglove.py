@@ -1,7 +1,7 @@
 """Endpoint of other viewers, such as Foxglove, Lichtblick and PlotJuggler.
 
 The subprotocol is foxglove.websocket.v1 (github.com/foxglove/ws-protocol, docs/spec.md): channels are JSON with a
-schema, the pots are parameters. A parameter can be set while no client of the page drives.
+schema, the pots are parameters. While no client of the page drives, the first viewer that sets a parameter drives.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import struct
 import time
 from collections.abc import Callable, Collection, Mapping
@@ -36,6 +37,8 @@ _ROWS = 8
 _MOST_SUBSCRIPTIONS = 64
 _SLOW_S = 10.0
 _WARNING, _ERROR = 1, 2
+
+_log = logging.getLogger(__name__)
 
 _NUMBER: Mapping[str, Any] = {"type": "number"}
 _TEXT: Mapping[str, Any] = {"type": "string"}
@@ -75,7 +78,7 @@ class Viewer:
     """One viewer at its connection."""
 
     def __init__(self, socket: ServerConnection, session: LiveSession, *, may_set: Callable[[], bool]) -> None:
-        """:param may_set: true while a viewer may set parameters."""
+        """:param may_set: true while this viewer may set parameters."""
         self._socket = socket
         self._session = session
         self._may_set = may_set
@@ -93,12 +96,15 @@ class Viewer:
         await self._tell("serverInfo", **info)
         await self._tell("advertise", channels=[channel.advertisement() for channel in self._channels.values()])
         publishing = asyncio.create_task(self._publish())
+        publishing.add_done_callback(lambda _: self._socket.transport.abort())
         try:
             async for message in self._socket:
                 await self._receive(message)
         finally:
             publishing.cancel()
-            await asyncio.gather(publishing, return_exceptions=True)
+            for error in await asyncio.gather(publishing, return_exceptions=True):
+                if isinstance(error, Exception):
+                    _log.error("messages to a viewer have ended", exc_info=error)
 
     async def _receive(self, message: str | bytes) -> None:
         """Carry out one message; a wrong one is answered by a status."""
@@ -111,7 +117,7 @@ class Viewer:
             await _OPERATIONS[operation](self, table)
         except AnalogrigError as error:
             await self._tell("status", level=_ERROR, message=one_line(str(error)))
-        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        except (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError):
             await self._tell("status", level=_ERROR, message="the message is not as the protocol describes it")
 
     async def _subscribe(self, table: Mapping[str, Any]) -> None:
@@ -131,17 +137,17 @@ class Viewer:
 
     async def _set_parameters(self, table: Mapping[str, Any]) -> None:
         if not self._may_set():
-            raise ConfigurationError("the page drives: close it to set parameters here")
-        names = []
+            raise ConfigurationError("another client drives: close it to set parameters here")
+        turns = []
         for each in table["parameters"]:
             name, value = str(each["name"]), each["value"]
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise TypeError(name)
-            self._session.do(Turn(name, float(value)))
-            names.append(name)
+            turns.append(Turn(name, float(value)))
+        self._session.do(*turns)
         if table.get("id") is not None:
             await asyncio.sleep(2 * _PERIOD_S)  # the pots turn before the next block
-            await self._tell_parameters(names, table["id"])
+            await self._tell_parameters({turn.name for turn in turns}, table["id"])
 
     async def _watch_parameters(self, table: Mapping[str, Any]) -> None:
         self._watched |= self._named(table)

@@ -29,6 +29,7 @@ from analogrig.run import INPUT, LOST, OUTPUT, missing_samples
 _BOUND_AFTER_N = (64, 256, 1024)
 """Samples after a change at which its bound is looked for."""
 _MOST_NOTED = 50
+_MOST_TIMED = 1000
 
 
 @dataclass
@@ -57,9 +58,9 @@ class Notes:
         self._seed = seed
         self._take = Take(desk.scenario)
         self._number = 0
-        self._unfelt: list[tuple[int, float]] = []
+        self._unfelt: deque[tuple[int, float]] = deque(maxlen=_MOST_TIMED)
         """Samples that feel a turn of a pot, and the times of the turns."""
-        self.felt_s: deque[float] = deque(maxlen=1000)
+        self.felt_s: deque[float] = deque(maxlen=_MOST_TIMED)
         """Times from a turn of a pot to the first answered sample that feels it."""
         self.alarms: deque[NotedAlarm] = deque(maxlen=_MOST_NOTED)
         self.alarm_count = 0
@@ -71,19 +72,23 @@ class Notes:
     def begin(self, take: Take, number: int) -> None:
         """Begin a take."""
         self._take, self._number = take, number
-        self._unfelt = []
+        self.forget_turns()
         self.diagnosis, self.misfit = "", ""
 
     def await_turn(self, sample: int, times_s: Sequence[float]) -> None:
         """Await the first sample that feels a turn of pots, ordered at these times."""
-        self._unfelt += [(sample, at_s) for at_s in times_s]
+        self._unfelt.extend((sample, at_s) for at_s in times_s)
+
+    def forget_turns(self) -> None:
+        """Await no turns."""
+        self._unfelt.clear()
 
     def watch(self, block: Block, answers: Answers, now_s: float) -> bool:
         """Take note of an answered block that is in the ring. Return True if there is news."""
         end = self._ring.end
         self.missing_n += int(np.count_nonzero(~block.samples().valid[: len(answers)] | (answers.flags & LOST != 0)))
         self.felt_s.extend(now_s - at_s for sample, at_s in self._unfelt if sample < end)
-        self._unfelt = [each for each in self._unfelt if each[0] >= end]
+        self._unfelt = deque((each for each in self._unfelt if each[0] >= end), _MOST_TIMED)
         for alarm in answers.alarms:
             self._note_alarm(alarm.index)
         for diagnosis in answers.diagnoses:
@@ -126,7 +131,9 @@ class Notes:
         record, which begins at rest.
         """
         segments, performance = self._take.segments(), self._desk.performance
-        number = next(i for i, segment in enumerate(segments) if segment.start == change)
+        number = next((i for i, segment in enumerate(segments) if segment.start == change), 0)
+        if not number:  # no longer kept
+            return None
         end = min([end, *(segment.start for segment in segments[number + 1 :])])
         before, after = (segment.plant.parameters() for segment in segments[number - 1 : number + 1])
         if performance is None:

@@ -80,8 +80,7 @@ def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
 
 def state_table(session: LiveSession) -> dict[str, Any]:
     """State of the bench."""
-    take = session.take
-    truth = take.segments()[-1].plant.parameters()
+    truth = session.desk.scenario.plant.changed(session.values).parameters()
     estimates = session.notes.estimates()
     end = session.ring.end
     return {
@@ -106,7 +105,7 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "diagnosis": session.notes.diagnosis,
         "misfit": session.notes.misfit,
         "counters": {name: count for name, count in session.counters.items() if count},
-        "link_counters": {name: count for name, count in session.device.link_counters.items() if count},
+        "link_counters": {name: count for name, count in session.link_counters.items() if count},
         "alarms": [dataclasses.asdict(alarm) for alarm in list(session.notes.alarms)[-12:]],
         "alarm_count": session.notes.alarm_count,
         "recording": session.is_recording,

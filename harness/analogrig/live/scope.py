@@ -130,12 +130,15 @@ def read_signal(session: LiveSession, name: str, first: int, end: int) -> Values
 
 
 class Screen:
-    """Screen of one client: remembers its last trigger, and whether a single one has come."""
+    """Screen of one client: remembers where a single trigger was armed, and where it has come."""
 
     def __init__(self) -> None:
         self.view: View | None = None
         """View that the client has asked for."""
-        self._is_waiting = True
+        self._armed: tuple[int, int] | None = None
+        """Take and first sample that may trigger a single shot; None: those after the next frame."""
+        self._held: tuple[int, float] | None = None
+        """Take and trigger of the single shot that is shown."""
         self._shown: tuple[int, int] | None = None
         """Take and last sample of the last frame."""
         self._measured_s = -_MEASURE_S
@@ -144,7 +147,7 @@ class Screen:
     def change(self, view: View) -> None:
         """Show another view."""
         if self.view is None or view.arm != self.view.arm or view.trigger.mode != self.view.trigger.mode:
-            self._is_waiting = True
+            self._armed = self._held = None
         self.view = view
         self._shown = None
         self._measured_s = -_MEASURE_S
@@ -152,9 +155,11 @@ class Screen:
     def frame(self, session: LiveSession) -> bytes | None:
         """Next frame; None if there is nothing new to show."""
         view, ring = self.view, session.ring
-        if view is None or (view.trigger.mode == "single" and not self._is_waiting):
+        if view is None or (self._held is not None and self._shown is not None):
             return None
         end, take = ring.end, session.take_number
+        if view.trigger.mode == "single" and self._armed is None:
+            self._armed = take, end
         if end < LEAST_WINDOW_N or self._shown == (take, end):
             return None
         try:
@@ -164,7 +169,7 @@ class Screen:
 
     def _frame(self, view: View, session: LiveSession, take: int, end: int) -> bytes | None:
         samples = min(view.samples, end)
-        found = None if view.kind == "fft" else _find_trigger(view.trigger, session, end, samples)
+        found = self._find_trigger(view, session, take, end)
         if found is None and view.trigger.mode != "auto" and view.kind != "fft":
             return None
         if found is None:
@@ -172,10 +177,10 @@ class Screen:
         else:
             trigger = found
             first = min(max(int(found) - round(view.trigger.position * samples), session.ring.start), end - samples)
-        self._shown = take, end
-        if trigger is not None:
-            self._is_waiting = False
         signals = {name: read_signal(session, name, first, first + samples) for name in view.signals}
+        self._shown = take, end
+        if trigger is not None and view.trigger.mode == "single":
+            self._held = take, trigger
         rate_hz = session.sample_rate_hz
         header: dict[str, Any] = {"take": take, "first": first, "samples": samples, "rate": rate_hz, "end": end}
         header |= {"trigger": trigger, "kind": view.kind, "signals": list(signals)}
@@ -194,9 +199,28 @@ class Screen:
         header |= {"points": len(columns[0]), "per": per}
         return packed(header, columns)
 
+    def _find_trigger(self, view: View, session: LiveSession, take: int, end: int) -> float | None:
+        """Instant of the trigger, in samples: that of a single shot stays.
 
-def _find_trigger(trigger: Trigger, session: LiveSession, end: int, samples: int) -> float | None:
-    """Last instant of a trigger after which the screen is full, in samples; None if there is none."""
+        :raises LookupError: the take of the single shot has ended.
+        """
+        if self._held is not None:
+            if self._held[0] != take:
+                raise LookupError("the take of the single shot has ended")
+            return self._held[1]
+        if view.kind == "fft":
+            return None
+        after = None
+        if view.trigger.mode == "single" and self._armed is not None:
+            after = self._armed[1] if self._armed[0] == take else 0
+        return _find_trigger(view.trigger, session, end, min(view.samples, end), after)
+
+
+def _find_trigger(trigger: Trigger, session: LiveSession, end: int, samples: int, after: int | None) -> float | None:
+    """Instant of a trigger after which the screen is full, in samples; None if there is none.
+
+    :param after: sample from which the first trigger counts; None: the last trigger counts.
+    """
     before = round(trigger.position * samples)
     last = end - (samples - before)
     first = max(session.ring.start, before, last - max(samples, 4000))
@@ -208,7 +232,8 @@ def _find_trigger(trigger: Trigger, session: LiveSession, end: int, samples: int
     low = level - _HYSTERESIS * float(np.ptp(signed))
     crossings = np.flatnonzero((signed[1:] >= level) & (signed[:-1] < level))
     below = np.flatnonzero(signed <= low)
-    for k in crossings[::-1].tolist():
+    sought = crossings[::-1] if after is None else crossings[first + crossings + 1 >= after]
+    for k in sought.tolist():
         at = np.searchsorted(below, k, "right") - 1
         since = below[at] if at >= 0 else -1
         if since >= 0 and not (crossings[np.searchsorted(crossings, since)] < k):

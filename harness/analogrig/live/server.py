@@ -4,20 +4,22 @@
     /live?token=T         WebSocket of the page: frames and states out, views and commands in
     /foxglove?token=T     WebSocket with the subprotocol foxglove.websocket.v1 (foxglove.py)
 
-One client of the page drives, the others watch. When the driver is gone, the generator is switched off.
+One client of the page drives, the others watch; a viewer sets pots only while no page drives. When the driver is
+gone, the generator is switched off.
 
 Limits of a client:
 
     address  the token, a Host of this server, an Origin of the page (viewers outside a browser have none)
     memory   messages of MOST_MESSAGE_BYTES, one frame on its way, the buffers of the connection
     time     a client that takes nothing for SLOW_S is dropped
-    place    one of MOST_CLIENTS
+    place    one of MOST_CLIENTS, and of MOST_SOCKETS before it is let in
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 import logging
 import secrets
@@ -28,7 +30,7 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, quote, urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
@@ -48,6 +50,8 @@ if TYPE_CHECKING:
     from analogrig.live.session import LiveSession
 
 MOST_CLIENTS = 16
+MOST_SOCKETS = 4 * MOST_CLIENTS
+"""Open sockets, also of those that send no request."""
 MOST_MESSAGE_BYTES = 8192
 BUFFERED_BYTES = 262_144
 SLOW_S = 10.0
@@ -71,6 +75,25 @@ class _PageClient:
     screen: Screen = field(default_factory=Screen)
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when it must get the state at once."""
+
+
+class _Connection(ServerConnection):
+    """Connection that is noted as long as its socket is open; one too many is closed at once."""
+
+    def __init__(self, *arguments: Any, noted: dict[ServerConnection, bool], **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self._noted = noted
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        if len(self._noted) < MOST_SOCKETS:
+            self._noted[self] = False
+        else:
+            self.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._noted.pop(self, None)
+        super().connection_lost(exc)
 
 
 class BenchServer:
@@ -99,8 +122,11 @@ class BenchServer:
         self._slow_s = slow_s
         self._frame_s = frame_s
         self._clients: list[_PageClient] = []
-        self._viewers = 0
+        self._open: dict[ServerConnection, bool] = {}
+        """Connections with an open socket; true for those that have a place."""
         self._driver: _PageClient | None = None
+        self._setter: ServerConnection | None = None
+        """Viewer that sets parameters while no client of the page drives."""
         self._server: Server | None = None
         self._hosts: frozenset[str] = frozenset()
         self._page = page()
@@ -108,13 +134,15 @@ class BenchServer:
     @property
     def address(self) -> str:
         """URL of the page."""
-        return f"http://{self._host}/?token={self.token}"
+        return f"http://{self._host}/?token={quote(self.token, safe='')}"
 
     async def listen(self, host: str = "127.0.0.1", port: int = 0) -> None:
         """Listen at an address of this machine; port 0: any free one.
 
-        :raises ConfigurationError: listening there failed.
+        :raises ConfigurationError: listening there failed, or the address is that of all networks.
         """
+        if host in ("", "0.0.0.0", "::"):  # noqa: S104 - refused
+            raise ConfigurationError(f"cannot listen at {host!r}: name the one address that browsers open")
         try:
             self._server = await serve(
                 self._serve_socket,
@@ -129,9 +157,11 @@ class BenchServer:
                 open_timeout=5,
                 close_timeout=2,
                 server_header=None,
+                create_connection=functools.partial(_Connection, noted=self._open),  # type: ignore[arg-type]
             )
-        except OSError as error:
-            raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror or error}") from error
+        except (OSError, UnicodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else one_line(str(error))
+            raise ConfigurationError(f"cannot listen at {host[:80]!r}:{port}: {reason}") from error
         for listening in self._server.sockets:  # accepted connections inherit the options
             listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_RCVBUF, BUFFERED_BYTES)
             listening.setsockopt(socketlib.SOL_SOCKET, socketlib.SO_SNDBUF, BUFFERED_BYTES)
@@ -149,25 +179,32 @@ class BenchServer:
     # ---- requests
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Page, refusal, or None for a WebSocket that may open."""
-        refusal = self._refusal(request)
+        """Page, refusal, or None for a WebSocket that may open: it has a place from now on."""
+        try:
+            url = urlsplit(request.path)
+        except ValueError:
+            return connection.respond(HTTPStatus.BAD_REQUEST, "the address is malformed\n")
+        refusal = self._refusal(url, request.headers)
         if refusal is not None:
             return connection.respond(*refusal)
-        return _page_response(self._page) if urlsplit(request.path).path == "/" else None
+        if url.path == "/":
+            return _page_response(self._page)
+        if connection in self._open:
+            self._open[connection] = True
+        return None
 
-    def _refusal(self, request: Request) -> tuple[HTTPStatus, str] | None:
+    def _refusal(self, url: SplitResult, headers: Headers) -> tuple[HTTPStatus, str] | None:
         """Status and reason if the request is refused."""
-        url = urlsplit(request.path)
         token = parse_qs(url.query).get("token", [""])[0]
-        if _one(request.headers, "Host") not in self._hosts:
+        if _one(headers, "Host") not in self._hosts:
             return HTTPStatus.FORBIDDEN, "this Host is not served\n"
         if url.path not in ("/", _LIVE, _FOXGLOVE):
             return HTTPStatus.NOT_FOUND, "there is nothing here\n"
         if not secrets.compare_digest(token.encode(), self.token.encode()):
             return HTTPStatus.FORBIDDEN, "open the address that analogrig bench has printed\n"
-        if url.path != "/" and not self._is_welcome(_one(request.headers, "Origin"), url.path):
+        if url.path != "/" and not self._is_welcome(_one(headers, "Origin"), url.path):
             return HTTPStatus.FORBIDDEN, "this Origin is not served\n"
-        if url.path != "/" and len(self._clients) + self._viewers >= MOST_CLIENTS:
+        if url.path != "/" and sum(self._open.values()) >= MOST_CLIENTS:
             return HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MOST_CLIENTS} clients already\n"
         return None
 
@@ -179,13 +216,18 @@ class BenchServer:
         path = "" if socket.request is None else urlsplit(socket.request.path).path
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             if path == _FOXGLOVE:
-                self._viewers += 1
                 try:
-                    await foxglove.Viewer(socket, self.session, may_set=lambda: self._driver is None).serve()
+                    await foxglove.Viewer(socket, self.session, may_set=lambda: self._may_set(socket)).serve()
                 finally:
-                    self._viewers -= 1
+                    self._setter = None if self._setter is socket else self._setter
             else:
                 await self._serve_client(_PageClient(socket))
+
+    def _may_set(self, viewer: ServerConnection) -> bool:
+        """True if a viewer may set parameters: it is the one that does."""
+        if self._driver is None and self._setter is None:
+            self._setter = viewer
+        return self._driver is None and self._setter is viewer
 
     # ---- clients of the page
 

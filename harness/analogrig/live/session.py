@@ -6,12 +6,13 @@ reads the ring and the state. Commands take effect between two blocks; the sessi
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,16 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+class _Turn:
+    """Ordered turn of a pot."""
+
+    value: float
+    ramp_n: int
+    at_s: float | None
+    """Time of the order; None: paused."""
+
+
+@dataclass(frozen=True)
 class Saved:
     """Files of one recording."""
 
@@ -90,8 +101,7 @@ class LiveSession:
         self._folder = folder
         self._identity = identity
         self.clock = clock or WallClock()
-        self._lock = threading.Lock()
-        self._woken = threading.Event()
+        self._lock, self._woken = threading.Lock(), threading.Event()
         self._waiting: deque[tuple[Command, float]] = deque()
         parameters = self.desk.scenario.plant.parameters()
         self.values = {name: parameters[name] for name in self.knobs}
@@ -113,6 +123,9 @@ class LiveSession:
         self.notices: deque[tuple[int, str]] = deque(maxlen=_MOST_NOTED)
         self.saved: deque[Saved] = deque(maxlen=_MOST_NOTED)
         self.counters: Mapping[str, int] = {}
+        """Counters of the last take."""
+        self.link_counters: Mapping[str, int] = dict(device.link_counters)
+        """Counters of the link after the last block. Those of the device belong to the thread that plays."""
         self.meter = RateMeter(device)
         self.is_recording = False
         self.version = 0
@@ -123,33 +136,37 @@ class LiveSession:
         self._spoils: list[commands.Spoil] = []
         """Faults of the line that wait for the next answered block: handshake and configuration are spared."""
         self._steps = 0
-        self._ends_take = False
-        self._is_closed, self._is_made_safe = False, False
+        self._ends_take, self._is_closed, self._is_made_safe = False, False, False
         self._pace: tuple[float, int] | None = None
         """Time and sample from which the pace is counted."""
-        self._turns: dict[str, float] = {}
-        self._ramp_n = 0
-        self._turned_at: list[float] = []
+        self._turns: dict[str, _Turn] = {}
+        """Turns that have not taken effect, by parameter."""
         self._taken = 0
         """Samples of this take that the rig has been asked for."""
 
     # ---- from other threads
 
-    def do(self, command: Command) -> None:
-        """Check a command, and let it take effect before the next block.
+    def do(self, *wanted: Command) -> None:
+        """Check commands, and let them take effect before the next block: all or none.
 
-        :raises ConfigurationError: it is not possible on this bench, or too many commands wait.
+        :raises ConfigurationError: one is not possible on this bench, or too many commands wait.
         """
-        self._check(command)
+        for command in wanted:
+            self._check(command)
         with self._lock:
-            if len(self._waiting) >= MOST_WAITING:
+            if len(self._waiting) + len(wanted) > MOST_WAITING:
                 raise ConfigurationError("too many commands at once: wait for the next block")
-            self._waiting.append((command, self.clock()))
+            self._waiting.extend((command, self.clock()) for command in wanted)
         self._woken.set()
 
     def make_safe(self) -> None:
-        """Switch the generator off before the next block; a recording under way is saved."""
-        self._is_made_safe = True
+        """Switch the generator off before the next block; a recording under way is saved.
+
+        Commands that wait for the block are dropped.
+        """
+        with self._lock:
+            self._waiting.clear()
+            self._is_made_safe = True
         self._woken.set()
 
     def close(self) -> None:
@@ -177,6 +194,8 @@ class LiveSession:
                 self._refuse_while_recording("the mode")
             case commands.Spoil() if command.kind not in self.line_faults:
                 raise ConfigurationError(f"the line of this device has no fault {command.kind!r} to inject")
+            case commands.Spoil() if len(self._spoils) >= MOST_WAITING:
+                raise ConfigurationError("too many faults of the line wait for the next block")
             case commands.Inject() if command.fault not in self.desk.faults:
                 raise ConfigurationError(f"this rig has no fault {command.fault!r} to inject")
         if not self.desk.is_stepped and isinstance(command, commands.Operate | commands.Step | commands.ClearLamps):
@@ -213,6 +232,10 @@ class LiveSession:
 
     def _play_take(self) -> None:
         """Play from rest until something demands a new start."""
+        if not self.desk.is_stepped:
+            self._wait_to_play()
+            if self._is_closed:
+                return
         self._begin_take()
         keeps = self.take.is_recorded
         bench = Bench(
@@ -227,6 +250,8 @@ class LiveSession:
         except AnalogrigError as error:
             self._stop_after(str(error))
             return
+        if not self.desk.is_stepped and self.ring.end > CHANGE_N:
+            self._end_turns(self._turns, {name: turn.value for name, turn in self._turns.items()})
         self.counters = {**run.conditions.counters, **run.conditions.link_counters}
         if keeps:
             self._conclude(run)
@@ -238,14 +263,10 @@ class LiveSession:
         excitation = self.excitation
         if not self.is_on:
             excitation = _OFF
-        if not self.desk.is_stepped:
-            self._wait_to_play()
         scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))
         tweaks: tuple[PotChange, ...] = ()
         if not self.desk.is_stepped and self._turns:
-            tweaks = (PotChange(CHANGE_N, self._turns),)
-            self.values |= self._turns
-            self._turns, self._turned_at = {}, []
+            tweaks = (PotChange(CHANGE_N, {name: turn.value for name, turn in self._turns.items()}),)
         scenario = dataclasses.replace(scenario, excitation=excitation, tweaks=tweaks, seed=self.seed)
         self.take_number += 1
         self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
@@ -254,16 +275,21 @@ class LiveSession:
         self._taken = 0
         self.ring.restart()
         self.notes.begin(self.take, self.take_number)
+        if tweaks:
+            self._await_turns(CHANGE_N + 1, self._turns.values())
         self.version += 1
-        for fault in self.injected if self.is_recording else ():
+        for fault in self.injected:
             self._note_fault(fault)
+        for kind in () if self.device.faulty_line is None else self.device.faulty_line.lasting:
+            self.take.add_caveat(f"line fault {kind}: injected by hand before the recording")
 
     @property
     def ordered_values(self) -> dict[str, float]:
         """Values that the pots have, or get before the next block."""
         with self._lock:
             waiting = [command for command, _ in self._waiting if isinstance(command, commands.Turn)]
-        return {**self.values, **self._turns, **{turn.name: turn.value for turn in waiting}}
+            turned = {name: turn.value for name, turn in self._turns.items()}
+            return {**self.values, **turned, **{turn.name: turn.value for turn in waiting}}
 
     @property
     def line_faults(self) -> tuple[str, ...]:
@@ -275,12 +301,16 @@ class LiveSession:
         """Faults in force."""
         return set(self.desk.injected) if isinstance(self.desk, SteppedDesk) else set()
 
+    @property
+    def _plays(self) -> bool:
+        """True unless paused; rigs of whole records are silent while the generator is off."""
+        return self.is_playing and (self.is_on or self.desk.is_stepped)
+
     def _wait_to_play(self) -> None:
         """Outside a take: apply the commands, and wait while there is nothing to play."""
         while True:
             self._apply_commands()
-            is_due = self.is_playing and (self.is_on or self.desk.is_stepped)
-            if is_due or self._steps or self._is_closed:
+            if self._plays or self._steps or self._is_closed:
                 return
             self._wait(None)
 
@@ -352,29 +382,33 @@ class LiveSession:
                 if not self._waiting:
                     break
                 command, at_s = self._waiting.popleft()
+                if isinstance(command, commands.Turn):
+                    self._turns[command.name] = _Turn(command.value, command.ramp_n, at_s if self._plays else None)
             try:
                 self._check(command)  # again: the bench may have changed since
-                self._apply(command, at_s)
+                self._apply(command)
             except (AnalogrigError, EmulatorError) as error:
                 self.notify(str(error))
+                if isinstance(command, commands.Turn):
+                    self._end_turns({command.name: self._turns[command.name]}, {})
             self.version += 1
         if isinstance(self.desk, SteppedDesk):
             self._turn_pots(self.desk)
 
-    def _apply(self, command: Command, at_s: float) -> None:
+    def _apply(self, command: Command) -> None:
         match command:
             case commands.Turn():
-                self._turns[command.name] = command.value
-                self._ramp_n = command.ramp_n
-                self._turned_at.append(at_s)
+                pass  # it is noted as it leaves the queue
             case commands.Generate():
                 self.excitation = self._generated(command)
                 self.is_on = self.is_on if command.on is None else command.on
                 self._ends_take = True
             case commands.SetPlaying():
                 self.is_playing, self._steps, self._pace = command.on, 0, None
+                self._forget_times()
             case commands.Step():
                 self.is_playing, self._steps = False, self._steps + command.samples
+                self._forget_times()
             case commands.Tempo():
                 self.factor, self._pace = command.factor, None
             case commands.Restart():
@@ -407,7 +441,7 @@ class LiveSession:
         self.mode, self.lamps = desk.mode, tuple(desk.lamps)
 
     def _note_fault(self, fault: commands.Fault) -> None:
-        self.take.caveats.append(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
+        self.take.add_caveat(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
 
     def _turn_pots(self, desk: SteppedDesk) -> None:
         """Turn the pots that the hand has turned, unless one is still turning."""
@@ -419,21 +453,37 @@ class LiveSession:
             return
         sample = self._taken - 1
         is_fresh = sample > (self.take.changes[-1].sample if self.take.changes else 0)
-        ramp_n = self._ramp_n if is_fresh else 0
-        turns, self._turns = self._turns, {}
-        times_s, self._turned_at = self._turned_at, []
-        turns = {name: value for name, value in turns.items() if value != self.values[name]}
-        if not turns:
-            return
+        ramp_n = next(iter(self._turns.values())).ramp_n
+        if ramp_n and self.take.changes and not is_fresh:
+            return  # a change has one ramp: this one begins at the next sample
+        ramped = {name: turn for name, turn in self._turns.items() if turn.ramp_n == ramp_n}
+        values = {name: turn.value for name, turn in ramped.items() if turn.value != self.values[name]}
+        ramp_n = ramp_n if is_fresh else 0
         try:
-            desk.turn(self.values | turns, turns, sample, ramp_n)
+            if values:
+                desk.turn(self.values | values, values, sample, ramp_n)
+                self.take.change(sample, values, ramp_n)
+                self._await_turns(sample + 1, [ramped[name] for name in values])
+                self.version += 1
         except AnalogrigError as error:
             self.notify(str(error))
-            return
-        self.values |= turns
-        self.take.change(sample, turns, ramp_n)
-        self.notes.await_turn(sample + 1, times_s)
-        self.version += 1
+            values = {}
+        self._end_turns(ramped, values)
+
+    def _await_turns(self, sample: int, turns: Iterable[_Turn]) -> None:
+        """Time the turns that this sample feels first."""
+        self.notes.await_turn(sample, [turn.at_s for turn in turns if turn.at_s is not None])
+
+    def _forget_times(self) -> None:
+        """Time no turns that were ordered until now: a pause would count as their delay."""
+        self.notes.forget_turns()
+        self._turns = {name: dataclasses.replace(turn, at_s=None) for name, turn in self._turns.items()}
+
+    def _end_turns(self, turns: Mapping[str, _Turn], values: Mapping[str, float]) -> None:
+        """Note the values that turns have reached."""
+        with self._lock:
+            self.values |= values
+            self._turns = {name: turn for name, turn in self._turns.items() if name not in turns}
 
     def _spoil(self) -> None:
         """Inject the faults of the line that were asked for."""
@@ -441,7 +491,7 @@ class LiveSession:
         if self.device.faulty_line is not None:
             for each in spoils:
                 self.device.faulty_line.inject(each.kind, each.direction)
-                self.take.caveats.append(
+                self.take.add_caveat(
                     f"line fault {each.kind}, {each.direction} the device: injected by hand at sample {self.ring.end}"
                 )
 
@@ -449,6 +499,7 @@ class LiveSession:
         """Take note of an answered block."""
         now_s = self.clock()
         self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
+        self.link_counters = dict(self.device.link_counters)
         self.ring.add(block, self.desk.probed(len(block.codes)), answers)
         self._spoil()
         self.meter.count(len(answers), now_s)
@@ -461,12 +512,12 @@ class LiveSession:
         """Save a recorded take, unless it has no samples."""
         if not run.samples:
             return
-        concluded = self.take.concluded(run)
-        if self._identity is not None:
-            concluded = concluded.with_identity(dataclasses.replace(self._identity, devices=self.device.files()))
         try:
+            concluded = self.take.concluded(run)
+            if self._identity is not None:
+                concluded = concluded.with_identity(dataclasses.replace(self._identity, devices=self.device.files()))
             self._folder.mkdir(parents=True, exist_ok=True)
-            number = next(n for n in itertools.count(1) if not self._file(n, "npz").exists())
+            number = self._reserve_number()
             table = {k: v for k, v in concluded.conditions.scenario.items() if v != "" and k not in ("name", "rig")}
             with replace_file(self._file(number, "toml")) as file:
                 file.write(config.to_toml(table).encode())
@@ -479,13 +530,27 @@ class LiveSession:
         held = f"{number_of(run.samples, 'sample', form=',')}, {number_of(saved.alarms, 'alarm')}"
         self.notify(f"saved {saved.run}: {held}; scenario: {saved.scenario}")
 
+    def _reserve_number(self) -> int:
+        """Number of the next recording; its scenario is created, so that no other bench takes it.
+
+        :raises OSError: the folder cannot be written to.
+        """
+        for number in itertools.count(1):
+            if not self._file(number, "npz").exists():
+                with contextlib.suppress(FileExistsError):
+                    self._file(number, "toml").open("x").close()
+                    return number
+        raise AssertionError
+
     def _file(self, number: int, suffix: str) -> Path:
         return self._folder / f"take-{number}.{suffix}"
 
     def _stop_after(self, reason: str) -> None:
         """Pause after a failure."""
+        self.link_counters = dict(self.device.link_counters)
         self.notify(f"stopped: {reason}")
         self.is_playing, self._steps, self.is_recording, self._has_failed = False, 0, False, True
+        self._forget_times()
 
     def _bring_back(self) -> None:
         """Bring the device back as soon as a hand wants to go on."""

@@ -9,13 +9,16 @@ from dataclasses import dataclass, field
 from analogrig.answers import Answers
 from analogrig.bench import RunBuilder
 from analogrig.datasheet import Datasheet
-from analogrig.plant import Segment
+from analogrig.plant import MAX_CHANGES, Segment
 from analogrig.rigs.rig import Block
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario, segments_of
 
 MOST_RECORDED_N = 2_000_000
 """Samples of the longest recording: 100 s at 20,000 samples/s, 80 MB."""
+
+MOST_KEPT_CHANGES = 50
+"""Changes that a take keeps if it is not recorded: bounds are looked for after the last ones only."""
 
 Watch = Callable[[Block, Answers], None]
 
@@ -25,7 +28,7 @@ class Take:
     """One play: its scenario so far, and the changes that were made by hand."""
 
     scenario: Scenario
-    """Scenario at its first sample."""
+    """Scenario at its first sample; older changes of an unrecorded take are part of it."""
     is_recorded: bool = False
     changes: list[PotChange] = field(default_factory=list)
     caveats: list[str] = field(default_factory=list)
@@ -39,6 +42,14 @@ class Take:
             self.changes[-1] = dataclasses.replace(self.changes[-1], set={**self.changes[-1].set, **values})
         else:
             self.changes.append(PotChange(sample, values, ramp_n))
+        if not self.is_recorded and len(self.changes) > MOST_KEPT_CHANGES:
+            oldest = self.changes.pop(0)
+            self.scenario = self.scenario.with_plant(self.scenario.plant.changed(oldest.set))
+
+    def add_caveat(self, reason: str) -> None:
+        """Note a reason that the recording cannot be judged."""
+        if self.is_recorded and len(self.caveats) < MAX_CHANGES:
+            self.caveats.append(reason)
 
     def segments(self) -> tuple[Segment, ...]:
         """True plant from the start and after each change."""
@@ -55,6 +66,10 @@ class Take:
     def concluded(self, run: Run) -> Run:
         """Run with the scenario that was played by hand, instead of the endless one."""
         scenario = self.played(run.samples)
+        if scenario.tweaks and scenario.tweaks[-1].ramp_n < next(
+            change.ramp_n for change in self.changes if change.sample == scenario.tweaks[-1].sample
+        ):
+            self.add_caveat("the recording ends while a pot turns: its scenario turns the pot faster")
         conditions = dataclasses.replace(
             run.conditions,
             samples_asked=run.samples,

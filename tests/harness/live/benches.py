@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from analogrig.live.commands import Command
 from analogrig.live.server import BenchServer
 from analogrig.live.session import LiveSession
 from analogrig.rigs.description import open_rig
+from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.scenario import Scenario
 
 SEED = 7
@@ -33,6 +35,27 @@ Action = Command | Callable[[LiveSession], None]
 def linked() -> Device:
     """Device behind a line into which a hand can inject faults, as the command opens it."""
     return open_dut("inproc", exchange="block", report_interval_n=REPORT_INTERVAL_N, wire_faults=NO_FAULTS)
+
+
+class RecordsRig(Rig):
+    """Rig that plays whole records, as a real one does; calls ``begun`` with the scenario of each."""
+
+    def __init__(self, begun: Callable[[Scenario], None]) -> None:
+        self._begun = begun
+        self._inner = open_rig("emulator")
+        self.capabilities = self._inner.capabilities
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        performance = self._inner.perform(scenario, seed)
+
+        def blocks() -> Iterator[Block]:
+            self._begun(scenario)
+            yield from performance.blocks
+
+        return dataclasses.replace(performance, blocks=blocks())
+
+    def description(self) -> Mapping[str, Any]:
+        return self._inner.description()
 
 
 class ScriptedClock:
@@ -70,12 +93,12 @@ def scripted_session(
     folder: Path,
     *,
     scenario: Scenario | None = None,
-    rig: str = "emulator",
+    rig: str | Rig = "emulator",
     dut: Device | None = None,
 ) -> LiveSession:
     """Session that has played a script to its end; time is that of the machine. The device is closed."""
     clock = ScriptedClock(script)
-    with open_rig(rig) as opened, dut or describe("inproc").direct() as device:
+    with open_rig(rig) if isinstance(rig, str) else rig as opened, dut or describe("inproc").direct() as device:
         session = LiveSession(opened, scenario or Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
         clock.session = session
         session.run()

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import ClientConnection
 
+from analogrig.live import foxglove
 from analogrig.live.server import BenchServer
 from tests.harness.live.benches import LiveBench
 from tests.harness.live.test_server import open_client, played
@@ -143,6 +144,18 @@ def test_alarm_is_sent_with_its_latency(bench: BenchServer) -> None:
     played(work)
 
 
+def test_viewer_whose_messages_fail_is_disconnected(bench: BenchServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def work() -> None:
+        async with open_viewer(bench) as socket:
+            channels = {each["topic"]: each["id"] for each in (await text(socket, "advertise"))["channels"]}
+            monkeypatch.setattr(foxglove.Viewer, "_rows", lambda *_: 1 / 0)
+            subscription = {"id": 1, "channelId": channels["/signals"]}
+            await socket.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
+            await socket.wait_closed()
+
+    played(work)
+
+
 def test_parameters_obey_the_limits_and_the_driver(bench: BenchServer) -> None:
     async def work() -> None:
         async with open_viewer(bench) as socket:
@@ -151,9 +164,21 @@ def test_parameters_obey_the_limits_and_the_driver(bench: BenchServer) -> None:
             status = await text(socket, "status")
             assert status["level"] == 2
             assert "K must be" in status["message"]
+            huge = 10**400  # beyond the range of a float
+            for values in ({"K": 16000.0, "M": 1e9}, {"K": 16000.0, "M": huge}):
+                settings = [{"name": name, "value": value} for name, value in values.items()]
+                await socket.send(json.dumps({"op": "setParameters", "parameters": settings}))
+                assert (await text(socket, "status"))["level"] == 2
+            await socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1e999, "channelId": 1}]}))
+            assert "as the protocol describes" in (await text(socket, "status"))["message"]
+            assert bench.session.ordered_values["K"] == 24500.0
+            setting = json.dumps({"op": "setParameters", "parameters": [{"name": "K", "value": 2e4}]})
+            async with open_viewer(bench) as second:
+                await second.send(setting)
+                assert "another client drives" in (await text(second, "status"))["message"]
             async with open_client(bench):
-                await socket.send(json.dumps({"op": "setParameters", "parameters": [{"name": "K", "value": 2e4}]}))
-                assert "the page drives" in (await text(socket, "status"))["message"]
+                await socket.send(setting)
+                assert "another client drives" in (await text(socket, "status"))["message"]
 
     played(work)
     assert bench.session.values["K"] != 2e4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import socket
 import urllib.error
@@ -18,8 +19,9 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 from websockets.http11 import USER_AGENT
 
+from analogrig.errors import ConfigurationError
 from analogrig.live.scope import unpacked
-from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, BenchServer
+from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from analogrig.run import Run
 from tests.harness.live.benches import LiveBench
 
@@ -76,6 +78,9 @@ def open_client(server: BenchServer, path: str = "/live", **more: Any) -> Any:
     """Connection to an endpoint, with the token and the origin of the page unless ``more`` has others."""
     token = more.pop("token", server.token)
     more.setdefault("origin", f"http://{host_of(server)}")
+    if "named" in more:  # the host of the URL, as a browser that was led here by another name sends it
+        address, _, port = host_of(server).rpartition(":")
+        return connect(f"ws://{more.pop('named')}{path}?token={token}", host=address, port=int(port), **more)
     return connect(f"ws://{host_of(server)}{path}?token={token}", **more)
 
 
@@ -103,6 +108,7 @@ def test_page_needs_the_token_and_a_host_of_this_server(bench: BenchServer) -> N
     assert status_of(base) == 403
     assert status_of(f"{base}/etc/passwd?token={bench.token}") == 404
     assert status_of(bench.address, Host="evil.example") == 403
+    assert status_of(f"{base}//[") == 400
 
 
 @pytest.mark.parametrize("path", ["/live", "/foxglove"])
@@ -113,7 +119,7 @@ def test_page_needs_the_token_and_a_host_of_this_server(bench: BenchServer) -> N
         {"token": ""},
         {"origin": "http://evil.example"},
         {"origin": "null"},
-        {"additional_headers": {"Host": "evil.example"}},
+        {"named": "evil.example"},
     ],
     ids=str,
 )
@@ -251,17 +257,46 @@ def test_client_that_takes_nothing_is_dropped_and_holds_up_nobody(tmp_path: Path
         played(lambda: work(bench))
 
 
-def test_newcomer_is_turned_away_when_all_places_are_taken(bench: BenchServer) -> None:
+def test_newcomers_are_turned_away_when_all_places_are_taken(bench: BenchServer) -> None:
     async def work() -> None:
-        async with asyncio.TaskGroup() as group:
-            clients = [group.create_task(open_client(bench).__aenter__()) for _ in range(MOST_CLIENTS)]
-        with pytest.raises(InvalidStatus) as refused:
-            async with open_client(bench):
-                pass
-        assert refused.value.response.status_code == 503
-        await asyncio.gather(*(each.result().close() for each in clients))
+        opening = [open_client(bench).__aenter__() for _ in range(MOST_CLIENTS + 4)]
+        clients = await asyncio.gather(*opening, return_exceptions=True)
+        refused = [each for each in clients if isinstance(each, InvalidStatus)]
+        assert [each.response.status_code for each in refused] == [503] * 4
+        await asyncio.gather(*(each.close() for each in clients if isinstance(each, ClientConnection)))
+        while True:  # a place is free as soon as the server has seen the end
+            with contextlib.suppress(InvalidStatus):
+                async with open_client(bench) as newcomer:
+                    await Client(newcomer).until(lambda state: state["drives"])
+                    return
 
     played(work)
+
+
+def test_sockets_without_a_request_are_limited(bench: BenchServer) -> None:
+    host, _, port = host_of(bench).rpartition(":")
+    with contextlib.ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(MOST_SOCKETS + 1)]
+        with contextlib.suppress(ConnectionError):
+            assert silent[-1].recv(1) == b""
+        silent[0].settimeout(0.0)
+        with pytest.raises(BlockingIOError):
+            silent[0].recv(1)
+
+
+def test_token_of_any_characters_opens_the_printed_address(tmp_path: Path) -> None:
+    with LiveBench(tmp_path, token="a+b%&# c") as server:  # noqa: S106
+        assert status_of(server.address) == 200
+
+
+@pytest.mark.parametrize(
+    ("host", "words"),
+    [("", "name the one"), ("0.0.0.0", "name the one"), ("::", "name the one"), ("x" * 300, "cannot listen")],  # noqa: S104
+)
+def test_address_that_cannot_be_opened_is_refused(host: str, words: str, bench: BenchServer) -> None:
+    other = BenchServer(bench.session)
+    with pytest.raises(ConfigurationError, match=words):
+        asyncio.run(other.listen(host))
 
 
 def test_frames_hold_what_the_card_has_seen(bench: BenchServer) -> None:

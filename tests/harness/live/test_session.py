@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from analogrig import cli
 from analogrig.catalogue import BLOCK_SAMPLES
 from analogrig.cli.bench import NO_FAULTS
 from analogrig.devices.opening import open_dut
-from analogrig.errors import ConfigurationError
+from analogrig.errors import ConfigurationError, RigError
 from analogrig.judging.verdict import judge
 from analogrig.links.faulty_bus import FaultyBus
 from analogrig.links.wire_faults import FaultyLine, FaultyWire
@@ -36,14 +38,17 @@ from analogrig.live.commands import (
 )
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
+from analogrig.live.panel import state_table
+from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
 from analogrig.live.session import BLOCK_S, LiveSession
+from analogrig.live.take import MOST_KEPT_CHANGES, Take
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import SuspensionComputer
-from tests.harness.live.benches import SEED, linked, scripted_session
+from tests.harness.live.benches import SEED, Action, RecordsRig, linked, scripted_session
 
 RATE_HZ = 20_000
 BLOCK_N = int(RATE_HZ * BLOCK_S)
@@ -135,6 +140,50 @@ def test_pot_is_felt_within_one_block(recorded: LiveSession) -> None:
     assert max(recorded.notes.felt_s) <= 2 * BLOCK_S
 
 
+def test_turns_at_once_keep_their_own_ramps(tmp_path: Path) -> None:
+    script = ((0.05, Turn("K", 18000.0)), (0.05, Turn("B", 3453.0, 100)), (0.1, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path)
+    assert [(change.set, change.ramp_n) for change in session.take.changes] == [
+        ({"K": 18000.0}, 0),
+        ({"B": 3453.0}, 100),
+    ]
+    assert not session._turns
+
+
+def test_turn_while_paused_is_not_timed(tmp_path: Path) -> None:
+    script = (
+        *((0.05, SetPlaying(on=False)), (0.1, Turn("K", 18000.0)), (50.0, SetPlaying(on=True))),
+        *((50.1, Turn("K", 19000.0)), (50.2, SetPlaying(on=False))),
+    )
+    felt_s = scripted_session(script, tmp_path).notes.felt_s
+    assert len(felt_s) == 1
+    assert felt_s[0] <= 2 * BLOCK_S
+
+
+def test_turn_on_a_rig_of_whole_records_lasts_and_is_timed_in_the_record_that_feels_it(tmp_path: Path) -> None:
+    sessions: list[LiveSession] = []
+    values: list[tuple[float, float]] = []
+
+    def begin(_: Scenario) -> None:
+        (session,) = sessions
+        values.append((session.values["K"], session.ordered_values["K"]))
+        match len(values):
+            case 1:
+                session.do(Turn("K", 18000.0))
+            case 2:
+                raise RigError("the card is gone")
+            case 3:
+                session.do(Turn("K", 19000.0))
+            case _:
+                session.make_safe()
+
+    script = ((1.0, sessions.append), (2.0, Generate(on=True)), (9.0, SetPlaying(on=True)))
+    session = scripted_session(script, tmp_path, rig=RecordsRig(begin))
+    assert values == [(24500.0, 24500.0), (24500.0, 18000.0), (24500.0, 18000.0), (18000.0, 19000.0)]
+    assert session.values["K"] == 19000.0
+    assert len(session.notes.felt_s) == 1  # not the turn that has waited for a hand to go on
+
+
 def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) -> None:
     ends: list[int] = []
 
@@ -145,6 +194,18 @@ def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) 
         ((0.0, SetPlaying(on=False)), (1.0, note), (2.0, Step(1)), (3.0, note), (4.0, Step(7)), (5.0, note)), tmp_path
     )
     assert ends == [0, 1, 8]
+
+
+def test_amplifiers_are_shown_with_the_block_of_their_channels(tmp_path: Path) -> None:
+    pause, steps = (0.1, SetPlaying(on=False)), ((0.2, Step(10)), (0.3, Step(100)), (0.4, Step(1)))
+    tempo = ((0.5, Tempo(10.0)), (0.5, SetPlaying(on=True)), (0.8, Tempo(0.1)), (0.81, SetPlaying(on=False)))
+    session = scripted_session((pause, *steps, *tempo), tmp_path, dut=linked())
+    signals, end = signals_of(session), session.ring.end
+    (same,) = [
+        each.id for each in signals.values() if each.id != "displacement" and each.node == signals["displacement"].node
+    ]
+    seen, probed = (read_signal(session, name, 0, end) for name in ("displacement", same))
+    assert np.abs(seen - probed).max() < 0.05
 
 
 def test_time_factor_slows_and_hastens_the_session(tmp_path: Path) -> None:
@@ -192,6 +253,32 @@ def test_generator_plays_a_sine_for_as_long_as_it_is_on(tmp_path: Path) -> None:
     lines = np.abs(np.fft.rfft(force_v - force_v.mean())) / 200
     assert np.argmax(lines) == 4  # 200 Hz at 20 kHz
     assert np.delete(lines, 4).max() < 0.1 * lines[4]
+
+
+def test_commands_of_a_gone_driver_do_not_undo_the_switch_off(tmp_path: Path) -> None:
+    def leave(session: LiveSession) -> None:
+        session.do(Generate(on=True, high_v=5.0))
+        session.do(SetRecording(on=True))
+        session.make_safe()
+
+    session = scripted_session(((0.05, leave), (0.1, SetPlaying(on=False))), tmp_path)
+    assert (session.is_on, session.is_recording, session.take_number) == (False, False, 2)
+    assert not session.saved
+    assert not session.ring.read("codes", 0, session.ring.end).std(axis=0).max() > 2
+
+
+def test_rig_of_whole_records_plays_only_while_the_generator_is_on(tmp_path: Path) -> None:
+    levels_v: list[float] = []
+    sessions: list[LiveSession] = []
+
+    def note(scenario: Scenario) -> None:
+        levels_v.append(scenario.excitation.high_v)
+        sessions[0].make_safe()
+
+    script = ((1.0, sessions.append), (2.0, Generate(on=True, high_v=4.0)), (3.0, SetPlaying(on=True)))
+    session = scripted_session(script, tmp_path, rig=RecordsRig(note))
+    assert levels_v == [4.0]
+    assert session.take_number == 1
 
 
 def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path: Path) -> None:
@@ -270,6 +357,13 @@ def test_long_take_needs_no_more_memory_than_a_short_one(tmp_path: Path) -> None
     assert session.ring.end > session.ring.start > 0
 
 
+def test_turned_pots_of_an_unrecorded_take_need_bounded_memory(tmp_path: Path) -> None:
+    turns = [(0.01 * k, Turn("K", 18000.0 + 50.0 * k)) for k in range(1, 2 * MOST_KEPT_CHANGES)]
+    session = scripted_session((*turns, (2.0, SetPlaying(on=False))), tmp_path)
+    assert len(session.take.changes) == MOST_KEPT_CHANGES
+    assert session.take.segments()[-1].plant.parameters()["K"] == turns[-1][1].value == session.values["K"]
+
+
 def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
     script = (
         (0.02, Turn("K", 18000.0)),
@@ -290,6 +384,56 @@ def test_frame_lost_by_hand_is_counted_and_recorded(tmp_path: Path) -> None:
     (fault,) = run.conditions.faults
     assert re.fullmatch(r"line fault drop, to the device: injected by hand at sample \d+", fault)
     assert cli.main(["judge", str(session.saved[0].run), "--out", str(tmp_path / "judged")]) == 3
+
+
+def test_state_reads_no_counters_of_the_device_that_another_thread_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states: list[dict[str, Any]] = []
+
+    def note(session: LiveSession) -> None:
+        with monkeypatch.context() as patched:
+            patched.setattr(type(session.device), "link_counters", property(lambda _: pytest.fail("read")))
+            states.append(state_table(session))
+
+    session = scripted_session(((0.02, Spoil("flip", "from")), (0.1, note)), tmp_path, dut=linked())
+    assert states[0]["link_counters"] == {k: v for k, v in session.device.link_counters.items() if v} != {}
+
+
+def test_lasting_line_fault_from_before_the_recording_makes_it_inconclusive(tmp_path: Path) -> None:
+    script = ((0.02, Spoil("babble", "to")), (0.05, SetRecording(on=True)), (0.1, SetRecording(on=False)))
+    session = scripted_session(script, tmp_path, dut=linked())
+    (saved,) = session.saved
+    assert "line fault babble: injected by hand before the recording" in Run.load(saved.run).conditions.faults
+
+
+def test_recording_that_ends_within_a_ramp_is_inconclusive(tmp_path: Path) -> None:
+    script = ((0.0, SetRecording(on=True)), (0.05, Turn("K", 18000.0, 2000)), (0.1, SetRecording(on=False)))
+    (saved,) = scripted_session(script, tmp_path).saved
+    assert any("while a pot turns" in fault for fault in Run.load(saved.run).conditions.faults)
+    assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
+
+
+def test_recording_takes_no_number_that_another_file_has(tmp_path: Path) -> None:
+    (tmp_path / "take-1.toml").write_text("mine")
+    (tmp_path / "take-2.npz").write_text("mine")
+    script = ((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False)))
+    (saved,) = scripted_session(script, tmp_path).saved
+    assert saved.scenario.name == "take-3.toml"
+    assert (tmp_path / "take-1.toml").read_text() == "mine"
+
+
+def test_recording_that_cannot_be_saved_is_named_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(Take, "concluded", fail)
+    script = ((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False)), (0.05, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path)
+    assert "could not be saved: [Errno 24] Too many open files" in session.notices[0][1]
+    assert session.take_number == 3
 
 
 def test_cut_line_stops_the_session_until_it_is_mended(tmp_path: Path) -> None:
@@ -330,6 +474,26 @@ def test_every_line_fault_has_a_label(name: str, line: type[FaultyLine[Any, Any]
     with open_dut(name, wire_faults=NO_FAULTS) as device:
         assert isinstance(device.faulty_line, line)
     assert set(line.KINDS) <= set(LINE_LABELS)
+
+
+def test_single_shot_shows_the_first_trigger_after_it_was_armed_in_every_view(tmp_path: Path) -> None:
+    screen = Screen()
+    view = View(("force",), Trigger("force", level=5.0, mode="single"), samples=40)
+    shots: list[Any] = []
+
+    def shoot(session: LiveSession) -> None:
+        frame = screen.frame(session)
+        shots.append(None if frame is None else unpacked(frame)[0])
+
+    def show(samples: int) -> Callable[[LiveSession], None]:
+        return lambda _: screen.change(replace(view, samples=samples))
+
+    script: tuple[Action, ...] = (SetPlaying(on=False), show(40), shoot, Step(250), shoot, show(80), shoot, shoot)
+    session = scripted_session([(0.1 + 0.1 * i, each) for i, each in enumerate(script)], tmp_path)
+    armed = session.ring.end - 250
+    assert [shot is not None for shot in shots] == [False, True, True, False]
+    assert armed <= shots[1]["trigger"] < armed + 100 + 1  # a period of the force
+    assert (shots[2]["trigger"], shots[2]["samples"]) == (shots[1]["trigger"], 80)
 
 
 @pytest.mark.parametrize(
