@@ -20,13 +20,10 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
         "rig": str(desk.description().get("name", "")),
         "program": desk.program.name,
         "dut": device.name,
-        "link": device.link_name,
-        "time_scale": desk.program.circuit.scales.time,
         "stepped": desk.is_stepped,
         "modes": ["POT SET", "INITIAL CONDITION", "HOLD", "OPERATE"] if desk.is_stepped else [],
         "faults": dict(desk.faults),
         "line_faults": {kind: LINE_LABELS[kind] for kind in session.line_faults},
-        "line": {name: count for name, count in device.line.items() if count},
         "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
         "level": sum(session.excitation.range_v) / 2.0,
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
@@ -84,7 +81,6 @@ def state_table(session: LiveSession) -> dict[str, Any]:
     estimates = session.notes.estimates()
     end = session.ring.end
     return {
-        "version": session.version,
         "take": session.take_number,
         "samples": end,
         "playing": session.is_playing,

@@ -27,7 +27,9 @@
   let plotKey = "";
   let kept = [];
   let arm = 0;
+  let level = 0; // of the trigger, in volts or in the device's own numbers
   let number = 0;
+  const views = new Set(); // numbers of views that are not answered; their answers leave an error in sight
   const knobs = new Map();
   const voltages = new Map(); // texts of the patch by amplifier
   const settings = document.querySelectorAll("#generator [data-key]");
@@ -54,6 +56,7 @@
 
   function told(message) {
     if (message.bench) {
+      views.clear();
       bench = message.bench;
       complain("");
       build();
@@ -64,7 +67,8 @@
       show();
     } else {
       for (const knob of knobs.values()) knob.answered(message.re);
-      complain(message.error ?? "");
+      const isView = views.delete(message.re);
+      if (message.error || !isView) complain(message.error ?? "");
       if (message.error && state) show();
     }
   }
@@ -134,7 +138,7 @@
     shown = shown.filter((id) => bench.signals.some((each) => each.id === id));
     if (!shown.length) shown = bench.signals.slice(0, 2).map(({ id }) => id);
     if (!shown.includes(current)) [current] = shown;
-    if (!$("source").value) $("level").value = short(bench.level);
+    if (!$("source").value) level = bench.level;
     const base = $("base").value;
     $("base").replaceChildren();
     for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")} per division`);
@@ -336,7 +340,12 @@
       if (turn === this.awaited) this.awaited = 0;
     }
 
+    get isDisabled() {
+      return this.slider.getAttribute("aria-disabled") === "true";
+    }
+
     key(event) {
+      if (this.isDisabled) return;
       const steps = { ArrowUp: 1, ArrowRight: 1, ArrowDown: -1, ArrowLeft: -1, PageUp: 10, PageDown: -10 };
       const ends = { Home: this.knob.low, End: this.knob.high };
       if (event.key in steps) this.turn(this.value * 1.01 ** (steps[event.key] * (event.shiftKey ? 0.1 : 1)));
@@ -346,13 +355,14 @@
     }
 
     wheel(event) {
+      if (this.isDisabled) return;
       event.preventDefault();
       this.turn(this.value * 1.01 ** (event.deltaY < 0 ? 1 : -1));
     }
 
     // A ramp lasts until the next message of the hand, so that the pot follows it evenly.
     grasp(event) {
-      if (this.slider.getAttribute("aria-disabled") === "true") return;
+      if (this.isDisabled) return;
       this.held = true;
       this.slider.setPointerCapture(event.pointerId);
       let [y, fraction, sent] = [event.clientY, this.fraction, 0];
@@ -552,7 +562,7 @@
     const trigger = {
       source: $("source").value,
       slope: $("slope").value,
-      level: Number($("level").value) / factorOf($("source").value),
+      level,
       mode: $("mode").value,
       position: Number($("position").value),
     };
@@ -560,12 +570,13 @@
     const kind = $("kind").value;
     kept = [];
     $("arm").hidden = $("mode").value !== "single";
+    if (document.activeElement !== $("level")) $("level").value = short(level * factorOf($("source").value), 6);
     $("level-unit").textContent = unitOf($("source").value);
     $("screen").hidden = kind === "xy";
     $("xy").hidden = kind !== "xy";
     $("cursor-panel").hidden = !$("cursors").checked || kind === "xy";
     $("screen").setAttribute("aria-label", kind === "fft" ? "Spectrum of the signals" : "Signals over time");
-    send("view", { signals: shown, samples, columns, kind, trigger, arm });
+    views.add(send("view", { signals: shown, samples, columns, kind, trigger, arm }));
   }
 
   function drawn(buffer) {
@@ -697,6 +708,7 @@
   }
 
   function showCursors() {
+    if (!(current in frame.values)) return; // it was added after this frame
     const at = times(frame);
     const places = ["cursor-a", "cursor-b"].map((id) => Math.round(Number($(id).value) * (at.length - 1)));
     const [a, b] = places.map((i) => frame.values[current][i]);
@@ -773,7 +785,13 @@
         send("generate", { [each.dataset.key]: value });
       };
     }
-    for (const id of ["kind", "base", "source", "slope", "level", "mode", "position", "cursors"]) $(id).onchange = look;
+    for (const id of ["kind", "base", "source", "slope", "position", "cursors"]) $(id).onchange = look;
+    $("level").onchange = () => {
+      const value = Number($("level").value) / factorOf($("source").value);
+      if ($("level").value !== "" && Number.isFinite(value)) level = value;
+      $("level").blur();
+      look();
+    };
     $("mode").onchange = $("arm").onclick = () => {
       arm += 1;
       look();
