@@ -292,9 +292,9 @@ def _memory(minutes: float) -> Iterator[Figure]:
         seen.append(next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")))
 
     fast = 1e-3
-    turns = ((fast * s, Turn("K", 22000.0 + 500.0 * (s % 2))) for s in range(1, int(60.0 * minutes)))
-    notes = ((60.0 * fast, note), (60.0 * minutes * fast, note))
-    script: list[tuple[float, Action]] = [(0.0, Tempo(fast)), *sorted((*turns, *notes), key=lambda each: each[0])]
+    script: list[tuple[float, Action]] = [(0.0, Tempo(fast)), (60.0 * fast, note), (60.0 * minutes * fast, note)]
+    script += [(fast * s, Turn("K", 22000.0 + 500.0 * (s % 2))) for s in range(1, int(60.0 * minutes))]
+    script.sort(key=lambda each: each[0])
     with tempfile.TemporaryDirectory() as folder:
         scripted_session(script, Path(folder))
     yield Figure(f"growth of memory from 1 to {minutes:g} minutes of machine time", seen[1] - seen[0], "MB")
