@@ -357,14 +357,14 @@ class LiveSession:
         self._woken.clear()
 
     @property
-    def performance(self) -> Performance | None:
-        """Play under way; None before the first."""
+    def performance(self) -> Performance:
+        """Play under way; before the first, one that is not taken."""
         return self.desk.performance
 
     @property
     def sample_rate_hz(self) -> float:
         """Samples per second of machine time."""
-        return 20e3 if self.performance is None else 1.0 / self.performance.sample_period_s
+        return 1.0 / self.performance.sample_period_s
 
     # ---- commands
 
