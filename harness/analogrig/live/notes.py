@@ -1,4 +1,4 @@
-"""Notes of a live session on what its device says: alarms with latency and bound, diagnosis, misfit, estimates."""
+"""Notes on the reports of a session's device: alarms with latency and bound, diagnosis, misfit, estimates."""
 
 from __future__ import annotations
 
