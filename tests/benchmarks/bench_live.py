@@ -109,7 +109,8 @@ class _Process:
 
     def socket(self, path: str = "live", **more: Any) -> Any:
         """Connection to an endpoint."""
-        url = self.address.replace("http:", "ws:").replace("/?", f"/{path}?")
+        url, _, token = self.address.replace("http:", "ws:").replace("/?", f"/{path}?").partition("=")
+        url = f"{url}={more.pop('token', token)}"
         more.setdefault("origin", self.address.partition("/?")[0])
         return connect(url, max_size=None, **more)
 
@@ -272,6 +273,9 @@ async def _attack(bench: _Process, path: str, seed: int, until_s: float) -> int:
             if draw.random() < 0.2:
                 async with bench.socket(path, origin=draw.choice(("http://evil.example", "null", None))):
                     pass
+            if draw.random() < 0.2:
+                async with bench.socket(path, token=draw.choice(("", "no", "x" * 1000))):
+                    pass
             async with bench.socket(path, close_timeout=0.1) as socket:
                 for _ in range(draw.randrange(1, 200)):
                     await socket.send(hostile_message(draw))
@@ -292,8 +296,13 @@ def _memory(minutes: float) -> Iterator[Figure]:
         seen.append(next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")))
 
     fast = 1e-3
-    script: list[tuple[float, Action]] = [(0.0, Tempo(fast)), (60.0 * fast, note), (60.0 * minutes * fast, note)]
-    script += [(fast * s, Turn("K", 22000.0 + 500.0 * (s % 2))) for s in range(1, int(60.0 * minutes))]
+    turns = [(fast * s, Turn("K", 22000.0 + 500.0 * (s % 2))) for s in range(1, int(60.0 * minutes))]
+    script: list[tuple[float, Action]] = [
+        (60.0 * fast, note),
+        (60.0 * minutes * fast, note),
+        (0.0, Tempo(fast)),
+        *turns,
+    ]
     script.sort(key=lambda each: each[0])
     with tempfile.TemporaryDirectory() as folder:
         scripted_session(script, Path(folder))

@@ -56,7 +56,7 @@ def add(commands: Any) -> None:
         metavar="URL",
         help="origin of another page that may use the endpoint for viewers; may be repeated",
     )
-    command.add_argument("--no-open", action="store_true", help="leave the browser alone, and print the address")
+    command.add_argument("--no-open", action="store_true", help="print the address only; open no browser")
     command.add_argument(
         "--out",
         type=Path,
@@ -77,6 +77,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.real_time is not None:
         raise ConfigurationError("--real-time: the page sets the time factor")
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"--out {arguments.out}: cannot create the folder: {error}") from error
     with (
         open_what_to_play(arguments) as (rig, scenario, seed),
         _open_device(arguments.dut or scenario.dut or "inproc", arguments) as device,
@@ -87,7 +91,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _open_device(name: str, arguments: argparse.Namespace) -> Device:
-    """Open the device. One of our catalogue takes blocks, and reports an estimate now and then, unless told otherwise.
+    """Open the device. The defaults of one of our catalogue are blocks, and an estimate every ``REPORT_INTERVAL_N``.
 
     :raises ConfigurationError, LinkError, DeviceError: as ``open_dut``.
     """

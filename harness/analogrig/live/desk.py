@@ -48,18 +48,16 @@ class Desk(Rig):
     """Amplifiers whose outputs are read."""
     nodes: tuple[str, ...] = ()
     """Nodes of their outputs."""
+    performance: Performance
+    """Play under way; before the first, one that is not taken."""
 
     def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
-        """:raises ConfigurationError: the rig cannot play the scenario."""
         self._rig = rig
         self._seed = seed
-        self.performance: Performance | None = None
-        """Play under way; None before the first."""
         self.scenario = dataclasses.replace(scenario, samples=RECORD_N, tweaks=(), random_phase=False)
         self.capabilities = rig.capabilities
         self.program = scenario.program
         self.knobs: Mapping[str, Knob] = knobs_of(self.scenario.plant)
-        self.check(self.scenario)
 
     def check(self, scenario: Scenario) -> None:
         """:raises ConfigurationError: the rig cannot play this scenario; nothing moves."""
@@ -97,7 +95,7 @@ class SteppedDesk(Desk):
     is_stepped = True
 
     def __init__(self, rig: EmulatorRig, scenario: Scenario, seed: int, lengths: Lengths) -> None:
-        """:raises ConfigurationError: the rig cannot play the scenario."""
+        """:raises ConfigurationError: the rig cannot be set up for the scenario."""
         self._emulated = rig
         self._lengths = lengths
         self._faults: ChannelFaults | None = None
@@ -218,4 +216,6 @@ def open_desk(rig: Rig, scenario: Scenario, seed: int, lengths: Lengths) -> Desk
     """
     if rig.recorded is not None:
         raise ConfigurationError("a recording has no pots to turn: name an emulated or a real rig")
-    return SteppedDesk(rig, scenario, seed, lengths) if is_emulated(rig) else Desk(rig, scenario, seed)
+    desk = SteppedDesk(rig, scenario, seed, lengths) if is_emulated(rig) else Desk(rig, scenario, seed)
+    desk.perform(desk.scenario, seed)
+    return desk

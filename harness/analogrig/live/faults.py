@@ -57,7 +57,7 @@ def labels(channel: str) -> Mapping[Fault, str]:
 
 
 class ChannelFaults:
-    """Faults in force, and what they do to the volts of consecutive blocks."""
+    """Faults in force, and their effect on the volts of consecutive blocks."""
 
     def __init__(self, lsb_v: float, sample_rate_hz: float, rng: np.random.Generator) -> None:
         self._lsb_v = lsb_v

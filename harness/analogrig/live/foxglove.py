@@ -51,10 +51,11 @@ class Topic:
     number: int
     topic: str
     properties: Mapping[str, Any]
+    description: str
 
     def advertisement(self) -> dict[str, Any]:
         """Entry of the message ``advertise``."""
-        schema = {"type": "object", "properties": self.properties}
+        schema = {"type": "object", "description": self.description, "properties": self.properties}
         return {
             "id": self.number,
             "topic": self.topic,
@@ -70,8 +71,13 @@ def channels_of(session: LiveSession) -> dict[int, Topic]:
     signals = dict.fromkeys(signals_of(session), _NUMBER)
     alarm = {"take": _NUMBER, "sample": _NUMBER, "what": _TEXT, "latency_n": _NUMBER, "bound_n": _NUMBER}
     state = {"mode": _TEXT, "samples": _NUMBER, "speed": _NUMBER, "take": _NUMBER}
-    tables = {"/signals": {"sample": _NUMBER, **signals}, "/alarms": alarm, "/state": state}
-    return {number: Topic(number, topic, table) for number, (topic, table) in enumerate(tables.items(), 1)}
+    rows = f"{_ROWS} evenly spaced samples every {_PERIOD_S:g} s, at machine time from the start of the take"
+    topics = (
+        ("/signals", {"sample": _NUMBER, **signals}, rows),
+        ("/alarms", alarm, "alarms of the device, at the time of sending"),
+        ("/state", state, "state of the bench, at the time of sending"),
+    )
+    return {number: Topic(number, *topic) for number, topic in enumerate(topics, 1)}
 
 
 class Viewer:
@@ -174,15 +180,18 @@ class Viewer:
         """Publish what is subscribed to."""
         told: dict[str, float] = {}
         sent_alarms, end, take = self._session.notes.alarm_count, 0, 0
+        began_ns = sent_ns = 0  # times of the first sample of the take, and of the last sample sent
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             while True:
                 await asyncio.sleep(_PERIOD_S)
                 session = self._session
                 if session.take_number != take:
                     take, end = session.take_number, 0
+                    began_ns = max(time.time_ns(), sent_ns)
                 last, end = end, session.ring.end
                 for row in self._rows(last, end) if "/signals" in self._topics() else ():
-                    await self._send("/signals", row)
+                    sent_ns = began_ns + round(1e9 * row["sample"] / session.sample_rate_hz)
+                    await self._send("/signals", row, sent_ns)
                 fresh = min(session.notes.alarm_count - sent_alarms, len(session.notes.alarms))
                 sent_alarms = session.notes.alarm_count
                 for alarm in list(session.notes.alarms)[-fresh:] if fresh else ():
@@ -220,11 +229,15 @@ class Viewer:
             for i, sample in enumerate(samples)
         ]
 
-    async def _send(self, topic: str, table: Mapping[str, Any]) -> None:
+    async def _send(self, topic: str, table: Mapping[str, Any], time_ns: int = 0) -> None:
+        """Send a message to its subscriptions.
+
+        :param time_ns: 0: now.
+        """
         payload = json.dumps(table, allow_nan=False).encode()
         for number, channel in list(self._subscribed.items()):
             if self._channels[channel].topic == topic:
-                await self._put(struct.pack("<BIQ", _MESSAGE_DATA, number, time.time_ns()) + payload)
+                await self._put(struct.pack("<BIQ", _MESSAGE_DATA, number, time_ns or time.time_ns()) + payload)
 
     async def _tell(self, operation: str, **table: Any) -> None:
         await self._put(json.dumps({"op": operation, **table}))

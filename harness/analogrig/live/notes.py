@@ -1,4 +1,4 @@
-"""Notes of a live session on what its device says: alarms with latency and bound, diagnosis, misfit, estimates."""
+"""Notes on the reports of a session's device: alarms with latency and bound, diagnosis, misfit, estimates."""
 
 from __future__ import annotations
 
@@ -136,8 +136,6 @@ class Notes:
             return None
         end = min([end, *(segment.start for segment in segments[number + 1 :])])
         before, after = (segment.plant.parameters() for segment in segments[number - 1 : number + 1])
-        if performance is None:
-            return None
         program, output = self._desk.program, performance.channels[self._desk.program.channels[OUTPUT]]
         try:
             clipped: Any = self._ring.read("clipped", change, end)
@@ -165,7 +163,7 @@ class Notes:
     def estimated(self, theta: NDArray[np.floating]) -> NDArray[np.float64]:
         """Parameters ``program.estimates`` (n, m) of estimates theta; NaN if they describe no such plant."""
         program, sheet, performance = self._desk.program, self._device.datasheet, self._desk.performance
-        if sheet.model is None or performance is None:
+        if sheet.model is None:
             return np.full((len(theta), len(program.estimates)), np.nan)
         input_per_code, output_per_code = (performance.channels[name].lsb for name in program.measured)
         period_s = performance.sample_period_s * performance.time_scale

@@ -1,4 +1,4 @@
-"""Panel of a live bench: what does not change, and the state, as plain values for clients."""
+"""Panel of a live bench: its constant properties, and its state, as plain values for clients."""
 
 from __future__ import annotations
 

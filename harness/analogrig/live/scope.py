@@ -87,10 +87,9 @@ def signals_of(session: LiveSession) -> dict[str, Signal]:
     quantities = desk.program.circuit.scales.quantities
     performance = session.performance
     out = []
-    for name in desk.program.channels:
-        if performance is None or name in performance.channels:
-            full, node = quantities[name].full, quantities[name].node
-            out.append(Signal(name, name.replace("_", " "), "channel", desk.program.unit(name), full / 10.0, node))
+    for name, channel in performance.channels.items():
+        label, node = name.replace("_", " "), quantities[name].node
+        out.append(Signal(name, label, "channel", channel.unit, channel.unit_per_v, node))
     nodes = {scale.node: (name, scale) for name, scale in quantities.items()}
     for name, node in zip(desk.amplifiers, desk.nodes, strict=True):
         quantity, scale = nodes.get(node, ("", None))
@@ -109,8 +108,6 @@ def read_signal(session: LiveSession, name: str, first: int, end: int) -> Values
     :raises LookupError: the ring does not hold the samples, or there is no such signal.
     """
     ring, performance = session.ring, session.performance
-    if performance is None:
-        raise LookupError("nothing is played yet")
     if name in performance.channels:
         codes: Any = ring.read("codes", first, end)
         return performance.channels[name].volts(codes[:, session.desk.program.channels.index(name)])
@@ -160,7 +157,8 @@ class Screen:
         end, take = ring.end, session.take_number
         if view.trigger.mode == "single" and self._armed is None:
             self._armed = take, end
-        if end < LEAST_WINDOW_N or self._shown == (take, end):
+        least = LEAST_WINDOW_N if view.kind == "fft" else 2
+        if end < least or self._shown == (take, end):
             return None
         try:
             return self._frame(view, session, take, end)

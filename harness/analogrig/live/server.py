@@ -7,11 +7,21 @@
 One client of the page drives, the others watch; a viewer sets pots only while no page drives. When the driver is
 gone, the generator is switched off.
 
+Messages of the page are JSON objects; frames are binary (scope.py).
+
+    to the server   {"do": "view", "id": N, ...}     fields of View (scope.py)
+                    {"do": "drive", "id": N}         drive if no other client does
+                    {"do": COMMAND, "id": N, ...}    names and fields of commands (commands.py)
+    to the page     {"bench": {...}}                 first: names, limits and drawing (panel.py)
+                    {"state": {...}}                 state of the bench (panel.py) and role of the client
+                    {"re": N, "ok": true}            message N was accepted
+                    {"re": N, "error": "..."}        message N was refused
+
 Limits of a client:
 
     address  the token, a Host of this server, an Origin of the page (viewers outside a browser have none)
     memory   messages of MOST_MESSAGE_BYTES, one frame on its way, the buffers of the connection
-    time     a client that takes nothing for SLOW_S is dropped
+    time     a client that accepts no data for SLOW_S is dropped
     place    one of MOST_CLIENTS, and of MOST_SOCKETS before it is let in
 """
 
@@ -311,7 +321,7 @@ class BenchServer:
         except ConnectionClosed:
             pass
         except TimeoutError:
-            _log.info("a client takes nothing: dropped")
+            _log.info("a client accepts no data: dropped")
 
     def _state(self, client: _PageClient) -> dict[str, Any]:
         roles = {"drives": client is self._driver, "driven": self._driver is not None, "clients": len(self._clients)}

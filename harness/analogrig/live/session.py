@@ -1,4 +1,4 @@
-"""Live session: a rig and a device that run while a hand operates them. Knows nothing of browsers.
+"""Live session: a rig and a device that run while a hand operates them. It serves no page: ``server.py`` does.
 
 One thread calls ``run``, which plays one take after another through the bench. Any other thread passes commands and
 reads the ring and the state. Commands take effect between two blocks; the session knows the sample.
@@ -361,14 +361,14 @@ class LiveSession:
         self._woken.clear()
 
     @property
-    def performance(self) -> Performance | None:
-        """Play under way; None before the first."""
+    def performance(self) -> Performance:
+        """Play under way; before the first, one that is not taken."""
         return self.desk.performance
 
     @property
     def sample_rate_hz(self) -> float:
         """Samples per second of machine time."""
-        return 20e3 if self.performance is None else 1.0 / self.performance.sample_period_s
+        return 1.0 / self.performance.sample_period_s
 
     # ---- commands
 

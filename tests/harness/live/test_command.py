@@ -62,3 +62,11 @@ def test_recording_cannot_be_operated_by_hand(tmp_path: Path, capsys: pytest.Cap
     (saved,) = scripted_session(((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False))), tmp_path).saved
     assert cli.main(["bench", "--rig", f"recording:{saved.run}", "--no-open", "--out", str(tmp_path)]) == 2
     assert "no pots to turn" in capsys.readouterr().err
+
+
+def test_folder_that_cannot_be_made_is_refused_before_the_bench_opens(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert cli.main(["bench", "--no-open", "--out", str(tmp_path / "file" / "takes")]) == 2
+    assert "cannot create the folder" in capsys.readouterr().err

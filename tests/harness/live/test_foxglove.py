@@ -90,7 +90,9 @@ def test_subscribed_channels_send_what_their_schemas_describe(bench: BenchServer
             schema = json.loads(channels["/signals"]["schema"])["properties"]
             assert set(first) == set(schema)
             assert second["sample"] > first["sample"]
-            assert after_ns >= before_ns > 1_600_000_000_000_000_000
+            assert before_ns > 1_600_000_000_000_000_000
+            apart_s = (second["sample"] - first["sample"]) / bench.session.sample_rate_hz
+            assert after_ns - before_ns == pytest.approx(1e9 * apart_s, abs=1000)
             _, state = await data(socket, 71)
             assert state["mode"] == "OPERATE"
             await socket.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [70, 71]}))

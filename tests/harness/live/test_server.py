@@ -167,7 +167,7 @@ def test_generator_is_off_when_the_driver_is_gone_and_the_recording_is_saved(ben
                 await watcher.until(lambda state: not state["drives"])
             driver = Client(two)
             assert await driver.ask("record", on=True) == ""
-            await driver.until(lambda state: state["recording"] and state["samples"] > 2000)
+            await driver.until(lambda state: state["take"] == 2 and state["samples"] > 2000)
         async with open_client(bench) as three:
             state = await Client(three).until(lambda state: not state["generator"]["on"] and state["saved"])
             assert state["drives"]
