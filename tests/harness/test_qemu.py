@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +25,7 @@ from analogrig.devices.opening import reopen_dut
 from analogrig.devices.qemu import QemuDevice, QemuF405, QemuM4
 from analogrig.devices.registry import KINDS, describe, from_table
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -64,8 +66,11 @@ def shortened(name: str) -> Scenario:
 def reference(request: pytest.FixtureRequest) -> tuple[Scenario, Run]:
     """A scenario, and its run with the device in this process."""
     scenario = shortened(request.param)
-    return scenario, play(InprocDevice(name="bob"), scenario)
+    return scenario, play(InprocDevice(name="bob", estimator=EstimatorConfig(**SETTINGS)), scenario)
 
+
+SETTINGS: dict[str, Any] = {"orders": "given"}
+"""Boards have room for two poles; a scenario's program may want more."""
 
 DEVICES = [
     *({"kind": kind} for kind in ("host", "qemu-m3", "qemu-m4", "qemu-m7")),
@@ -80,7 +85,8 @@ def test_every_scenario_gives_the_same_bits_on_every_device(
 ) -> None:
     """The M0 image runs on an M3, since QEMU has no M0 board."""
     scenario, expected = reference
-    run = play(from_table({"name": "bob", "exchange": exchange, "timeout_s": LONG_S, **device}, "bob"), scenario)
+    table = {"name": "bob", "exchange": exchange, "timeout_s": LONG_S, "estimator": SETTINGS, **device}
+    run = play(from_table(table, "bob"), scenario)
     assert run.conditions.faults == ()
     assert run.theta_hash() == expected.theta_hash()
     assert (run.statistic == expected.statistic).all()
