@@ -245,3 +245,17 @@ def latching(*, closed: bool, farad: float = 1e-9) -> Circuit:
             ),
         ]
     )
+
+
+@pytest.mark.parametrize("pulse_ticks", [1, 3, 100])
+def test_a_pulse_that_ends_before_the_first_look_takes_the_limiter_nowhere(pulse_ticks: int) -> None:
+    """10 k into 10 nF, settled just below a limiter of 1.5 V: the first look after the edge is beyond the bound."""
+    low_v, high_v, samples = 1.5 - 1e-3, 10.0, 60
+    limiter = DiodeLimiter("D1", "c", "0", 1.5, 50.0, 1e9)
+    circuit = Circuit([SOURCE, Resistor("R1", "in", "c", 10e3), Capacitor("C1", "c", "0", 10e-9), limiter])
+    pulse = (50.0, 50.0 + pulse_ticks / TICKS_PER_SAMPLE)
+    engine = Engine(piecewise_linear(circuit), ["c"])
+    volts = engine.run(samples, steps((0.0, low_v), (pulse[0], high_v), (pulse[1], low_v)))[:, 0]
+    unmoved = Engine(piecewise_linear(circuit), ["c"]).run(samples, steps((0.0, low_v)))[:, 0]
+    assert engine.counts.events == 0
+    np.testing.assert_allclose(volts, unmoved, rtol=0, atol=2e-4)

@@ -245,9 +245,10 @@ bool events_look_until(engine_t* const self, int64_t tick) {
 }
 
 /// Length of the longest step from `clear` towards a tick: not longer than the time since the last event. The steps after
-/// an event grow with it and resolve whatever it sets off.
+/// an event grow with it and resolve whatever it sets off; the first is as long as the first look.
 static int64_t longest_step(const engine_t* const self, int64_t tick) {
-    const int64_t left = tick - self->clear, since = self->clear - self->origin;
+    const int64_t left = tick - self->clear, passed = self->clear - self->origin;
+    const int64_t since = passed > 0 ? passed : INT64_C(1) << self->mode->base;
     const int64_t limit = left < since ? left : since;
     int           level = self->mode->base;
     while (level < TOP_LEVEL && (INT64_C(2) << level) <= limit) {
