@@ -132,12 +132,31 @@ def read_toml(path: Path) -> dict[str, Any]:
 
     :raises ConfigurationError: it cannot be read, is too large, or is not TOML.
     """
+    return toml_of(read_file(path), path)
+
+
+def read_file(path: Path) -> bytes:
+    """Bytes of a TOML file.
+
+    :raises ConfigurationError: it cannot be read, or is too large.
+    """
     try:
-        text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8")
-        _check_nesting(text)
-        return tomllib.loads(text)
+        return read_bounded(path, MAX_FILE_BYTES)
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:  # a null character in its name
+        raise ConfigurationError(f"{path}: {error}") from error
+
+
+def toml_of(data: bytes, path: Path) -> dict[str, Any]:
+    """Plain values of a TOML file's bytes; errors name its path.
+
+    :raises ConfigurationError: they are not TOML.
+    """
+    try:
+        text = data.decode("utf-8")
+        _check_nesting(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
 

@@ -9,6 +9,7 @@ import functools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,7 +55,7 @@ class Program:
         :raises ConfigurationError: absent, not TOML, or not a program; names the file, the place and the cure.
         """
         path = config.locate("programs", name)
-        return cls.from_table(config.read_toml(path), str(path))
+        return _loaded(config.read_file(path), path)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], where: str) -> Program:
@@ -194,6 +195,11 @@ class Program:
         known |= dict(zip(self.parameters, np.asarray(values, np.float64).T, strict=True))
         columns = [self._rates(np.repeat(unit[:, None], p, axis=1), known) for unit in np.eye(n + 1)]
         return np.stack(columns, axis=2).transpose(1, 0, 2)
+
+
+@functools.lru_cache(maxsize=64)
+def _loaded(data: bytes, path: Path) -> Program:
+    return Program.from_table(config.toml_of(data, path), str(path))
 
 
 @functools.lru_cache(maxsize=64)

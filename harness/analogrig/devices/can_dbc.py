@@ -114,7 +114,6 @@ class CanDbcDevice(CanBusDescription, AdaptedDescription):
     """Frame that begins a record: the device forgets all samples."""
     reset: Request | None = None
     """Frame that brings the device to a defined state when it is opened."""
-    timeout_s: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -53,7 +53,7 @@ class DeviceDescription:
     """One line for people."""
     most_lost_n: int = 0
     """Largest number of samples lost on the way to the device. Beyond it the run is INCONCLUSIVE."""
-    timeout_s: float = 2.0
+    timeout_s: float = 10.0
     """Time-out of all answers to one message."""
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ from serial.urlhandler import protocol_socket
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 
 DEFAULT_BAUD = 115_200
-WRITE_TIMEOUT_S = 2.0
+WRITE_TIMEOUT_S = 10.0
 
 _READ_BYTES = 65_536
 _POLL_S = 1e-3
