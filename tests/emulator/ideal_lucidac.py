@@ -21,7 +21,7 @@ from analogrig_emulator.lucidac.configuration import (
 Values = NDArray[np.float64]
 
 _STEPS = 2048
-_PASSES = 6
+_PASSES = 3
 """Passes that settle a chain of multipliers and identities."""
 
 
@@ -51,7 +51,7 @@ def ideal_solution(configuration: Configuration, samples: int, rate_hz: float) -
     def slope(_: float, y: Values) -> Values:
         return np.asarray(-k0 * (sources @ outputs(y) + constants)[:INTEGRATORS])
 
-    solved = solve_ivp(slope, (0.0, instants_s[-1]), start, "DOP853", instants_s, rtol=1e-8, atol=1e-10)
+    solved = solve_ivp(slope, (0.0, instants_s[-1]), start, "DOP853", instants_s, rtol=1e-7, atol=1e-9)
     return np.array([outputs(y)[list(configuration.adc)] for y in solved.y.T])
 
 

@@ -36,6 +36,15 @@ def protocol() -> Any:
         ) from error
 
 
+def parse_envelope(content: bytes) -> Any:
+    """Envelope of a frame's content; None if it is malformed, such as nested too deeply."""
+    malformed: type[Exception] = importlib.import_module("google.protobuf.message").DecodeError
+    try:
+        return protocol().Envelope.FromString(content)
+    except malformed:
+        return None
+
+
 def frame(message: Any, envelope_version: Any = None) -> bytes:
     """Frame with a MessageV1."""
     envelope = protocol().Envelope(message_v1=message)

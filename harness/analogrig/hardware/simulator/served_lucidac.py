@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, framed, protocol
+from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, framed, parse_envelope, protocol
 from analogrig.hardware.simulator.lucidac_registers import Registers
 from analogrig.hardware.simulator.served import Keys, merge, parse_defect
 from analogrig.hardware.simulator.tcp_server import IDLE_S, SLOW_S, Client, TcpServer, now_s
@@ -154,9 +154,8 @@ class LucidacServer(TcpServer):
 
     def _answer(self, client: Client, content: bytes) -> bytes:
         """Frame that answers the content of a frame."""
-        try:
-            envelope = self._pb.Envelope.FromString(content)
-        except ValueError:  # DecodeError, for nested messages without end too
+        envelope = parse_envelope(content)
+        if envelope is None:
             return frame(self._message(self._error("no envelope of this protocol")))
         if envelope.HasField("generic") and envelope.generic.HasField("ping_command"):
             pong = self._pb.Envelope()
