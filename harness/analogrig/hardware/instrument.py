@@ -25,7 +25,7 @@ MEASURED = CHANNELS[:2]
 """Channels of a rig that are wired to the instrument: force and displacement of a suspension."""
 
 _ROUNDING_V = 1e-9
-_EARLY_N = 1e-4
+EARLY_N = 1e-4
 """Time from an edge to its first sample, in samples, so that rounding never puts the edge after the sample."""
 
 _REMEMBERED = 64
@@ -252,12 +252,12 @@ def check_edges(excitation: Excitation, rate_hz: float) -> None:
         )
 
 
-def first_phase(excitation: Excitation, rate_hz: float) -> float:
-    """Phase at the first sample, in periods; on the card's clock the edges coincide with samples."""
+def first_phase(excitation: Excitation, rate_hz: float, early_n: float = EARLY_N) -> float:
+    """Phase at the first sample, in periods; on the card's clock edges come ``early_n`` samples before samples."""
     if excitation.clock == "free":
         return excitation.phase
     period_n = round(rate_hz / excitation.frequency_hz)
-    return (math.floor(excitation.phase * period_n) + _EARLY_N) / period_n
+    return (math.floor(excitation.phase * period_n) + early_n) / period_n
 
 
 def _is_whole(samples: float) -> bool:

@@ -38,6 +38,9 @@ FULL_SCALE = 1.25
 """End of the converter's range in machine units, by the legacy firmware; values beyond it count as clipped."""
 
 _HALF_RANGE = 1 << 15
+_EARLY_N = 1e-3
+"""Time from an edge of the generator to its first sample, in samples: the elements settle in 50 ns."""
+
 _ASLEEP = SignalGenerator("sine and square")
 
 
@@ -150,7 +153,7 @@ class LucidacInstrument(Instrument):
     def _generator(self, sample: int) -> SignalGenerator:
         """Generator of a run that begins at a sample of the record."""
         excitation, rate_hz = self._excitation, self.datasheet.rate_hz
-        periods = first_phase(excitation, rate_hz) + sample / rate_hz * excitation.true_frequency_hz
+        periods = first_phase(excitation, rate_hz, _EARLY_N) + sample / rate_hz * excitation.true_frequency_hz
         return SignalGenerator(
             "sine and square",
             excitation.true_frequency_hz,
