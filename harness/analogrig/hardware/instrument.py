@@ -265,9 +265,9 @@ def _is_whole(samples: float) -> bool:
 
 
 DRIVERS = {
-    "lucidac": ("analogrig.hardware.lucidac:LucidacInstrument", "HOST[:PORT]"),
     "redpitaya": ("analogrig.hardware.red_pitaya:RedPitaya", "HOST[:PORT]"),
     "nidaqmx": ("analogrig.hardware.ni_daqmx:NiDaqmx", "CARD"),
+    "lucidac": ("analogrig.hardware.lucidac:LucidacInstrument", "HOST[:PORT]"),
 }
 """Driver class and form of its addresses, by the scheme of an instrument's URL."""
 
