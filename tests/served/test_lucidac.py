@@ -23,6 +23,7 @@ from analogrig.scenario import DEFAULT_SEED
 from analogrig_emulator.lucidac.configuration import Configuration
 from tests.emulator.ideal_lucidac import ideal_solution
 from tests.harness.processes import LONG_S
+from tests.served.hostile_lucidac import nested, varint
 from tests.served.lucidac_examples import EXAMPLES
 from tests.served.serving import ROOT, Served, serving
 
@@ -274,33 +275,23 @@ def test_configuration_can_be_extracted_and_ping_is_answered(talk: Talk) -> None
 
 
 def test_malformed_content_is_answered_and_the_connection_goes_on(talk: Talk) -> None:
-    nested = b"\x0a\x00"
-    for _ in range(5000):
-        nested = b"\x1a" + _varint(len(nested)) + nested
-    for content in (b"", b"\xff" * 50, b"\x12\x05abc", nested):
-        talk.send(_varint(len(content)) + content)
+    framed_contents = [varint(len(content)) + content for content in (b"", b"\xff" * 50, b"\x12\x05abc")]
+    for malformed in (*framed_contents, nested(2000), nested(200_000)):
+        talk.send(malformed)
         assert talk.next().message_v1.error_message.description
     assert talk.ask("extract_command", specification=True).WhichOneof("kind") == "extract_response"
 
 
 @pytest.mark.parametrize("length", [1 << 20, 1 << 31, 1 << 63, (1 << 64) - 1])
 def test_frame_too_long_is_answered_and_the_connection_closed(talk: Talk, length: int) -> None:
-    talk.send(_varint(length) + bytes(100))
+    talk.send(varint(length) + bytes(100))
     assert re.search("at most", talk.next().message_v1.error_message.description)
     assert talk.next() is None
 
 
-def _varint(value: int) -> bytes:
-    head = bytearray()
-    while value >= 0x80:
-        head.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes((*head, value))
-
-
 def test_reader_gives_frames_however_the_stream_is_cut() -> None:
     contents = [b"", b"a" * 127, b"b" * 128, b"c" * 20_000]
-    stream = b"".join(_varint(len(content)) + content for content in contents)
+    stream = b"".join(varint(len(content)) + content for content in contents)
     for step in (1, 7, 128, len(stream)):
         reader, found = FrameReader(), []
         for start in range(0, len(stream), step):

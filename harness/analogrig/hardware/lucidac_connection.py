@@ -39,11 +39,8 @@ class LucidacConnection:
             raise RigClosed(f"instrument {self.name}: cannot be reached: {error.strerror or error}") from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def ask(self, kind: str, **fields: Any) -> Any:
-        """Send a command. Return the message that answers it.
-
-        :raises RigRefused: it is an error, or the device is busy.
-        """
+    def ask_once(self, kind: str, **fields: Any) -> Any:
+        """Send a command. Return the message that answers it, be it an error."""
         message = self._pb.MessageV1(id=str(uuid.uuid4()))
         command = getattr(message, kind)
         command.SetInParent()
@@ -51,6 +48,14 @@ class LucidacConnection:
         self._send(frame(message), kind)
         while (answer := self._next(kind, self._timeout_s)).id != message.id:
             pass
+        return answer
+
+    def ask(self, kind: str, **fields: Any) -> Any:
+        """Send a command. Return the message that answers it.
+
+        :raises RigRefused: it is an error, or the device is busy.
+        """
+        answer = self.ask_once(kind, **fields)
         answered = answer.WhichOneof("kind")
         if answered == "error_message":
             raise RigRefused(f"instrument {self.name}: {kind}: {answer.error_message.description[:200]!r}")
