@@ -14,7 +14,7 @@ from analogrig_emulator.lucidac.configuration import (
     SLOW,
     Configuration,
     Integrator,
-    Lane,
+    LucidacLane,
     constant_output,
 )
 
@@ -61,13 +61,13 @@ def random_configuration(rng: np.random.Generator) -> Configuration:
     targets = [*range(count), *range(8, 8 + 2 * products)]
     sources = [*range(count), *range(8, 8 + products), *([12, 13] if products else [])]
     constant = float(rng.choice([0.0, 1.0, -0.1]))
-    lanes = {i: Lane(i, i, float(rng.uniform(0.05, 0.5))) for i in range(count)}
+    lanes = {i: LucidacLane(i, i, float(rng.uniform(0.05, 0.5))) for i in range(count)}
     for number in range(count, int(rng.integers(count + len(targets), LANES + 1))):
         source = constant_output(number) if constant and rng.random() < 0.15 else int(rng.choice(sources))
         target = targets[(number - count) % len(targets)]
         if source >= 8 and target >= 8 and source != constant_output(number):
             source = int(rng.integers(count))  # a loop without an integrator need not have a solution
-        lanes[number] = Lane(source, target, float(rng.uniform(-0.6, 0.6)), bool(rng.random() < 0.1))
+        lanes[number] = LucidacLane(source, target, float(rng.uniform(-0.6, 0.6)), bool(rng.random() < 0.1))
     integrators = [
         Integrator(float(rng.uniform(-0.7, 0.7)), FAST if rng.random() < 0.8 else SLOW) for _ in range(INTEGRATORS)
     ]

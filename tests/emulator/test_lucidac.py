@@ -13,7 +13,7 @@ from analogrig_emulator.lucidac.configuration import (
     SLOW,
     Configuration,
     Integrator,
-    Lane,
+    LucidacLane,
     SignalGenerator,
 )
 from analogrig_emulator.lucidac.machine import Lucidac
@@ -26,20 +26,20 @@ Values = NDArray[np.float64]
 
 RATE_HZ = 100e3
 OMEGA = 0.01 * 2 * np.pi
-SINE = {0: Lane(0, 1, OMEGA), 1: Lane(1, 0, -OMEGA)}
+SINE = {0: LucidacLane(0, 1, OMEGA), 1: LucidacLane(1, 0, -OMEGA)}
 VAN_DER_POL = {
-    0: Lane(9, 0, -0.5, upscaled=True),
-    1: Lane(1, 0, -0.5),
-    2: Lane(0, 1, 0.25, upscaled=True),
-    3: Lane(1, 8),
-    4: Lane(1, 9),
-    5: Lane(8, 10, -1.0),
-    6: Lane(15, 10, 0.25),
-    7: Lane(0, 11),
+    0: LucidacLane(9, 0, -0.5, upscaled=True),
+    1: LucidacLane(1, 0, -0.5),
+    2: LucidacLane(0, 1, 0.25, upscaled=True),
+    3: LucidacLane(1, 8),
+    4: LucidacLane(1, 9),
+    5: LucidacLane(8, 10, -1.0),
+    6: LucidacLane(15, 10, 0.25),
+    7: LucidacLane(0, 11),
 }
 
 
-def configuration(lanes: dict[int, Lane], adc: tuple[int, ...] = (0, 1), **more: float) -> Configuration:
+def configuration(lanes: dict[int, LucidacLane], adc: tuple[int, ...] = (0, 1), **more: float) -> Configuration:
     """Configuration whose integrators begin at -IC."""
     initial = {int(name[2:]): value for name, value in more.items() if name.startswith("ic")}
     integrators = tuple(Integrator(initial.get(i, 0.0)) for i in range(8))
@@ -65,7 +65,7 @@ def prepared(patch: Configuration, parts: LucidacParts | None = None) -> Lucidac
     [
         configuration(SINE, ic0=-1.0),
         configuration(VAN_DER_POL, ic1=0.1, constant=1.0),
-        configuration({0: Lane(0, 8), 1: Lane(1, 9, 0.5)}, (0, 8, 12, 13), ic0=0.8, ic1=-0.6),
+        configuration({0: LucidacLane(0, 8), 1: LucidacLane(1, 9, 0.5)}, (0, 8, 12, 13), ic0=0.8, ic1=-0.6),
     ],
 )
 def test_calibrated_machine_follows_the_equations_and_an_uncalibrated_one_does_not(patch: Configuration) -> None:
@@ -79,12 +79,12 @@ def test_calibrated_machine_follows_the_equations_and_an_uncalibrated_one_does_n
 
 
 def test_integrators_begin_at_the_inverted_initial_condition() -> None:
-    machine = prepared(configuration({0: Lane(0, 0, 0.3)}, (0,), ic0=-0.8))
+    machine = prepared(configuration({0: LucidacLane(0, 0, 0.3)}, (0,), ic0=-0.8))
     assert abs(played(machine, 1)[0, 0] - 0.8) < 1e-3
 
 
 def test_slow_integrators_take_a_hundred_times_as_long() -> None:
-    fast = configuration({0: Lane(0, 0, 0.3)}, (0,), ic0=-0.8)
+    fast = configuration({0: LucidacLane(0, 0, 0.3)}, (0,), ic0=-0.8)
     slow = replace(fast, integrators=tuple(replace(each, k0=SLOW) for each in fast.integrators))
     assert np.abs(played(prepared(slow), 50, 1e3) - played(prepared(fast), 50, 1e5)).max() < 1e-3
 
@@ -101,7 +101,7 @@ def test_specimens_differ_by_seed_and_repeat_by_seed() -> None:
 
 
 def test_overload_is_flagged_and_halts_the_run_where_that_is_wanted() -> None:
-    machine = prepared(configuration({0: Lane(15, 0, -0.5)}, (0,), constant=1.0))
+    machine = prepared(configuration({0: LucidacLane(15, 0, -0.5)}, (0,), constant=1.0))
     assert sum(map(len, machine.play(200, RATE_HZ, halt_on_overload=True))) in (22, 23)  # 1.05 units at 210 us
     assert machine.overloads == {("M0", 0): True}
     values = played(machine, 200)
@@ -115,7 +115,7 @@ def test_ports_take_the_voltages_of_the_generator_by_cable() -> None:
     generator = SignalGenerator(
         "sine and square", 1000.0, amplitude=0.6, offset=0.2, square=(-0.2, 0.7), dac=(0.3, -0.8), sleep=False
     )
-    lanes = {26: Lane(None, 8), 27: Lane(None, 9), 28: Lane(None, 10)}
+    lanes = {26: LucidacLane(None, 8), 27: LucidacLane(None, 9), 28: LucidacLane(None, 10)}
     parts = replace(LucidacParts(), cables={"square": 2, "sine": 3, "dac1": 4})
     patch = Configuration(lanes=lanes, external=frozenset({2, 3, 4}), adc=(12, 13, 14), generator=generator)
     values = -played(prepared(patch, parts), 300)
@@ -143,11 +143,11 @@ def test_a_perfect_machine_needs_no_calibration() -> None:
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ({"lanes": {3: Lane(0, 0, 1.5)}}, "lane 3: coefficient must be within +-1, not 1.5"),
-        ({"lanes": {3: Lane(0, 0, float("nan"))}}, "lane 3: coefficient"),
-        ({"lanes": {32: Lane(0, 0)}}, "lane must be 0 to 31, not 32"),
-        ({"lanes": {0: Lane(16, 0)}}, "lane 0: output must be 0 to 15, not 16"),
-        ({"lanes": {24: Lane(None, 0)}}, "lane 24: no output and no port feeds it"),
+        ({"lanes": {3: LucidacLane(0, 0, 1.5)}}, "lane 3: coefficient must be within +-1, not 1.5"),
+        ({"lanes": {3: LucidacLane(0, 0, float("nan"))}}, "lane 3: coefficient"),
+        ({"lanes": {32: LucidacLane(0, 0)}}, "lane must be 0 to 31, not 32"),
+        ({"lanes": {0: LucidacLane(16, 0)}}, "lane 0: output must be 0 to 15, not 16"),
+        ({"lanes": {24: LucidacLane(None, 0)}}, "lane 24: no output and no port feeds it"),
         ({"constant": 0.5}, "constant must be"),
         ({"adc": (0,) * 9}, "the converter has 8 channels, not 9"),
         ({"integrators": (Integrator(k0=7),)}, "integrator 0: k0 must be 10000 or 100, not 7"),

@@ -15,14 +15,14 @@ from analogrig.hardware.lucidac_connection import LucidacConnection
 from analogrig.hardware.lucidac_patch import module_of
 from analogrig.hardware.simulator.served_lucidac import MAC, specimen
 from analogrig.scenario import DEFAULT_SEED
-from analogrig_emulator.lucidac.configuration import Configuration, Integrator, Lane
+from analogrig_emulator.lucidac.configuration import Configuration, Integrator, LucidacLane
 from tests.harness.processes import LONG_S
 from tests.served.hostile import Attack, survive
 from tests.served.hostile_lucidac import ATTACKS, claim_lengths, fuzz, leave_half_open, nest, query
 from tests.served.serving import ServedByProcess, ended, serving
 
 OSCILLATOR = Configuration(
-    (Integrator(-0.875), *[Integrator()] * 7), {0: Lane(0, 1, 0.05), 1: Lane(1, 0, -0.05)}, adc=(0, 1) * 4
+    (Integrator(-0.875), *[Integrator()] * 7), {0: LucidacLane(0, 1, 0.05), 1: LucidacLane(1, 0, -0.05)}, adc=(0, 1) * 4
 )
 SILENT = "adc_noise_lsb=0"
 SAMPLES, RATE_HZ = 300_000, 62_500

@@ -53,7 +53,7 @@ class Integrator:
 
 
 @dataclass(frozen=True)
-class Lane:
+class LucidacLane:
     """Connection of an output to an input. source: None for a lane that a port of the front panel feeds."""
 
     source: int | None
@@ -94,7 +94,7 @@ class Configuration:
     """
 
     integrators: tuple[Integrator, ...] = (Integrator(),) * INTEGRATORS
-    lanes: Mapping[int, Lane] = field(default_factory=dict)
+    lanes: Mapping[int, LucidacLane] = field(default_factory=dict)
     constant: float = 0.0
     external: frozenset[int] = frozenset()
     adc: tuple[int, ...] = ()
@@ -112,7 +112,7 @@ class Configuration:
         _require_all(self.external, PORTS, "front panel: port")
         self._check_generator()
 
-    def _check_lane(self, number: int, lane: Lane) -> None:
+    def _check_lane(self, number: int, lane: LucidacLane) -> None:
         _require_all([number], LANES, "lane")
         _require_all([lane.target], OUTPUTS, f"lane {number}: input")
         _require_within(lane.factor, 1.0, f"lane {number}: coefficient")
@@ -139,7 +139,7 @@ class Configuration:
         ends += [output for number, lane in self.lanes.items() if (output := self.element_output(number, lane)) >= 0]
         return frozenset([*ends, *self.adc])
 
-    def element_output(self, number: int, lane: Lane) -> int:
+    def element_output(self, number: int, lane: LucidacLane) -> int:
         """Output of an element that feeds a lane; -1 if the constant or a port feeds it."""
         if lane.source is None or number - FIRST_PORT_LANE in self.external:
             return -1

@@ -15,7 +15,7 @@ from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, PiecewiseLinear
 from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.lucidac.configuration import ADC_CHANNELS, Configuration, SignalGenerator
-from analogrig_emulator.lucidac.wiring import UNIT_V, LucidacParts, Trims, Wiring, calibrated
+from analogrig_emulator.lucidac.wiring import UNIT_V, LucidacCircuit, LucidacParts, Trims, calibrated
 
 WATCH_HZ = 100e3
 """Least rate at which the overload flags look at the elements."""
@@ -48,7 +48,7 @@ class Lucidac:
         self._gains = 1.0 + self.parts.adc_gain * draws[0]
         self._offsets = self.parts.adc_offset * draws[1]
         self._calibrated_gain = self._calibrated_offset = False
-        self._wiring = Wiring(Configuration(), self.parts)
+        self._wiring = LucidacCircuit(Configuration(), self.parts)
         self.overloads: dict[tuple[str, int], bool] = {}
         """Flags by block and index of the element; they stay until cleared."""
 
@@ -58,13 +58,13 @@ class Lucidac:
         return self._wiring.configuration
 
     @property
-    def wiring(self) -> Wiring:
+    def wiring(self) -> LucidacCircuit:
         """Present circuit, for to_spice for instance."""
         return self._wiring
 
     def configure(self, configuration: Configuration) -> None:
         """Patch. Raises CircuitError, and then nothing changes."""
-        wiring = Wiring(configuration, self.parts)
+        wiring = LucidacCircuit(configuration, self.parts)
         if configuration.used:
             piecewise_linear(wiring.circuit())
         self._wiring = wiring
@@ -136,7 +136,7 @@ class Lucidac:
 class _Run:
     """Run of a circuit, at `points` points a sample. phase: point of a block at which its first sample is."""
 
-    def __init__(self, wiring: Wiring, samples: int, rate_hz: float, points: int) -> None:
+    def __init__(self, wiring: LucidacCircuit, samples: int, rate_hz: float, points: int) -> None:
         self._rate_hz, self._points, self._left = rate_hz, points, samples
         self._operating = piecewise_linear(wiring.circuit())
         self._charging = piecewise_linear(wiring.circuit(charging=True))
@@ -162,7 +162,7 @@ class _Run:
 class _Ports:
     """Voltages at the ports of the front panel, by the cables of the signal generator."""
 
-    def __init__(self, wiring: Wiring, points: int, rate_hz: float) -> None:
+    def __init__(self, wiring: LucidacCircuit, points: int, rate_hz: float) -> None:
         generator = wiring.configuration.generator
         plugged = {port: output for output, port in wiring.parts.cables.items()}
         self._rate_hz = rate_hz

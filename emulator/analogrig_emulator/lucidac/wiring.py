@@ -38,7 +38,7 @@ from analogrig_emulator.lucidac.configuration import (
     INTEGRATORS,
     OUTPUTS,
     Configuration,
-    Lane,
+    LucidacLane,
 )
 
 UNIT_V = 2.0
@@ -115,7 +115,7 @@ class Trims:
 
 
 @dataclass(frozen=True)
-class Wiring:
+class LucidacCircuit:
     """Circuit of a configuration on one specimen of the machine."""
 
     configuration: Configuration
@@ -153,7 +153,7 @@ class Wiring:
     # ---- elements in use
 
     @property
-    def _lanes(self) -> Mapping[int, Lane]:
+    def _lanes(self) -> Mapping[int, LucidacLane]:
         return dict(sorted(self.configuration.lanes.items()))
 
     def _is_external(self, number: int) -> bool:
@@ -210,7 +210,7 @@ class Wiring:
         for output in sorted(source for source in fed if source is not None):
             yield VoltageSource(f"REF{output}", f"ref{output}", dc_v=constant * UNIT_V)
 
-    def _lane(self, number: int, lane: Lane) -> Iterator[Element]:
+    def _lane(self, number: int, lane: LucidacLane) -> Iterator[Element]:
         out = f"c{number}"
         if self._is_external(number):
             yield VoltageSource(f"PORT{number - FIRST_PORT_LANE}", out)
@@ -253,7 +253,7 @@ class Wiring:
         yield Resistor(f"RB{i}", f"s{i}", f"o{i}", SUM_OHM)
 
 
-def calibrated(wiring: Wiring, *, gain: bool, offset: bool) -> Trims:
+def calibrated(wiring: LucidacCircuit, *, gain: bool, offset: bool) -> Trims:
     """Trims that bring every path of a configuration to its nominal gain and offset, to their resolution.
 
     The gain of a lane covers its converter, its summing resistor and what follows up to the element's output, the
@@ -271,7 +271,7 @@ def calibrated(wiring: Wiring, *, gain: bool, offset: bool) -> Trims:
 
 @dataclass(frozen=True)
 class _Calibration:
-    wiring: Wiring
+    wiring: LucidacCircuit
     specimen: Mapping[str, Element]
 
     def gains(self) -> dict[int, float]:

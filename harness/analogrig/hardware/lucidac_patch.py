@@ -32,7 +32,7 @@ from analogrig_emulator.lucidac.configuration import (
     UPSCALE,
     Configuration,
     Integrator,
-    Lane,
+    LucidacLane,
     SignalGenerator,
 )
 
@@ -94,7 +94,7 @@ class LinearPatch:
         integrators += [Integrator()] * (INTEGRATORS - len(integrators))
         return Configuration(
             tuple(integrators),
-            {FIRST_PORT_LANE + PORT: Lane(None, _INPUT)} | dict(zip(numbers, lanes, strict=False)),
+            {FIRST_PORT_LANE + PORT: LucidacLane(None, _INPUT)} | dict(zip(numbers, lanes, strict=False)),
             external=frozenset({PORT}),
             adc=(FIRST_IDENTITY, *range(len(self.states))),
             generator=generator,
@@ -108,7 +108,7 @@ class LinearPatch:
         full = np.array([scales[name] for name in (*self.states, self.program.channels[0])])
         return np.asarray(self.program.equations.speed * matrix * full / full[:-1, None] / FAST)
 
-    def _lanes(self, weights: NDArray[np.float64], fast: Sequence[bool]) -> Iterator[Lane]:
+    def _lanes(self, weights: NDArray[np.float64], fast: Sequence[bool]) -> Iterator[LucidacLane]:
         for i, row in enumerate(weights):
             for source, weight in enumerate(row):
                 factor = -weight * (1 if fast[i] else FAST / SLOW)
@@ -119,7 +119,7 @@ class LinearPatch:
                     continue
                 count = max(1, math.ceil(abs(factor) / UPSCALE))
                 upscaled = abs(factor) > 1.0
-                yield from [Lane(output, i, factor / count / (UPSCALE if upscaled else 1.0), upscaled)] * count
+                yield from [LucidacLane(output, i, factor / count / (UPSCALE if upscaled else 1.0), upscaled)] * count
 
 
 @functools.lru_cache(maxsize=8)

@@ -18,7 +18,7 @@ from analogrig_emulator.lucidac.configuration import (
     PORTS,
     Configuration,
     Integrator,
-    Lane,
+    LucidacLane,
     SignalGenerator,
 )
 
@@ -88,7 +88,7 @@ class Registers:
             if fed or number in self.sources:
                 source = None if fed else self.sources[number]
                 correction = self.corrections[number]
-                lanes[number] = Lane(source, target, self.factors[number], number in self.upscaled, correction)
+                lanes[number] = LucidacLane(source, target, self.factors[number], number in self.upscaled, correction)
         adc = tuple(probe.output for probe in self.probes)
         return Configuration(
             tuple(self.integrators), lanes, self.constant, frozenset(self.external), adc, self.generator
