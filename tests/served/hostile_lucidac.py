@@ -6,6 +6,7 @@ python -m tests.served.hostile_lucidac SECONDS SEED
 from __future__ import annotations
 
 import contextlib
+import functools
 import random
 import socket
 import struct
@@ -14,6 +15,9 @@ import time
 from typing import Any
 
 from analogrig.hardware.lucidac_messages import MOST_FRAME_BYTES, FrameReader, frame, protocol
+from analogrig.hardware.lucidac_patch import module_of
+from analogrig.hardware.simulator.served_lucidac import MAC
+from analogrig_emulator.lucidac.configuration import Configuration, LucidacLane
 from tests.served.hostile import Attack, Stop, connect_often, ignore_disconnection, survive_all
 from tests.served.serving import ServedByProcess, serving
 
@@ -56,17 +60,50 @@ def kinds() -> list[str]:
     return [field.name for field in protocol().MessageV1.DESCRIPTOR.oneofs_by_name["kind"].fields]
 
 
+@functools.cache
+def valid_contents() -> tuple[bytes, ...]:
+    """Contents of valid frames, one for each command that the device executes."""
+    pb = protocol()
+    lanes = {0: LucidacLane(0, 1, 0.05), 8: LucidacLane(1, 0, -0.05, upscaled=True), 26: LucidacLane(None, 8)}
+    patch = Configuration(lanes=lanes, external=frozenset({2}), adc=(0, 1, 12))
+    fields: dict[str, dict[str, Any]] = {
+        "extract_command": {"specification": True, "configuration": True},
+        "reset_command": {"overload_reset": True, "circuit_reset": True},
+        "config_command": {"module": module_of(patch, MAC), "reset_before": True},
+        "calibration_command": {"config": {"gain": "Enabled", "offset": "Enabled"}},
+        "start_run_command": {
+            "run_config": pb.RunConfig(op_time=pb.Time(value=1, prefix=pb.MILLI)),
+            "daq_config": pb.DaqConfig(sample_rate=100_000),
+        },
+        "stop_run_command": {},
+        "manual_control_command": {"to": pb.ManualControlCommand.HALT},
+        "udp_data_streaming_command": {"port": 1},
+        "get_overload_status_command": {},
+    }
+    return tuple(next_content(command(kind, **values)) for kind, values in fields.items())
+
+
+def next_content(data: bytes) -> bytes:
+    """Content of one frame."""
+    reader = FrameReader()
+    reader.feed(data)
+    return reader.next() or b""
+
+
 def random_frame(draw: random.Random) -> bytes:
-    """Frame of a random message with random content, mostly of valid tags, and sometimes of a wrong length."""
-    content = bytearray(draw.randbytes(draw.choice((0, 1, 10, 100, 2000))))
-    if draw.random() < 0.8:
-        field = protocol().MessageV1.DESCRIPTOR.fields_by_name[draw.choice(kinds())]
-        body = varint(field.number << 3 | 2) + varint(len(content)) + bytes(content)
-        body = b"\x0a\x01x" + body
-        content = bytearray(b"\x1a" + varint(len(body)) + body)  # the field message_v1 of an Envelope
-    if content and draw.random() < 0.3:
+    """Frame of a valid command with some bytes changed, or of random content, and sometimes of a wrong length."""
+    if draw.random() < 0.6:
+        content = bytearray(draw.choice(valid_contents()))
+        changes = draw.choice((0, 1, 1, 1, 2, 5))
+    else:
+        content = bytearray(draw.randbytes(draw.choice((0, 1, 10, 100, 2000))))
+        changes = 0
+        if draw.random() < 0.8:
+            body = _field("MessageV1", draw.choice(kinds()), bytes(content))
+            content = bytearray(_field("Envelope", "message_v1", b"\x0a\x01x" + body))
+    for _ in range(changes):
         content[draw.randrange(len(content))] = draw.randrange(256)
-    wrong = draw.choice((0, 0, 0, 0, 0, 0, 0, 0, 0, 1, -1, 1 << 20, 1 << 62)) if draw.random() < 0.05 else 0
+    wrong = draw.choice((1, -1, 1 << 20, 1 << 62)) if draw.random() < 0.01 else 0
     return varint(max(0, len(content) + wrong)) + bytes(content)
 
 
@@ -177,7 +214,7 @@ def run_and_read_slowly(served: ServedByProcess, draw: random.Random, stop: Stop
     """Start a run of an hour, and read its samples a kilobyte at a time."""
     pb = protocol()
     run, daq = pb.RunConfig(op_time=pb.Time(value=3600)), pb.DaqConfig(sample_rate=1000)
-    adc = pb.Item(entity=pb.EntityId(path="04-E9-E5-00-00-01"), adc_config=pb.AdcConfig(channels=[pb.AdcChannel()] * 8))
+    adc = pb.Item(entity=pb.EntityId(path=MAC), adc_config=pb.AdcConfig(channels=[pb.AdcChannel()] * 8))
     count = 0
     with served.connect() as connection, ignore_disconnection():
         connection.sendall(command("config_command", module=pb.Module(items=[adc]), reset_before=True))

@@ -229,6 +229,7 @@ def test_machine_is_busy_for_others_during_a_run_and_free_when_its_client_is_gon
         (lambda pb: items(itor_config=pb.ItorConfig(elements=[pb.ItorConfig.Element(idx=1, k=5)])), "k0 must be"),
         (lambda pb: items(port_config=pb.PortConfig(states=[1] * 9)), "8 ports, not 9"),
         (lambda pb: items(select_config=pb.SelectConfig(constant=pb.SelectConfig.ANALOG_INPUT)), "no analogue input"),
+        (lambda pb: items(select_config=pb.SelectConfig(constant=77)), "ground or a reference"),
         (lambda pb: items(switch_config=pb.SwitchConfig()), "has no switch_config"),
         (
             lambda pb: items(
@@ -253,6 +254,7 @@ def test_impossible_runs_and_unknown_commands_are_answered_with_an_error(talk: T
     for run, rate_hz, why in (
         (pb.RunConfig(), 1000, "op_time must be more than 0"),
         (pb.RunConfig(op_time=pb.Time(value=2**62)), 1000, "op_time must be more than 0"),
+        (pb.RunConfig(op_time=pb.Time(value=1, prefix=77)), 1000, "op_time must be more than 0"),
         (second, 0, "sample_rate x channels must be 1 to 500000, not 0 x 8"),
         (second, 62_501, "sample_rate x channels must be 1 to 500000, not 62501 x 8"),
     ):

@@ -36,6 +36,11 @@ def protocol() -> Any:
         ) from error
 
 
+def enum_name(kind: Any, value: int) -> str:
+    """Name of an enumerated value; empty for one that the protocol does not define."""
+    return str(kind.Name(value)) if value in kind.values() else ""
+
+
 def parse_envelope(content: bytes) -> Any:
     """Envelope of a frame's content; None if it is malformed, such as nested too deeply."""
     malformed: type[Exception] = importlib.import_module("google.protobuf.message").DecodeError

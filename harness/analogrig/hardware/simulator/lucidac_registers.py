@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from analogrig.hardware.lucidac_messages import protocol
+from analogrig.hardware.lucidac_messages import enum_name, protocol
 from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.lucidac.configuration import (
     ADC_CHANNELS,
@@ -129,7 +129,7 @@ class Registers:
 
     def _select(self, content: Any) -> None:
         kinds = protocol().SelectConfig
-        level = _CONSTANTS.get(kinds.ConstantConfig.Name(content.constant))
+        level = _CONSTANTS.get(enum_name(kinds.ConstantConfig, content.constant))
         if level is None:
             raise CircuitError("the constant of this LUCIDAC is ground or a reference, no analogue input")
         self.constant = level * (0.1 if content.magnitude == kinds.ONE_TENTH else 1.0)
@@ -164,7 +164,7 @@ class Registers:
 
     def _signal_generator(self, content: Any) -> None:
         waves = protocol().SignalGeneratorConfig.WaveForm
-        wave_form = _WAVE_FORMS.get(waves.Name(content.wave_form) if content.wave_form in waves.values() else "", "")
+        wave_form = _WAVE_FORMS.get(enum_name(waves, content.wave_form), "")
         dac = (*content.dac_outputs[:2], 0.0, 0.0)
         self.generator = SignalGenerator(
             wave_form,

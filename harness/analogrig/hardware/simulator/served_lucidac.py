@@ -27,7 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, framed, parse_envelope, protocol
+from analogrig.hardware.lucidac_messages import (
+    FrameError,
+    FrameReader,
+    enum_name,
+    frame,
+    framed,
+    parse_envelope,
+    protocol,
+)
 from analogrig.hardware.simulator.lucidac_registers import Registers
 from analogrig.hardware.simulator.served import Keys, merge, parse_defect
 from analogrig.hardware.simulator.tcp_server import IDLE_S, SLOW_S, Client, TcpServer, now_s
@@ -284,7 +292,8 @@ class LucidacServer(TcpServer):
         return self._pb.SuccessMessage()
 
     def _seconds(self, time: Any) -> float:
-        return float(time.value * _PREFIXES[self._pb.Prefix.Name(time.prefix)])
+        """Seconds of a time; 0 for an unknown prefix."""
+        return float(time.value * _PREFIXES.get(enum_name(self._pb.Prefix, time.prefix), 0.0))
 
     async def _conduct(self, client: Client, command: Any, blocks: Iterator[NDArray[np.int16]], rate_hz: int) -> None:
         """Run to its end: state changes, samples, and the reason if it fails."""
