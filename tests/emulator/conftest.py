@@ -18,14 +18,19 @@ SAMPLE_RATE_HZ = 20e3
 @pytest.fixture
 def ngspice(tmp_path: Path) -> NgSpice:
     """(deck, nodes, samples) -> voltages of the nodes at every sample instant of 20 kHz, (samples, nodes)."""
+    return ngspice_in(tmp_path)
+
+
+def ngspice_in(folder: Path) -> NgSpice:
+    """Value of the fixture, with its files in a folder."""
 
     def run(deck: str, nodes: Sequence[str], samples: int) -> NDArray[np.float64]:
-        (tmp_path / "deck.cir").write_text(deck)
+        (folder / "deck.cir").write_text(deck)
         command = ["ngspice", "-b", "-r", "out.raw", "deck.cir"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         log = done.stdout[-2000:] + done.stderr[-2000:]
-        assert (tmp_path / "out.raw").exists(), log
-        names, table = _read_raw(tmp_path / "out.raw")
+        assert (folder / "out.raw").exists(), log
+        names, table = _read_raw(folder / "out.raw")
         instants_s = np.arange(samples) / SAMPLE_RATE_HZ
         rows = _nearest(table[:, 0], instants_s)
         # ngspice's first time point comes 10 ps after sample 0; all other samples have a time point of their own.

@@ -124,7 +124,11 @@ class NiBench(Bench):
 BENCHES: dict[str, Callable[[], Bench]] = {"redpitaya": RedPitayaBench, "nidaqmx": NiBench}
 
 
-@pytest.fixture(params=DRIVERS)
+COMPUTERS = {"lucidac"}
+"""Instruments that are the computer too: tests/served/test_lucidac_rig.py."""
+
+
+@pytest.fixture(params=[driver for driver in DRIVERS if driver not in COMPUTERS])
 def bench(request: pytest.FixtureRequest) -> Bench:
     """Bench of a driver; a driver without one fails."""
     return BENCHES[request.param]()
@@ -165,8 +169,9 @@ def test_address_is_passed_to_the_driver_of_the_scheme(url: str, address: str) -
         ("redpitaya:host", "redpitaya://HOST[:PORT]"),
         ("nidaqmx://Dev1/ai0", "nidaqmx://CARD"),
         ("nidaqmx://", "nidaqmx://CARD"),
-        ("picoscope://x", "redpitaya://HOST[:PORT] or nidaqmx://CARD"),
-        ("", "redpitaya://HOST[:PORT] or nidaqmx://CARD"),
+        ("lucidac://host/x", "lucidac://HOST[:PORT]"),
+        ("picoscope://x", "redpitaya://HOST[:PORT] or nidaqmx://CARD or lucidac://HOST[:PORT]"),
+        ("", "redpitaya://HOST[:PORT] or nidaqmx://CARD or lucidac://HOST[:PORT]"),
     ],
 )
 def test_malformed_address_is_refused_with_the_right_form(url: str, form: str) -> None:

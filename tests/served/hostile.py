@@ -16,7 +16,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from tests.harness.processes import LONG_S
@@ -92,7 +92,7 @@ def talk(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Send random lines, and read most answers."""
     said = 0
     while True:
-        with _ignore_disconnection(), served.connect() as connection:
+        with ignore_disconnection(), served.connect() as connection:
             connection.settimeout(0.01)
             for _ in range(draw.randrange(1, 200)):
                 connection.sendall(line(draw))
@@ -123,7 +123,7 @@ def leave_half_open(served: ServedByProcess, draw: random.Random, stop: Stop) ->
     left: list[socket.socket] = []
     count = 0
     while True:
-        with _ignore_disconnection():
+        with ignore_disconnection():
             connection = served.connect()
             connection.sendall(draw.choice((b"", b"*IDN", b"OUTPUT1:STATE ON\nSOUR1:TRig:INT\nACQ:", line(draw)[:-1])))
             match draw.randrange(3):
@@ -148,7 +148,7 @@ def leave_half_open(served: ServedByProcess, draw: random.Random, stop: Stop) ->
 def read_slowly(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Read answers of 100 kB a kilobyte at a time."""
     count = 0
-    with served.connect() as connection, _ignore_disconnection():
+    with served.connect() as connection, ignore_disconnection():
         connection.sendall("".join(f"{command}\n" for command in SEQUENCE).encode())
         connection.sendall(b"ACQ:SOUR1:DATA?;" * 200 + b"\n")
         while not stop() or count < 100:
@@ -161,7 +161,7 @@ def never_read(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Query large answers until the server reads no more."""
     count = 0
     while True:
-        with served.connect() as connection, _ignore_disconnection():
+        with served.connect() as connection, ignore_disconnection():
             connection.settimeout(0.2)
             connection.sendall("".join(f"{command}\n" for command in SEQUENCE).encode())
             for _ in range(SILENT_BYTES // 4000):
@@ -193,7 +193,7 @@ def connect_often(served: ServedByProcess, draw: random.Random, stop: Stop) -> i
     count = 0
     kept: list[socket.socket] = []
     while True:
-        with _ignore_disconnection():
+        with ignore_disconnection():
             kept.append(served.connect())
         count += 1
         if len(kept) > draw.randrange(1, 100):
@@ -216,7 +216,7 @@ ATTACKS: tuple[Attack, ...] = (
 
 
 @contextlib.contextmanager
-def _ignore_disconnection() -> Iterator[None]:
+def ignore_disconnection() -> Iterator[None]:
     """Ignore errors of a connection that the server has closed or refused."""
     with contextlib.suppress(OSError):
         yield
@@ -242,8 +242,14 @@ def warm(served: ServedByProcess) -> None:
     client.close()
 
 
-def survive(served: ServedByProcess, attack: Attack, seed: int, seconds: float) -> Survival:
+Query = Callable[[ServedByProcess], str]
+"""Query of the witness, which returns the identity of the instrument; empty if all places are taken."""
+
+
+def survive(served: ServedByProcess, attack: Attack, seed: int, seconds: float, query: Query | None = None) -> Survival:
     """Attack a server that is warm.
+
+    :param query: that of the witness; by default SCPI.
 
     :raises AssertionError: the witness gets no answer, or the memory grows too much.
     """
@@ -252,7 +258,7 @@ def survive(served: ServedByProcess, attack: Attack, seed: int, seconds: float) 
     done = threading.Event()
     slowest_s = [0.0]
     failures: list[str] = []
-    witness = threading.Thread(target=_watch, args=(served, done, slowest_s, failures))
+    witness = threading.Thread(target=_watch, args=(served, query or _identity, done, slowest_s, failures))
     witness.start()
     try:
         times = attack(served, random.Random(seed), lambda: time.monotonic() >= until_s)
@@ -265,55 +271,67 @@ def survive(served: ServedByProcess, attack: Attack, seed: int, seconds: float) 
     return survival
 
 
-def _watch(served: ServedByProcess, done: threading.Event, slowest_s: list[float], failures: list[str]) -> None:
-    """Query repeatedly, and once more at the end."""
-    over = False
+def _watch(
+    served: ServedByProcess, query: Query, done: threading.Event, slowest_s: list[float], failures: list[str]
+) -> None:
+    """Query repeatedly, and once more at the end. All answers must be the same."""
+    over, identity = False, ""
     while not over and not failures:
         over = done.wait(0.02)
         begun_s, worked_s = time.monotonic(), served.processor_s
         try:
-            heard = _query(served)
+            heard = _query(served, query)
+            identity = identity or heard
         except OSError as error:
             heard = repr(error)
         waited_s, worked_s = time.monotonic() - begun_s, served.processor_s - worked_s
         slowest_s[0] = max(slowest_s[0], waited_s)
-        if heard != IDENTITY or worked_s > WITNESS_S:
+        if not heard or heard != identity or worked_s > WITNESS_S:
             failures.append(
                 f"the witness received {heard!r} after {waited_s:.1f} s and {worked_s:.1f} s of the processor"
             )
 
 
-def _query(served: ServedByProcess) -> str:
+def _identity(served: ServedByProcess) -> str:
+    client = served.client()
+    try:
+        return client.ask("*IDN?")
+    finally:
+        client.close()
+
+
+def _query(served: ServedByProcess, query: Query) -> str:
     """Query the identity; retry while all places are taken."""
     deadline_s = time.monotonic() + LONG_S
     while True:
-        client = served.client()
-        try:
-            heard = client.ask("*IDN?")
-        except ConnectionError:
-            heard = ""
-        finally:
-            client.close()
-        if heard or time.monotonic() > deadline_s:
-            return heard
+        with contextlib.suppress(ConnectionError):
+            heard = query(served)
+            if heard or time.monotonic() > deadline_s:
+                return heard
+        if time.monotonic() > deadline_s:
+            return ""
         time.sleep(0.05)
 
 
-def main(seconds: float, seed: int) -> None:
+def survive_all(served: ServedByProcess, attacks: Sequence[Attack], seconds: float, seed: int, query: Query) -> None:
     """Print a table; raise AssertionError at the first failure."""
     print(f"{'client':18} {'times':>9} {'grown kB':>9} {'slowest answer s':>17}")
+    for attack in attacks:
+        survival = survive(served, attack, seed, seconds, query)
+        print(
+            f"{attack.__name__:18} {survival.times:9d} {survival.grown_kb:9d} {survival.slowest_s:17.2f}",
+            flush=True,
+        )
+    served.process.terminate()
+    if (output := ended(served, [130])) != "analogrig: interrupted\n":
+        raise AssertionError(output)
+    print(f"{seconds:g} s each, seed {seed}: alive afterwards")
+
+
+def main(seconds: float, seed: int) -> None:
     with serving() as served:
         warm(served)
-        for attack in ATTACKS:
-            survival = survive(served, attack, seed, seconds)
-            print(
-                f"{attack.__name__:18} {survival.times:9d} {survival.grown_kb:9d} {survival.slowest_s:17.2f}",
-                flush=True,
-            )
-        served.process.terminate()
-        if (output := ended(served, [130])) != "analogrig: interrupted\n":
-            raise AssertionError(output)
-    print(f"{seconds:g} s each, seed {seed}: alive afterwards")
+        survive_all(served, ATTACKS, seconds, seed, _identity)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ import numpy as np
 from analogrig.hardware.simulator.records import AcquisitionFaults
 from analogrig.hardware.simulator.scpi import Call, Command, Response
 from analogrig.hardware.simulator.served import InstrumentDescription, ServedRedPitaya
-from analogrig.hardware.simulator.server import BUFFERED_BYTES, MOST_CLIENTS, Servable, Server
+from analogrig.hardware.simulator.server import Servable, Server
+from analogrig.hardware.simulator.tcp_server import BUFFERED_BYTES, MOST_CLIENTS
 from tests.harness.processes import LONG_S
 from tests.served.talk import SEQUENCE, front
 

@@ -1,4 +1,4 @@
-"""``analogrig serve``: the emulated rig as an instrument on a TCP port."""
+"""``analogrig serve``: the emulated rig as an instrument, or an emulated LUCIDAC, on a TCP port."""
 
 from __future__ import annotations
 
@@ -13,20 +13,29 @@ from analogrig.cli.terminal import PASSED, complain, show, show_json
 if TYPE_CHECKING:
     import asyncio
 
-    from analogrig.hardware.simulator.server import Server
+    from analogrig.hardware.simulator.tcp_server import TcpServer
+    from analogrig.links.wire import Clock
 
-DEFAULT_PORT = 5000
-"""Default TCP port, the one of a Red Pitaya."""
+_DEFAULT_PORTS = {"red-pitaya": 5000, "lucidac": 5732}
+"""Default TCP port of each machine that can be served."""
 
 
 def add(commands: Any) -> None:
     command = add_command(
         commands,
         "serve",
-        "serve an emulated rig as a Red Pitaya on a TCP port",
+        "serve an emulated rig as a Red Pitaya, or an emulated LUCIDAC, on a TCP port",
         "serve --port 5000",
+        "serve --as lucidac --port 5732",
         "serve --rig emulator-real --defect inputs.skew_s=5e-6",
         "serve -- analogrig run --rig red-pitaya",
+    )
+    command.add_argument(
+        "--as",
+        dest="machine",
+        choices=_DEFAULT_PORTS,
+        default="red-pitaya",
+        help="machine to serve (default: %(default)s); a lucidac has neither --rig nor --program",
     )
     command.add_argument(
         "--rig",
@@ -43,13 +52,14 @@ def add(commands: Any) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="defect of the instrument: a key of the table [instrument], such as wiring.swapped=true; may be repeated",
+        help="defect of the instrument: a key of the table [instrument], such as wiring.swapped=true; of a lucidac: a"
+        " parameter, such as adc_noise_lsb=0; may be repeated",
     )
     command.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)"
     )
     command.add_argument(
-        "--port", type=port, default=DEFAULT_PORT, metavar="N", help="TCP port; 0: any free one (default: %(default)d)"
+        "--port", type=port, metavar="N", help="TCP port; 0: any free one (default: 5000; lucidac: 5732)"
     )
     command.add_argument(
         "--real-time",
@@ -72,23 +82,35 @@ def port(text: str) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     import asyncio
 
-    from analogrig.hardware.simulator.served import ServedDescription
-    from analogrig.hardware.simulator.server import Server
-    from analogrig.program import Program
     from analogrig.scenario import DEFAULT_SEED
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
+    clock = time.monotonic if arguments.real_time else None
+    server, names = (_lucidac if arguments.machine == "lucidac" else _red_pitaya)(arguments, drawn_from, clock)
+    if arguments.port is None:
+        arguments.port = _DEFAULT_PORTS[arguments.machine]
+    return asyncio.run(_serve(server, arguments, {**names, "seed": drawn_from}))
+
+
+def _red_pitaya(arguments: argparse.Namespace, seed: int, clock: Clock | None) -> tuple[TcpServer, dict[str, Any]]:
+    from analogrig.hardware.simulator.served import ServedDescription
+    from analogrig.hardware.simulator.server import Server
+    from analogrig.program import Program
+
     described = ServedDescription.load(arguments.rig, arguments.defect)
-    server = Server(
-        described.set_up(Program.load(arguments.program), drawn_from, time.monotonic if arguments.real_time else None)
-    )
+    server = Server(described.set_up(Program.load(arguments.program), seed, clock))
     if described.unsupported:
         complain(f"{described.name}: the instrument has no {', '.join(described.unsupported)}", PASSED)
-    names = {"rig": described.name, "program": arguments.program, "seed": drawn_from}
-    return asyncio.run(_serve(server, arguments, names))
+    return server, {"rig": described.name, "program": arguments.program}
 
 
-async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str, Any]) -> int:
+def _lucidac(arguments: argparse.Namespace, seed: int, clock: Clock | None) -> tuple[TcpServer, dict[str, Any]]:
+    from analogrig.hardware.simulator.served_lucidac import LucidacServer, specimen
+
+    return LucidacServer(specimen(seed, arguments.defect), clock), {"rig": "lucidac", "program": ""}
+
+
+async def _serve(server: TcpServer, arguments: argparse.Namespace, names: dict[str, Any]) -> int:
     """Serve until a signal ends the command or, if there is one, until the client ends. Return the exit status."""
     from analogrig.signals import signal_future
 
@@ -99,7 +121,8 @@ async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str,
         if arguments.json:
             show_json({**names, "host": host, "port": number, "address": address})
         else:
-            show(f"rig {names['rig']} ({names['program']}, seed {names['seed']}) at {address}")
+            program = f"{names['program']}, " if names["program"] else ""
+            show(f"rig {names['rig']} ({program}seed {names['seed']}) at {address}")
         return await (_client(arguments.client, ended) if arguments.client else ended)
     finally:
         await server.close()

@@ -7,6 +7,7 @@ Volts are those at the instrument's connectors. ``analogrig.hardware.wiring`` de
 from __future__ import annotations
 
 import hashlib
+import math
 import pkgutil
 from abc import ABC, abstractmethod
 from collections import deque
@@ -24,6 +25,9 @@ MEASURED = CHANNELS[:2]
 """Channels of a rig that are wired to the instrument: force and displacement of a suspension."""
 
 _ROUNDING_V = 1e-9
+EARLY_N = 1e-4
+"""Time from an edge to its first sample, in samples, so that rounding never puts the edge after the sample."""
+
 _REMEMBERED = 64
 """Number of records among which a repetition is recognised."""
 
@@ -142,6 +146,12 @@ class Instrument(ABC):
         self._digests: deque[bytes] = deque(maxlen=_REMEMBERED)
         """Digests of the codes of earlier records."""
 
+    def patch(self, program: str) -> None:  # noqa: B027 - most are no computer
+        """Patch a program, where the instrument is the computer too; others are patched by hand.
+
+        :raises ConfigurationError: it cannot be patched; names the term.
+        """
+
     def find_pots(self, names: Iterable[str]) -> PotBox:
         """Pots of the instrument, which are to have these names.
 
@@ -228,9 +238,36 @@ class Instrument(ABC):
         """Close the connection. Raises nothing."""
 
 
+def check_edges(excitation: Excitation, rate_hz: float) -> None:
+    """Check that a generator with a clock of its own can put edges on the samples, where that is asked for.
+
+    :raises ConfigurationError: the edges are no whole samples apart.
+    """
+    period_n = rate_hz / excitation.frequency_hz
+    high_n = period_n * (0.5 if excitation.shape == "square" else excitation.duty)
+    if excitation.clock == "card" and not (_is_whole(high_n) and _is_whole(period_n)):
+        raise ConfigurationError(
+            f'{excitation.frequency_hz:g} Hz on the clock "card" needs edges that are whole samples apart, not'
+            f' {high_n:g} and {period_n - high_n:g}: use another frequency, or clock = "free"'
+        )
+
+
+def first_phase(excitation: Excitation, rate_hz: float, early_n: float = EARLY_N) -> float:
+    """Phase at the first sample, in periods; on the card's clock edges come ``early_n`` samples before samples."""
+    if excitation.clock == "free":
+        return excitation.phase
+    period_n = round(rate_hz / excitation.frequency_hz)
+    return (math.floor(excitation.phase * period_n) + early_n) / period_n
+
+
+def _is_whole(samples: float) -> bool:
+    return math.isclose(samples, round(samples), rel_tol=1e-12)
+
+
 DRIVERS = {
     "redpitaya": ("analogrig.hardware.red_pitaya:RedPitaya", "HOST[:PORT]"),
     "nidaqmx": ("analogrig.hardware.ni_daqmx:NiDaqmx", "CARD"),
+    "lucidac": ("analogrig.hardware.lucidac:LucidacInstrument", "HOST[:PORT]"),
 }
 """Driver class and form of its addresses, by the scheme of an instrument's URL."""
 

@@ -238,6 +238,7 @@ class RealRig(Rig):
             self._is_locked = True
         if self._instrument is None:
             self._instrument = self._connect(self._address, description.timeout_s)
+            self._instrument.patch(description.plant)
         if self._pots is None:
             own = description.pots.exact
             self._pots = self._instrument.find_pots(description.pot_names) if own else description.pots.open()

@@ -9,14 +9,22 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigRefused, RigTimeout
-from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, InstrumentDatasheet, PotBox
+from analogrig.hardware.instrument import (
+    DialChange,
+    InputRecord,
+    Instrument,
+    InstrumentDatasheet,
+    PotBox,
+    check_edges,
+    first_phase,
+)
 from analogrig.hardware.scpi_connection import ScpiConnection
+from analogrig.hardware.tcp_address import host_and_port, tcp_place
 from analogrig.links.wire import Clock
 from analogrig_emulator import Excitation
 
@@ -29,9 +37,6 @@ MIDDLE_N = BUFFER_N // 2
 _POLL_S = 0.01
 _ZEROS_N = BUFFER_N // 10
 """Zeros in a row on all inputs that show an unfilled buffer."""
-
-_EARLY_N = 1e-4
-"""Time from an edge to its first sample, in samples, so that rounding never puts the edge after the sample."""
 
 
 class RedPitaya(Instrument):
@@ -61,18 +66,12 @@ class RedPitaya(Instrument):
 
     @classmethod
     def place(cls, address: str) -> str:
-        try:
-            split, (host, port) = urlsplit(f"//{address}"), _host_and_port(address)
-        except ValueError:
-            return ""
-        if not (host and port) or split.path or split.query or split.fragment or split.username or " " in address:
-            return ""
-        return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        return tcp_place(address, PORT)
 
     @classmethod
     def open(cls, address: str, timeout_s: float) -> RedPitaya:
         """:raises RigError: the connection failed."""
-        connection = ScpiConnection(*_host_and_port(address), timeout_s)
+        connection = ScpiConnection(*host_and_port(address, PORT), timeout_s)
         try:
             return cls(connection, timeout_s)
         except BaseException:
@@ -84,13 +83,7 @@ class RedPitaya(Instrument):
         super().check(excitation)
         if excitation.shape == "prbs":
             raise ConfigurationError("the generator of a Red Pitaya has no prbs: use square or pulse")
-        period_n = cls.datasheet.rate_hz / excitation.frequency_hz
-        high_n = period_n * (0.5 if excitation.shape == "square" else excitation.duty)
-        if excitation.clock == "card" and not (_is_whole(high_n) and _is_whole(period_n)):
-            raise ConfigurationError(
-                f'{excitation.frequency_hz:g} Hz on the clock "card" needs edges that are whole samples apart, not'
-                f' {high_n:g} and {period_n - high_n:g}: use another frequency, or clock = "free"'
-            )
+        check_edges(excitation, cls.datasheet.rate_hz)
 
     def rest(self, settle_s: float) -> None:
         """Wait for a record, so that machine time passes.
@@ -138,7 +131,7 @@ class RedPitaya(Instrument):
             f"SOUR1:FREQ:FIX {self._excitation.true_frequency_hz:.15g}",
             f"SOUR1:VOLT {excitation.high_v - middle_v:.12g}",
             f"SOUR1:VOLT:OFFS {middle_v:.12g}",
-            f"SOUR1:PHAS {360.0 * self._phase():.15g}",
+            f"SOUR1:PHAS {360.0 * first_phase(self._excitation, self.datasheet.rate_hz):.15g}",
             f"ACQ:DEC:Factor {DECIMATION}",
             "ACQ:AVG OFF",
             *(f"ACQ:SOUR{number}:GAIN {word}" for number, word in self._ranges),
@@ -147,14 +140,6 @@ class RedPitaya(Instrument):
         scheduled_n = 0 if self._box is None else self._box.send_schedule()
         self._scpi.check("the set-up of the record")
         return scheduled_n
-
-    def _phase(self) -> float:
-        """Phase at the first sample, in periods; on the card's clock the edges coincide with samples."""
-        excitation = self._excitation
-        if excitation.clock == "free":
-            return excitation.phase
-        period_n = round(self.datasheet.rate_hz / excitation.frequency_hz)
-        return (math.floor(excitation.phase * period_n) + _EARLY_N) / period_n
 
     def _check_waiting(self) -> None:
         """:raises RecordStale: a record is ready before the generator, which triggers it, is on."""
@@ -217,11 +202,6 @@ class RedPitaya(Instrument):
             raise RecordIncomplete(f"{self.name}: incomplete record: only zeros from sample {start} to {end - 1}")
 
 
-def _host_and_port(address: str) -> tuple[str, int]:
-    split = urlsplit(f"//{address}")
-    return split.hostname or "", PORT if split.port is None else split.port
-
-
 class _ScpiPots(PotBox):
     """Pots on the instrument's own server."""
 
@@ -257,10 +237,6 @@ class _ScpiPots(PotBox):
 
     def _number(self, pot: str) -> int:
         return self.names.index(pot) + 1
-
-
-def _is_whole(samples: float) -> bool:
-    return math.isclose(samples, round(samples), rel_tol=1e-12)
 
 
 def _is_close(answer: str, wanted: float) -> bool:

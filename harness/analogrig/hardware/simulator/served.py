@@ -346,7 +346,7 @@ class ServedDescription(EmulatorDescription):
         path = config.locate("rigs", name)
         table: Keys = {"name": path.stem, **config.read_toml(path)}
         for defect in defects:
-            table = _merge(table, {"instrument": _parse(defect)})
+            table = merge(table, {"instrument": parse_defect(defect)})
         return config.build(cls, table, str(path))
 
     def set_up(self, program: Program, seed: int, clock: Clock | None = None) -> ServedRedPitaya:
@@ -401,7 +401,11 @@ def _pair(values: NDArray[np.float64]) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-def _parse(defect: str) -> Keys:
+def parse_defect(defect: str) -> Keys:
+    """Keys of a line of TOML.
+
+    :raises ConfigurationError: it is none.
+    """
     try:
         return tomllib.loads(defect)
     except (ValueError, RecursionError) as error:
@@ -410,10 +414,10 @@ def _parse(defect: str) -> Keys:
         ) from error
 
 
-def _merge(table: Keys, more: Keys) -> Keys:
+def merge(table: Keys, more: Keys) -> Keys:
     """The table with the keys of another; nested tables are merged likewise."""
     out = dict(table)
     for key, value in more.items():
         both = isinstance(value, dict) and isinstance(out.get(key), dict)
-        out[key] = _merge(out[key], value) if both else value
+        out[key] = merge(out[key], value) if both else value
     return out

@@ -1,0 +1,202 @@
+"""Driver of a LUCIDAC: the computer, its signal generator, and eight channels of 16 bits, at 20 kS/s.
+
+The driver patches the program itself; a cable leads from the square-wave output of the generator to port 2 of the front
+panel. Converter channel 0 reads the input of the program, channel 1 its output. Coefficients change between runs: a
+record with changes is played in several runs, each from the states that the converter read at the change.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.errors import ConfigurationError, RigError
+from analogrig.hardware.instrument import (
+    DialChange,
+    InputRecord,
+    Instrument,
+    InstrumentDatasheet,
+    PotBox,
+    check_edges,
+    first_phase,
+)
+from analogrig.hardware.lucidac_connection import LucidacConnection
+from analogrig.hardware.lucidac_messages import PORT
+from analogrig.hardware.lucidac_patch import LinearPatch, module_of, values_of
+from analogrig.hardware.tcp_address import host_and_port, tcp_place
+from analogrig.links.wire import Clock
+from analogrig.program import Program
+from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
+from analogrig_emulator.lucidac.configuration import SignalGenerator
+from analogrig_emulator.lucidac.wiring import UNIT_V
+
+FULL_SCALE = 1.25
+"""End of the converter's range in machine units, by the legacy firmware; values beyond it count as clipped."""
+
+_HALF_RANGE = 1 << 15
+_EARLY_N = 1e-3
+"""Time from an edge of the generator to its first sample, in samples: the elements settle in 50 ns."""
+
+_ASLEEP = SignalGenerator("sine and square")
+
+
+class LucidacInstrument(Instrument):
+    """LUCIDAC with records of any number of samples."""
+
+    datasheet = InstrumentDatasheet(
+        rate_hz=20e3,
+        record_n=1_000_000,
+        bits=16,
+        inputs=(0, 1),
+        output_v=(-UNIT_V, UNIT_V),
+        ranges_v={"unit": (-FULL_SCALE * UNIT_V, FULL_SCALE * UNIT_V)},
+    )
+
+    def __init__(self, connection: LucidacConnection) -> None:
+        """Take over ``connection``.
+
+        :raises RigError: the answers are not those of a LUCIDAC.
+        """
+        super().__init__(f"instrument {connection.name}")
+        self._connection = connection
+        self._mac = connection.carrier()
+        self._patched: LinearPatch | None = None
+        self._box: _Coefficients | None = None
+
+    @classmethod
+    def place(cls, address: str) -> str:
+        return tcp_place(address, PORT)
+
+    @classmethod
+    def open(cls, address: str, timeout_s: float, clock: Clock = time.monotonic) -> LucidacInstrument:
+        """:raises RigError: the connection failed."""
+        connection = LucidacConnection(*host_and_port(address, PORT), timeout_s, clock)
+        try:
+            return cls(connection)
+        except BaseException:
+            connection.close()
+            raise
+
+    @classmethod
+    def check(cls, excitation: Excitation) -> None:
+        super().check(excitation)
+        if excitation.shape != "square":
+            raise ConfigurationError(f"the generator of a LUCIDAC has no {excitation.shape}: use square")
+        check_edges(excitation, cls.datasheet.rate_hz)
+
+    def patch(self, program: str) -> None:
+        loaded = Program.load(program)
+        self._patched = LinearPatch(loaded)
+        self._box = self.pots = _Coefficients(loaded, self.name)
+
+    def rest(self, settle_s: float) -> None:
+        """Wait for nothing: every run begins at the initial conditions."""
+
+    def make_safe(self) -> None:
+        if self._patched is None or self._box is None:
+            return
+        at_rest = self._patched.configuration(self._box.values(), [0.0] * len(self._patched.states), _ASLEEP)
+        self._connection.ask("config_command", module=module_of(at_rest, self._mac), reset_before=True)
+
+    def close(self) -> None:
+        self._connection.close()
+
+    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> InputRecord:
+        if self._patched is None or self._box is None:
+            raise RigError(f"{self.name}: no program is patched")
+        self._connection.ask("reset_command", keep_calibration=True, overload_reset=True)
+        columns = [0, 1 + self._patched.output]
+        channels = [columns[number] for number, _ in self._ranges]
+        signs = np.array([-1.0 if channel == 0 else 1.0 for channel in channels])
+        values, ends = self._play(self._patched, self._box, samples)
+        if while_recording is not None:
+            while_recording()
+        if overloaded := self._connection.overloads():
+            raise RigError(f"{self.name}: overload of {', '.join(overloaded[:4])}: rescale the program")
+        wanted = signs * values[:, channels]
+        codes = np.clip(np.rint(wanted / (FULL_SCALE / _HALF_RANGE)), -_HALF_RANGE, _HALF_RANGE - 1).astype(np.int32)
+        at_end = ends[:, channels]
+        codes[at_end] = np.where(wanted[at_end] < 0.0, -_HALF_RANGE, _HALF_RANGE - 1)
+        return InputRecord(wanted * UNIT_V, codes, self.datasheet.bits)
+
+    def _play(
+        self, patched: LinearPatch, box: _Coefficients, samples: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Play runs from change to change. Return values in machine units and ends of the range, (samples, channels).
+
+        The first sample of a run is the last one of the run before.
+        """
+        rate_hz, states = self.datasheet.rate_hz, len(patched.states)
+        cuts = box.take_schedule(samples, rate_hz)
+        initial: NDArray[np.float64] = np.zeros(states)
+        values, ends = [], []
+        for i, (start, dials) in enumerate(cuts):
+            box.set_all(dials)
+            stop = cuts[i + 1][0] if i + 1 < len(cuts) else samples - 1
+            configuration = patched.configuration(box.values(), initial.tolist(), self._generator(start))
+            self._connection.ask("config_command", module=module_of(configuration, self._mac), reset_before=True)
+            self._calibrate()
+            taken, at_end = self._connection.run(stop + 1 - start, int(rate_hz), states + 1)
+            initial = np.clip(taken[-1, 1:], -1.0, 1.0)
+            first = 1 if i else 0
+            values.append(taken[first:])
+            ends.append(at_end[first:])
+        return np.concatenate(values), np.concatenate(ends)
+
+    def _calibrate(self) -> None:
+        self._connection.ask("calibration_command", config={"gain": "Enabled", "offset": "Enabled"})
+
+    def _generator(self, sample: int) -> SignalGenerator:
+        """Generator of a run that begins at a sample of the record."""
+        excitation, rate_hz = self._excitation, self.datasheet.rate_hz
+        periods = first_phase(excitation, rate_hz, _EARLY_N) + sample / rate_hz * excitation.true_frequency_hz
+        return SignalGenerator(
+            "sine and square",
+            excitation.true_frequency_hz,
+            360.0 * (periods % 1.0),
+            square=(excitation.low_v / UNIT_V, excitation.high_v / UNIT_V),
+            sleep=False,
+        )
+
+
+class _Coefficients(PotBox):
+    """Coefficients of a program's parameters, set as if they were the pots of a computer with that program."""
+
+    def __init__(self, program: Program, name: str) -> None:
+        self._program = program
+        self._name = name
+        self._computer = SuspensionComputer(program.circuit)
+        self.names = tuple(self._computer.dials)
+        self._changes: tuple[DialChange, ...] = ()
+
+    def set_one(self, pot: str, dial: float) -> None:
+        self.set_all({pot: dial})
+
+    def set_all(self, dials: Mapping[str, float]) -> None:
+        """Set pots. :raises RigError: one cannot stand there."""
+        try:
+            self._computer.set(**{f"{pot}_dial": dial for pot, dial in dials.items()})
+        except EmulatorError as error:
+            raise RigError(f"{self._name}: {error}") from error
+
+    def values(self) -> dict[str, float]:
+        """Present values of the parameters."""
+        shown = values_of(self._program, self._computer.coefficients)
+        return {name: shown.get(name, row.value) for name, row in self._program.parameters.items()}
+
+    def schedule(self, changes: Sequence[DialChange]) -> None:
+        self._changes = tuple(changes)
+
+    def take_schedule(self, samples: int, rate_hz: float) -> list[tuple[int, dict[str, float]]]:
+        """Samples at which runs begin, with their new dials; the schedule is empty then."""
+        cuts: dict[int, dict[str, float]] = {0: {}}
+        for delay_s, pot, dial in sorted(self._changes):
+            sample = math.floor(delay_s * rate_hz)
+            if sample < samples - 1:
+                cuts.setdefault(sample, {})[pot] = dial
+        self._changes = ()
+        return sorted(cuts.items())

@@ -1,0 +1,185 @@
+"""Client of a LUCIDAC over TCP: commands with their answers, and runs with their samples."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import time
+import uuid
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.errors import RecordIncomplete, RigClosed, RigError, RigRefused, RigTimeout
+from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, parse_envelope, protocol
+from analogrig.links.wire import Clock
+
+_MOST_ANSWER_BYTES = 1 << 20
+
+
+class LucidacConnection:
+    """Connection that exchanges messages, each answer within a time-out."""
+
+    def __init__(self, host: str, port: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
+        """:raises ConfigurationError: the package with the messages is not installed.
+        :raises RigError: the connection failed.
+        """
+        self._pb = protocol()
+        self.name = f"{host}:{port}"
+        self._clock = clock
+        self._timeout_s = timeout_s
+        self._reader = FrameReader(_MOST_ANSWER_BYTES)
+        try:
+            self._socket = socket.create_connection((host, port), timeout_s)
+        except TimeoutError as error:
+            raise RigTimeout(f"instrument {self.name}: no connection within {timeout_s:g} s") from error
+        except OSError as error:
+            raise RigClosed(f"instrument {self.name}: cannot be reached: {error.strerror or error}") from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def ask_once(self, kind: str, **fields: Any) -> Any:
+        """Send a command. Return the message that answers it, be it an error."""
+        message = self._pb.MessageV1(id=str(uuid.uuid4()))
+        command = getattr(message, kind)
+        command.SetInParent()
+        command.MergeFrom(type(command)(**fields))
+        self._send(frame(message), kind)
+        while (answer := self._next(kind, self._timeout_s)).id != message.id:
+            pass
+        return answer
+
+    def ask(self, kind: str, **fields: Any) -> Any:
+        """Send a command. Return the message that answers it.
+
+        :raises RigRefused: it is an error, or the device is busy.
+        """
+        answer = self.ask_once(kind, **fields)
+        answered = answer.WhichOneof("kind")
+        if answered == "error_message":
+            raise RigRefused(f"instrument {self.name}: {kind}: {answer.error_message.description[:200]!r}")
+        if answered == "busy_response":
+            raise RigRefused(f"instrument {self.name}: {kind}: the device is busy with another client's run")
+        return answer
+
+    def carrier(self) -> str:
+        """Address (MAC) of the device.
+
+        :raises RigError: it is no LUCIDAC.
+        """
+        module = self.ask("extract_command", recursive=True, specification=True).extract_response.module
+        roots = [item.entity_specification.entity for item in module.items if item.HasField("entity_specification")]
+        for entity in [*roots, *(child for root in roots for child in root.children)]:
+            if entity.class_ == self._pb.Entity.CARRIER:
+                return str(entity.id).strip("/")
+        raise RigError(f"instrument {self.name}: names no carrier board: it is no LUCIDAC")
+
+    def run(self, samples: int, rate_hz: int, channels: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Run. Return values in machine units and the ends of the converter's range, each (samples, channels).
+
+        :raises RecordIncomplete: samples are missing.
+        """
+        pb, run_id = self._pb, str(uuid.uuid4())
+        op_ns = math.ceil(samples / rate_hz * 1e9)
+        self.ask(
+            "start_run_command",
+            run=pb.Run(id=run_id),
+            run_config=pb.RunConfig(
+                ic_time=pb.Time(value=1, prefix=pb.MILLI), op_time=pb.Time(value=op_ns, prefix=pb.NANO)
+            ),
+            daq_config=pb.DaqConfig(num_channels=channels, sample_rate=rate_hz, sample_op=True),
+        )
+        values, ends, taken = np.empty((samples, channels)), np.zeros((samples, channels), np.bool_), 0
+        while True:
+            message = self._next("the run", self._timeout_s + op_ns * 1e-9)
+            kind = message.WhichOneof("kind")
+            if kind == "run_data_message":
+                part, at_end = self._samples(message.run_data_message.data, channels)
+                count = min(len(part), samples - taken)
+                values[taken : taken + count], ends[taken : taken + count] = part[:count], at_end[:count]
+                taken += count
+            elif kind == "run_state_change_message":
+                change = message.run_state_change_message
+                if change.new_ == pb.RunState.ERROR:
+                    raise RigError(f"instrument {self.name}: the run failed: {change.reason[:200]!r}")
+                if change.new_ == pb.RunState.DONE:
+                    break
+        if taken < samples:
+            raise RecordIncomplete(f"instrument {self.name}: returned {taken} of {samples} samples")
+        return values, ends
+
+    def overloads(self) -> list[str]:
+        """Elements that were overloaded since the flags were cleared."""
+        status = self.ask("get_overload_status_command").get_overload_status_response.status
+        return [f"{each.entity.path.strip('/')}/{each.idx}" for each in status.elements if each.overload]
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.close()
+
+    def _samples(self, data: Any, channels: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Values by probe, and which of them are at an end of the converter's range."""
+        stride, count, bits = data.channel_stride, data.sample_count, data.type.integer.bitwidth
+        is_signed = data.type.integer.signess == self._pb.IntegerType.Signed
+        kind = "<f4" if data.type.HasField("float_") else {16: "<i2", 32: "<i4"}.get(bits) if is_signed else None
+        probes = [channel.probe for channel in data.channels]
+        if kind is None or sorted(probes) != list(range(channels)) or stride < channels:
+            raise RigError(f"instrument {self.name}: sent samples of a form that was not asked for")
+        if len(data.data) != count * stride * np.dtype(kind).itemsize:
+            raise RigError(f"instrument {self.name}: sent {len(data.data)} bytes for {count} samples of {stride}")
+        raw = np.frombuffer(data.data, kind).reshape(count, stride)[:, :channels]
+        order = np.argsort(probes)
+        gains, offsets = (np.array([getattr(c, name) for c in data.channels]) for name in ("gain", "offset"))
+        values = (raw * gains + offsets)[:, order]
+        if not np.isfinite(values).all():
+            raise RecordIncomplete(f"instrument {self.name}: returned non-finite samples")
+        limits = np.iinfo(raw.dtype) if raw.dtype.kind == "i" else None
+        at_end = np.zeros(raw.shape, np.bool_) if limits is None else (raw == limits.min) | (raw == limits.max)
+        return values, at_end[:, order]
+
+    def _send(self, data: bytes, what: str) -> None:
+        try:
+            self._socket.settimeout(self._timeout_s)
+            self._socket.sendall(data)
+        except TimeoutError as error:
+            raise RigTimeout(f"instrument {self.name}: accepted no command for {self._timeout_s:g} s") from error
+        except OSError as error:
+            raise RigClosed(f"instrument {self.name}: connection lost at {what}: {error.strerror or error}") from error
+
+    def _next(self, what: str, within_s: float) -> Any:
+        """Next message.
+
+        :raises RigTimeout: it does not come in time.
+        """
+        deadline_s = self._clock() + within_s
+        while True:
+            try:
+                content = self._reader.next()
+            except FrameError as error:
+                raise RigError(f"instrument {self.name}: {what}: {error}") from error
+            if content is not None:
+                envelope = parse_envelope(content)
+                if envelope is None:
+                    raise RigError(f"instrument {self.name}: {what}: sent no message of this protocol")
+                return envelope.message_v1
+            left_s = deadline_s - self._clock()
+            if left_s <= 0.0:
+                raise RigTimeout(f"instrument {self.name}: {what}: no answer within {within_s:g} s")
+            self._socket.settimeout(left_s)
+            try:
+                received = self._socket.recv(1 << 18)
+            except TimeoutError as error:
+                raise RigTimeout(f"instrument {self.name}: {what}: no answer within {within_s:g} s") from error
+            except OSError as error:
+                raise RigClosed(
+                    f"instrument {self.name}: connection lost at {what}: {error.strerror or error}"
+                ) from error
+            if not received:
+                raise RigClosed(f"instrument {self.name}: connection closed at {what}")
+            self._reader.feed(received)
+
+
+def _nanoseconds(value: int) -> Any:
+    pb = protocol()
+    return pb.Time(value=value, prefix=pb.NANO)

@@ -1,0 +1,209 @@
+"""Linear programs on a LUCIDAC: lanes with coefficients for given parameters, and the messages that patch them.
+
+    state i         integrator i, at +state; x' = sum of weight source, in machine units, becomes lanes of -weight / k0
+    input           port of the front panel, its lane, and the identity that the first multiplier's input gives
+    channel         the converter reads the identity (inverted), or the integrator
+
+A weight beyond UPSCALE takes several lanes.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.errors import ConfigurationError
+from analogrig.hardware.lucidac_messages import protocol
+from analogrig.program import Program
+from analogrig_emulator.lucidac.configuration import (
+    FAST,
+    FIRST_IDENTITY,
+    FIRST_PORT_LANE,
+    INTEGRATORS,
+    LANES,
+    PORTS,
+    SLOW,
+    UPSCALE,
+    Configuration,
+    Integrator,
+    LucidacLane,
+    SignalGenerator,
+)
+
+PORT = 2
+"""Port of the front panel for the square wave, as in the manufacturer's example."""
+
+_INPUT = 8
+"""Input of the first multiplier, whose identity shows the port."""
+
+_NEGLIGIBLE = 1e-12
+
+
+@dataclass(frozen=True)
+class LinearPatch:
+    """Program on the machine.
+
+    :raises ConfigurationError: it does not fit; names the reason.
+    """
+
+    program: Program
+
+    def __post_init__(self) -> None:
+        program, where = self.program, f"program {self.program.name}: "
+        states = list(program.equations.states)
+        if not program.is_linear:
+            raise ConfigurationError(f"{where}a LUCIDAC is patched with linear programs alone")
+        if len(states) > INTEGRATORS:
+            raise ConfigurationError(f"{where}has {len(states)} states, and a LUCIDAC has {INTEGRATORS} integrators")
+        if program.channels[1] not in states:
+            raise ConfigurationError(f"{where}its output {program.channels[1]!r} is no state, and has no integrator")
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        return tuple(self.program.equations.states)
+
+    @property
+    def output(self) -> int:
+        """Index of the state that is the output of the program."""
+        return self.states.index(self.program.channels[1])
+
+    def configuration(
+        self, values: Mapping[str, float], initial: Sequence[float], generator: SignalGenerator
+    ) -> Configuration:
+        """Configuration for values of the parameters, from states in machine units.
+
+        :raises ConfigurationError: it needs more lanes than there are.
+        """
+        weights = self._weights(values)
+        fast = [bool(np.abs(row).max() * FAST / SLOW > UPSCALE) for row in weights]
+        lanes = list(self._lanes(weights, fast))
+        numbers = [n for n in range(LANES) if not FIRST_PORT_LANE <= n < FIRST_PORT_LANE + PORTS]
+        if len(lanes) > len(numbers):
+            raise ConfigurationError(
+                f"program {self.program.name}: needs {len(lanes)} lanes, and {len(numbers)} are free: rescale it"
+            )
+        integrators = [
+            Integrator(-value, FAST if is_fast else SLOW) for value, is_fast in zip(initial, fast, strict=True)
+        ]
+        integrators += [Integrator()] * (INTEGRATORS - len(integrators))
+        return Configuration(
+            tuple(integrators),
+            {FIRST_PORT_LANE + PORT: LucidacLane(None, _INPUT)} | dict(zip(numbers, lanes, strict=False)),
+            external=frozenset({PORT}),
+            adc=(FIRST_IDENTITY, *range(len(self.states))),
+            generator=generator,
+        )
+
+    def _weights(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Rates of the states by states and input, (n, n + 1), all in machine units and per 1 / FAST seconds."""
+        parameters = np.array([[values[name] for name in self.program.parameters]])
+        matrix = self.program.generators(parameters)[0][:-1]
+        scales = _scales(self.program)
+        full = np.array([scales[name] for name in (*self.states, self.program.channels[0])])
+        return np.asarray(self.program.equations.speed * matrix * full / full[:-1, None] / FAST)
+
+    def _lanes(self, weights: NDArray[np.float64], fast: Sequence[bool]) -> Iterator[LucidacLane]:
+        for i, row in enumerate(weights):
+            for source, weight in enumerate(row):
+                factor = -weight * (1 if fast[i] else FAST / SLOW)
+                output = source
+                if source == len(self.states):
+                    factor, output = -factor, FIRST_IDENTITY
+                if abs(factor) <= _NEGLIGIBLE:
+                    continue
+                count = max(1, math.ceil(abs(factor) / UPSCALE))
+                upscaled = abs(factor) > 1.0
+                yield from [LucidacLane(output, i, factor / count / (UPSCALE if upscaled else 1.0), upscaled)] * count
+
+
+@functools.lru_cache(maxsize=8)
+def _scales(program: Program) -> dict[str, float]:
+    return {name: row.full for name, row in program.circuit.scales.quantities.items()}
+
+
+def values_of(program: Program, coefficients: Mapping[str, float]) -> dict[str, float]:
+    """Values of the parameters whose pots have these coefficients under load.
+
+    :raises ConfigurationError: a pot stands at 0, or several parameters turn it.
+    """
+    circuit, values = program.circuit, {}
+    for pot, row in circuit.pots.items():
+        if len(row.settings) != 1 or not coefficients[pot] > 0.0:
+            raise ConfigurationError(
+                f"program {program.name}: pot {pot} with the coefficient {coefficients[pot]:g} shows no parameter"
+            )
+        (name,) = row.settings
+        at_one = circuit.pot_coefficient(pot, {name: 1.0})
+        values[name] = at_one / coefficients[pot] if name in program.inverse else coefficients[pot] / at_one
+    return values
+
+
+def module_of(configuration: Configuration, mac: str) -> Any:
+    """Items of a configuration message that patch a device."""
+    pb, cluster, lanes = protocol(), f"{mac}/0", configuration.lanes
+    sums: dict[int, list[int]] = {}
+    for number, lane in lanes.items():
+        sums.setdefault(lane.target, []).append(number)
+    select = [
+        pb.SelectConnectionConfig(input=lane.source, output=n) for n, lane in lanes.items() if lane.source is not None
+    ]
+    generator = configuration.generator
+    states = [
+        pb.PortConfig.EXTERNAL if port in configuration.external else pb.PortConfig.INTERNAL for port in range(PORTS)
+    ]
+    contents: list[tuple[str, str, Any]] = [
+        (
+            f"{cluster}/M0",
+            "itor_config",
+            pb.ItorConfig(
+                elements=[
+                    pb.ItorConfig.Element(idx=i, ic=e.ic, k=e.k0) for i, e in enumerate(configuration.integrators)
+                ]
+            ),
+        ),
+        (f"{cluster}/U", "select_config", pb.SelectConfig(connections=select)),
+        (
+            f"{cluster}/C",
+            "coef_config",
+            pb.CoefConfig(elements=[pb.CoefConfig.Element(idx=n, factor=lane.factor) for n, lane in lanes.items()]),
+        ),
+        (
+            f"{cluster}/I",
+            "sum_config",
+            pb.SumConfig(
+                connections=[pb.SumConnectionConfig(inputs=numbers, output=target) for target, numbers in sums.items()],
+                upscales=[pb.UpscaleConfig(lane=n, enabled=lane.upscaled) for n, lane in lanes.items()],
+            ),
+        ),
+        (
+            mac,
+            "adc_config",
+            pb.AdcConfig(
+                channels=[pb.AdcChannel(idx=output, gain=1.0, probe=i) for i, output in enumerate(configuration.adc)]
+            ),
+        ),
+        (mac, "port_config", pb.PortConfig(states=states)),
+        (
+            f"{mac}/FP",
+            "signal_generator_config",
+            pb.SignalGeneratorConfig(
+                wave_form=pb.SignalGeneratorConfig.SINE_AND_SQUARE,
+                frequency=generator.frequency_hz,
+                phase=generator.phase,
+                amplitude=generator.amplitude,
+                offset=generator.offset,
+                square_voltage_low=generator.square[0],
+                square_voltage_high=generator.square[1],
+                sleep=generator.sleep,
+                dac_outputs=generator.dac,
+            ),
+        ),
+    ]
+    items = [pb.Item(entity=pb.EntityId(path=path), **{kind: content}) for path, kind, content in contents]
+    return pb.Module(items=items)

@@ -1,0 +1,166 @@
+"""The emulated LUCIDAC against ideal equations and ngspice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analogrig_emulator import CircuitError, Components, OpAmpModel
+from analogrig_emulator.lucidac.configuration import (
+    SLOW,
+    Configuration,
+    Integrator,
+    LucidacLane,
+    SignalGenerator,
+)
+from analogrig_emulator.lucidac.machine import Lucidac
+from analogrig_emulator.lucidac.wiring import LucidacParts
+from tests.emulator.conftest import NgSpice
+from tests.emulator.ideal_lucidac import ideal_solution
+from tests.emulator.lucidac_decks import ngspice_error_lsb
+
+Values = NDArray[np.float64]
+
+RATE_HZ = 100e3
+OMEGA = 0.01 * 2 * np.pi
+SINE = {0: LucidacLane(0, 1, OMEGA), 1: LucidacLane(1, 0, -OMEGA)}
+VAN_DER_POL = {
+    0: LucidacLane(9, 0, -0.5, upscaled=True),
+    1: LucidacLane(1, 0, -0.5),
+    2: LucidacLane(0, 1, 0.25, upscaled=True),
+    3: LucidacLane(1, 8),
+    4: LucidacLane(1, 9),
+    5: LucidacLane(8, 10, -1.0),
+    6: LucidacLane(15, 10, 0.25),
+    7: LucidacLane(0, 11),
+}
+
+
+def configuration(lanes: dict[int, LucidacLane], adc: tuple[int, ...] = (0, 1), **more: float) -> Configuration:
+    """Configuration whose integrators begin at -IC."""
+    initial = {int(name[2:]): value for name, value in more.items() if name.startswith("ic")}
+    integrators = tuple(Integrator(initial.get(i, 0.0)) for i in range(8))
+    return Configuration(integrators, lanes, more.get("constant", 0.0), adc=adc)
+
+
+def played(machine: Lucidac, samples: int, rate_hz: float = RATE_HZ) -> Values:
+    """Values in machine units, as a client computes them from codes."""
+    codes = np.concatenate(list(machine.play(samples, rate_hz)))
+    gains, offsets = ([getattr(scale, name) for scale in machine.scales] for name in ("gain", "offset"))
+    return np.asarray(codes * np.array(gains) + np.array(offsets))
+
+
+def prepared(patch: Configuration, parts: LucidacParts | None = None) -> Lucidac:
+    machine = Lucidac(parts)
+    machine.configure(patch)
+    machine.calibrate(gain=True, offset=True)
+    return machine
+
+
+@pytest.mark.parametrize(
+    "patch",
+    [
+        configuration(SINE, ic0=-1.0),
+        configuration(VAN_DER_POL, ic1=0.1, constant=1.0),
+        configuration({0: LucidacLane(0, 8), 1: LucidacLane(1, 9, 0.5)}, (0, 8, 12, 13), ic0=0.8, ic1=-0.6),
+    ],
+)
+def test_calibrated_machine_follows_the_equations_and_an_uncalibrated_one_does_not(patch: Configuration) -> None:
+    expected = ideal_solution(patch, 400, RATE_HZ)
+    machine = Lucidac()
+    machine.configure(patch)
+    before = np.abs(played(machine, 400) - expected).max()
+    machine.calibrate(gain=True, offset=True)
+    after = np.abs(played(machine, 400) - expected).max()
+    assert after < 0.001 and before > 5 * after
+
+
+def test_integrators_begin_at_the_inverted_initial_condition() -> None:
+    machine = prepared(configuration({0: LucidacLane(0, 0, 0.3)}, (0,), ic0=-0.8))
+    assert abs(played(machine, 1)[0, 0] - 0.8) < 1e-3
+
+
+def test_slow_integrators_take_a_hundred_times_as_long() -> None:
+    fast = configuration({0: LucidacLane(0, 0, 0.3)}, (0,), ic0=-0.8)
+    slow = replace(fast, integrators=tuple(replace(each, k0=SLOW) for each in fast.integrators))
+    assert np.abs(played(prepared(slow), 50, 1e3) - played(prepared(fast), 50, 1e5)).max() < 1e-3
+
+
+def test_specimens_differ_by_seed_and_repeat_by_seed() -> None:
+    def of(seed: int) -> Values:
+        parts = LucidacParts()
+        machine = Lucidac(replace(parts, components=replace(parts.components, seed=seed)))
+        machine.configure(configuration(SINE, ic0=-1.0))
+        return played(machine, 200)
+
+    assert (of(1) == of(1)).all()
+    assert np.abs(of(1) - of(2)).max() > 1e-3
+
+
+def test_overload_is_flagged_and_halts_the_run_where_that_is_wanted() -> None:
+    machine = prepared(configuration({0: LucidacLane(15, 0, -0.5)}, (0,), constant=1.0))
+    assert sum(map(len, machine.play(200, RATE_HZ, halt_on_overload=True))) in (22, 23)  # 1.05 units at 210 us
+    assert machine.overloads == {("M0", 0): True}
+    values = played(machine, 200)
+    assert len(values) == 200 and values[-1, 0] > 1.2
+    healthy = prepared(configuration(SINE, ic0=-1.0))
+    played(healthy, 2000)
+    assert not healthy.overloads
+
+
+def test_ports_take_the_voltages_of_the_generator_by_cable() -> None:
+    generator = SignalGenerator(
+        "sine and square", 1000.0, amplitude=0.6, offset=0.2, square=(-0.2, 0.7), dac=(0.3, -0.8), sleep=False
+    )
+    lanes = {26: LucidacLane(None, 8), 27: LucidacLane(None, 9), 28: LucidacLane(None, 10)}
+    parts = replace(LucidacParts(), cables={"square": 2, "sine": 3, "dac1": 4})
+    patch = Configuration(lanes=lanes, external=frozenset({2, 3, 4}), adc=(12, 13, 14), generator=generator)
+    values = -played(prepared(patch, parts), 300)
+    t_s = np.arange(300) / RATE_HZ
+    expected = np.stack(
+        [np.where(t_s * 1000 % 1 < 0.5, 0.7, -0.2), 0.2 + 0.6 * np.sin(2 * np.pi * 1000 * t_s), np.full(300, -0.8)], 1
+    )
+    assert np.abs(values - expected)[np.arange(300) % 50 > 0].max() < 2e-3
+
+
+def test_a_perfect_machine_needs_no_calibration() -> None:
+    parts = LucidacParts(
+        computing=OpAmpModel(avol=1e8, gbw_hz=8e9, swing_v=(-2.5, 2.5)),
+        components=Components(),
+        adc_gain=0.0,
+        adc_offset=0.0,
+        adc_noise_lsb=0.0,
+    )
+    patch = configuration(SINE, ic0=-0.9)
+    machine = Lucidac(parts)
+    machine.configure(patch)
+    assert np.abs(played(machine, 1000) - ideal_solution(patch, 1000, RATE_HZ)).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"lanes": {3: LucidacLane(0, 0, 1.5)}}, "lane 3: coefficient must be within +-1, not 1.5"),
+        ({"lanes": {3: LucidacLane(0, 0, float("nan"))}}, "lane 3: coefficient"),
+        ({"lanes": {32: LucidacLane(0, 0)}}, "lane must be 0 to 31, not 32"),
+        ({"lanes": {0: LucidacLane(16, 0)}}, "lane 0: output must be 0 to 15, not 16"),
+        ({"lanes": {24: LucidacLane(None, 0)}}, "lane 24: no output and no port feeds it"),
+        ({"constant": 0.5}, "constant must be"),
+        ({"adc": (0,) * 9}, "the converter has 8 channels, not 9"),
+        ({"integrators": (Integrator(k0=7),)}, "integrator 0: k0 must be 10000 or 100, not 7"),
+        ({"generator": SignalGenerator(frequency_hz=0.0, sleep=False)}, "signal generator: frequency"),
+    ],
+)
+def test_impossible_configurations_are_refused_by_name(wrong: dict[str, object], named: str) -> None:
+    with pytest.raises(CircuitError) as caught:
+        Configuration(**wrong)  # type: ignore[arg-type]
+    assert named in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", [3, 11])
+def test_random_configurations_agree_with_ngspice_at_every_output(ngspice: NgSpice, seed: int) -> None:
+    """More of them: python -m tests.benchmarks.soak_lucidac 50."""
+    assert ngspice_error_lsb(ngspice, seed) < 0.05

@@ -1,0 +1,316 @@
+"""The served LUCIDAC: with the manufacturer's own client, and message by message."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analogrig.errors import ConfigurationError
+from analogrig.hardware import lucidac_messages
+from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, framed, protocol
+from analogrig.hardware.simulator.lucidac_registers import Registers
+from analogrig.hardware.simulator.served_lucidac import CHUNK_VALUES, MAC, specimen
+from analogrig.scenario import DEFAULT_SEED
+from analogrig_emulator.lucidac.configuration import Configuration
+from tests.emulator.ideal_lucidac import ideal_solution
+from tests.harness.processes import LONG_S
+from tests.served.hostile_lucidac import nested, varint
+from tests.served.lucidac_examples import EXAMPLES
+from tests.served.serving import ROOT, Served, serving
+
+Values = NDArray[np.float64]
+
+SPARSE = 5
+"""Every fifth sample is compared: the ideal solution takes long."""
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    with serving("--as", "lucidac") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def runs(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with what the manufacturer's client got in all examples."""
+    folder = tmp_path_factory.mktemp("lucidac")
+    command = [sys.executable, "-m", "tests.served.lucidac_examples", str(served.port), str(folder)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=LONG_S)
+    return folder
+
+
+def configuration(folder: Path, name: str) -> Configuration:
+    items = protocol().Module.FromString((folder / f"{name}.apb").read_bytes()).items
+    return Registers().with_items(items, MAC).configuration()
+
+
+def without_ports(patch: Configuration) -> Configuration:
+    lanes = {number: lane for number, lane in patch.lanes.items() if lane.source is not None}
+    return dataclasses.replace(patch, lanes=lanes, adc=tuple(output for output in patch.adc if output < 12))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_manufacturers_client_gets_the_ideal_solution_after_calibration_and_not_before(runs: Path, name: str) -> None:
+    example, data = EXAMPLES[name], np.load(runs / f"{name}.npz")["data"]
+    assert data.shape == (example.channels, round(example.op_s * example.sample_rate))
+    samples = round(example.horizon_s * example.sample_rate)
+    if not samples:
+        assert np.abs(data).max() > 1.2
+        return
+    patch = configuration(runs, name)
+    expected = ideal_solution(without_ports(patch), -(-samples // SPARSE), example.sample_rate / SPARSE)
+    machine = specimen(DEFAULT_SEED)
+    machine.configure(patch)
+    scales = machine.scales
+    codes = np.concatenate(list(machine.play(samples, example.sample_rate)))[::SPARSE]
+    uncalibrated = codes * np.array([scale.gain for scale in scales])
+    channels = expected.shape[1]
+    before = np.abs(uncalibrated[:, :channels] - expected).max()
+    after = np.abs(data.T[:samples:SPARSE, :channels] - expected).max()
+    assert after < 0.01
+    assert before > 0.003 and before > 3 * after
+
+
+def test_generator_comes_through_its_cables(runs: Path) -> None:
+    data = np.load(runs / "sine-extra.npz")["data"][2:, :1000]
+    t_s = np.arange(1000) / 1e5
+    square = np.where(t_s * 1000 % 1 < 0.5, 0.7, -0.2)
+    assert np.abs(data[0] + square)[np.arange(1000) % 50 > 0].max() < 0.003
+    assert np.abs(data[1] + 0.2 + 0.6 * np.sin(2 * np.pi * 1000 * t_s)).max() < 0.003
+
+
+# ---- message by message
+
+
+class Talk:
+    """Client that sends and receives messages."""
+
+    def __init__(self, served: Served) -> None:
+        self._connection = served.connect()
+        self._reader = FrameReader(1 << 20)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.close()
+
+    def send(self, data: bytes) -> None:
+        self._connection.sendall(data)
+
+    def next(self) -> Any:
+        """Next envelope; None at the end of the connection."""
+        while (content := self._reader.next()) is None:
+            data = self._connection.recv(65536)
+            if not data:
+                return None
+            self._reader.feed(data)
+        return protocol().Envelope.FromString(content)
+
+    def say(self, kind: str, message_id: str = "7", **fields: Any) -> None:
+        message = protocol().MessageV1(id=message_id)
+        command = getattr(message, kind)
+        command.SetInParent()
+        command.MergeFrom(type(command)(**fields))
+        self.send(frame(message))
+
+    def ask(self, kind: str, **fields: Any) -> Any:
+        """Answer to a command: the message; others that come before it are dropped."""
+        self.say(kind, "7", **fields)
+        while (message := self.next().message_v1).id != "7":
+            pass
+        return message
+
+    def error(self, kind: str, **fields: Any) -> str:
+        message = self.ask(kind, **fields)
+        assert message.WhichOneof("kind") == "error_message", message
+        return str(message.error_message.description)
+
+    def configure(self, *items: Any) -> Any:
+        return self.ask("config_command", module=protocol().Module(items=items), reset_before=True)
+
+    def start(self, samples: int, rate_hz: int, *, halt: bool = False) -> Any:
+        pb = protocol()
+        run = pb.RunConfig(op_time=pb.Time(value=round(samples / rate_hz * 1e9), prefix=pb.NANO), halt_on_overload=halt)
+        return self.ask(
+            "start_run_command", run=pb.Run(id="r"), run_config=run, daq_config=pb.DaqConfig(sample_rate=rate_hz)
+        )
+
+    def samples(self) -> tuple[int, list[str]]:
+        """Number of samples of a run, and its states."""
+        pb, count, states = protocol(), 0, []
+        while True:
+            message = self.next().message_v1
+            assert not message.id
+            if message.WhichOneof("kind") == "run_data_message":
+                data = message.run_data_message.data
+                assert data.sample_count * data.channel_stride <= CHUNK_VALUES and len(data.channels)
+                assert len(data.data) == 2 * data.sample_count * data.channel_stride
+                count += data.sample_count
+            elif message.WhichOneof("kind") == "run_state_change_message":
+                states.append(pb.RunState.Name(message.run_state_change_message.new_))
+                if states[-1] in ("DONE", "ERROR"):
+                    return count, states
+
+
+def items(path: str = MAC, **fields: Any) -> Any:
+    pb = protocol()
+    return pb.Item(entity=pb.EntityId(path=path), **fields)
+
+
+def ramp(factor: float = -0.5) -> list[Any]:
+    """Integrator 0 integrates the constant; the converter reads it on eight channels."""
+    pb = protocol()
+    return [
+        items(f"{MAC}/0/C", coef_config=pb.CoefConfig(elements=[pb.CoefConfig.Element(idx=0, factor=factor)])),
+        items(
+            select_config=pb.SelectConfig(
+                constant=pb.SelectConfig.POS_REF, connections=[pb.SelectConnectionConfig(input=15, output=0)]
+            )
+        ),
+        items(sum_config=pb.SumConfig(connections=[pb.SumConnectionConfig(inputs=[0], output=0)])),
+        items(adc_config=pb.AdcConfig(channels=[pb.AdcChannel(idx=0, gain=1.0, probe=i) for i in range(8)])),
+    ]
+
+
+@pytest.fixture
+def talk(served: Served) -> Iterator[Talk]:
+    with Talk(served) as client:
+        yield client
+
+
+def test_run_has_its_states_and_samples_and_flags_the_overload(talk: Talk) -> None:
+    talk.ask("reset_command", overload_reset=True, circuit_reset=True)
+    assert talk.configure(*ramp()).WhichOneof("kind") == "config_response"
+    assert talk.start(5000, 62_500).WhichOneof("kind") == "start_run_response"
+    assert talk.samples() == (5000, ["TAKE_OFF", "IC", "OP", "OP_END", "DONE"])
+    status = talk.ask("get_overload_status_command").get_overload_status_response.status
+    assert status.global_overload and [(each.entity.path, each.idx) for each in status.elements] == [
+        (f"/{MAC}/0/M0", 0)
+    ]
+    assert talk.start(5000, 62_500, halt=True).WhichOneof("kind") == "start_run_response"
+    count, states = talk.samples()
+    assert 13 < count < 17 and states[-1] == "DONE"  # 1.05 units after 210 us
+    talk.ask("reset_command", overload_reset=True)
+    assert not talk.ask("get_overload_status_command").get_overload_status_response.status.global_overload
+
+
+def test_machine_is_busy_for_others_during_a_run_and_free_when_its_client_is_gone(served: Served, talk: Talk) -> None:
+    with Talk(served) as other:
+        other.configure(*ramp(0.0))
+        other.start(62_500 * 600, 62_500)
+        for kind in ("config_command", "reset_command", "calibration_command", "start_run_command"):
+            assert talk.ask(kind).WhichOneof("kind") == "busy_response"
+        assert talk.ask("udp_data_streaming_command").WhichOneof("kind") == "udp_data_streaming_refused_response"
+        assert "no run of this client" in talk.error("stop_run_command")
+        assert other.ask("stop_run_command").WhichOneof("kind") == "success_message"
+        assert other.samples()[1][-1] == "DONE"
+        other.start(62_500 * 600, 62_500)
+    while talk.ask("reset_command").WhichOneof("kind") == "busy_response":
+        pass
+
+
+@pytest.mark.parametrize(
+    ("item", "why"),
+    [
+        (lambda pb: items("AA-BB-CC-DD-EE-FF", adc_config=pb.AdcConfig()), "no entity is called"),
+        (lambda pb: items(coef_config=pb.CoefConfig(elements=[pb.CoefConfig.Element(idx=32)])), "0 to 31, not 32"),
+        (lambda pb: items(adc_config=pb.AdcConfig(channels=[pb.AdcChannel(idx=16)])), "output must be 0 to 15, not 16"),
+        (lambda pb: items(adc_config=pb.AdcConfig(channels=[pb.AdcChannel()] * 9)), "8 channels, not 9"),
+        (lambda pb: items(itor_config=pb.ItorConfig(elements=[pb.ItorConfig.Element(idx=1, k=5)])), "k0 must be"),
+        (lambda pb: items(port_config=pb.PortConfig(states=[1] * 9)), "8 ports, not 9"),
+        (lambda pb: items(select_config=pb.SelectConfig(constant=pb.SelectConfig.ANALOG_INPUT)), "no analogue input"),
+        (lambda pb: items(select_config=pb.SelectConfig(constant=77)), "ground or a reference"),
+        (lambda pb: items(switch_config=pb.SwitchConfig()), "has no switch_config"),
+        (
+            lambda pb: items(
+                sum_config=pb.SumConfig(connections=[pb.SumConnectionConfig(inputs=[3], output=i) for i in range(2)])
+            ),
+            "lane 3 cannot feed two inputs",
+        ),
+        (
+            lambda pb: items(signal_generator_config=pb.SignalGeneratorConfig(wave_form=9)),
+            "signal generator: wave form",
+        ),
+    ],
+)
+def test_impossible_configuration_is_answered_with_its_error(talk: Talk, item: Any, why: str) -> None:
+    assert why in talk.error("config_command", module=protocol().Module(items=[item(protocol())]))
+
+
+def test_impossible_runs_and_unknown_commands_are_answered_with_an_error(talk: Talk) -> None:
+    pb = protocol()
+    talk.configure(*ramp())
+    second = pb.RunConfig(op_time=pb.Time(value=1))
+    for run, rate_hz, why in (
+        (pb.RunConfig(), 1000, "op_time must be more than 0"),
+        (pb.RunConfig(op_time=pb.Time(value=2**62)), 1000, "op_time must be more than 0"),
+        (pb.RunConfig(op_time=pb.Time(value=1, prefix=77)), 1000, "op_time must be more than 0"),
+        (second, 0, "sample_rate x channels must be 1 to 500000, not 0 x 8"),
+        (second, 62_501, "sample_rate x channels must be 1 to 500000, not 62501 x 8"),
+    ):
+        daq = pb.DaqConfig(sample_rate=rate_hz)
+        assert why in talk.error("start_run_command", run_config=run, daq_config=daq)
+    assert "update_command is not supported" in talk.error("update_command")
+    assert "follows no other" in talk.error("manual_control_command", to=pb.ManualControlCommand.MINION)
+    assert talk.ask("manual_control_command", to=pb.ManualControlCommand.IC).WhichOneof("kind") == "success_message"
+
+
+def test_configuration_can_be_extracted_and_ping_is_answered(talk: Talk) -> None:
+    talk.configure(*ramp(0.25))
+    module = talk.ask("extract_command", specification=True, configuration=True).extract_response.module
+    assert module.items[0].entity_specification.entity.id == f"/{MAC}"
+    assert any(item.coef_config.elements and item.coef_config.elements[0].factor == 0.25 for item in module.items)
+    ping = protocol().Envelope()
+    ping.generic.ping_command.SetInParent()
+    talk.send(framed(ping))
+    assert talk.next().generic.HasField("ping_response")
+
+
+def test_malformed_content_is_answered_and_the_connection_goes_on(talk: Talk) -> None:
+    framed_contents = [varint(len(content)) + content for content in (b"", b"\xff" * 50, b"\x12\x05abc")]
+    for malformed in (*framed_contents, nested(2000), nested(200_000)):
+        talk.send(malformed)
+        assert talk.next().message_v1.error_message.description
+    assert talk.ask("extract_command", specification=True).WhichOneof("kind") == "extract_response"
+
+
+@pytest.mark.parametrize("length", [1 << 20, 1 << 31, 1 << 63, (1 << 64) - 1])
+def test_frame_too_long_is_answered_and_the_connection_closed(talk: Talk, length: int) -> None:
+    talk.send(varint(length) + bytes(100))
+    assert re.search("at most", talk.next().message_v1.error_message.description)
+    assert talk.next() is None
+
+
+def test_reader_gives_frames_however_the_stream_is_cut() -> None:
+    contents = [b"", b"a" * 127, b"b" * 128, b"c" * 20_000]
+    stream = b"".join(varint(len(content)) + content for content in contents)
+    for step in (1, 7, 128, len(stream)):
+        reader, found = FrameReader(), []
+        for start in range(0, len(stream), step):
+            reader.feed(stream[start : start + step])
+            while (content := reader.next()) is not None:
+                found.append(content)
+        assert found == contents
+    reader = FrameReader()
+    reader.feed(b"\x80" * 10)
+    with pytest.raises(FrameError, match="a length has at most 10 bytes"):
+        reader.next()
+
+
+def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pybrid.base.proto.main_pb2", None)
+    lucidac_messages.protocol.cache_clear()
+    with pytest.raises(ConfigurationError, match=re.escape("pip install 'analogrig[lucidac]'")):
+        protocol()
+    monkeypatch.undo()
+    lucidac_messages.protocol.cache_clear()

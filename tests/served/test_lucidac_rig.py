@@ -1,0 +1,243 @@
+"""The rig on a LUCIDAC, against the served one."""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
+from analogrig.config import locate
+from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused
+from analogrig.hardware.instrument import DialChange
+from analogrig.hardware.lucidac import LucidacInstrument
+from analogrig.hardware.lucidac_connection import LucidacConnection
+from analogrig.hardware.lucidac_messages import protocol
+from analogrig.hardware.lucidac_patch import LinearPatch
+from analogrig.hardware.self_test import self_test
+from analogrig.program import Program
+from analogrig_emulator import Excitation, SuspensionComputer
+from analogrig_emulator.lucidac.configuration import SignalGenerator
+from tests.served.serving import Served, serving
+
+MOST_LATENCY_N = 3
+"""Largest difference of a latency from that on the emulated rig."""
+
+SQUARE = Excitation(low_v=0.02, high_v=1.98, frequency_hz=100.0)
+"""Force at the generator; a machine unit, 2 V, stands for 10 V."""
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    with serving("--as", "lucidac") as running:
+        yield running
+
+
+@pytest.fixture
+def instrument(served: Served) -> Iterator[LucidacInstrument]:
+    opened = LucidacInstrument.open(served.address, 30.0)
+    opened.patch("front")
+    opened.set_inputs([(0, "unit"), (1, "unit")])
+    opened.set_excitation(SQUARE)
+    yield opened
+    opened.close()
+
+
+def rig_file(folder: Path, served: Served) -> str:
+    """Shipped rig at the address of the served machine."""
+    path = folder / "bench.toml"
+    path.write_text(locate("rigs", "lucidac").read_text().replace("//127.0.0.1", f"//{served.address}"))
+    return str(path)
+
+
+def played(rig: str, address: str) -> Run:
+    with open_rig(rig, allow=[address], self_test=False) as opened, open_dut("inproc") as dut:
+        return Bench(opened, dut).play(Scenario.load("thesis"), seed=7)
+
+
+def test_thesis_has_the_verdict_of_the_emulated_rig(served: Served, tmp_path: Path) -> None:
+    """On 20 seeds: analogrig compare-rigs emulator lucidac --plays 20."""
+    verdicts = [judge(played(rig, served.address)) for rig in (rig_file(tmp_path, served), "emulator")]
+    assert [verdict.outcome for verdict in verdicts] == ["passed", "passed"]
+    latencies = [[change.latency_n for change in verdict.tweaks] for verdict in verdicts]
+    assert np.abs(np.diff(np.array(latencies, np.float64), axis=0)).max() <= MOST_LATENCY_N
+
+
+def test_self_test_finds_nothing_wrong(served: Served, tmp_path: Path) -> None:
+    with open_rig(rig_file(tmp_path, served), allow=[served.address], self_test=False) as rig:
+        assert not self_test(rig, 0, "front").reasons
+
+
+def test_record_is_the_program_on_an_ideal_computer_before_and_after_a_change(instrument: LucidacInstrument) -> None:
+    assert instrument.pots is not None
+    computer = SuspensionComputer("front", opamp="ideal")
+    instrument.pots.schedule([DialChange(200.05 / 20e3, "K", 0.5)])
+    record = instrument.record(400)
+    instrument.pots.set_one("K", computer.dials["K"])
+    first = np.concatenate(list(computer.play(dataclasses.replace(SQUARE, low_v=0.1, high_v=9.9), 201)))
+    np.testing.assert_allclose(5.0 * record.volts[:201], first[:, :2], atol=0.015)  # dials rest on no windings here
+    again = instrument.record(400)
+    assert np.abs(5.0 * (record.volts - again.volts)[202:, 1]).max() > 0.1
+    assert np.abs(5.0 * (record.volts - again.volts)[:, 0]).max() < 0.01
+    assert not record.clipped.any() and not again.repeats
+
+
+def test_overload_names_the_element(instrument: LucidacInstrument) -> None:
+    assert instrument.pots is not None
+    instrument.pots.set({"M": 0.99, "B": 0.01, "K": 0.01}, "", recording=False)
+    with pytest.raises(RigError, match=r"overload of .*/0/M0/[01]: rescale the program"):
+        instrument.record(2000)
+
+
+def test_generator_sleeps_between_records(served: Served, instrument: LucidacInstrument) -> None:
+    def sleeps() -> bool:
+        other = LucidacConnection("127.0.0.1", served.port, 30.0)
+        items = other.ask("extract_command", configuration=True).extract_response.module.items
+        other.close()
+        return any(item.signal_generator_config.sleep for item in items)
+
+    instrument.record(10)
+    assert not sleeps()
+    instrument.make_safe()
+    assert sleeps()
+
+
+def test_busy_machine_and_refused_commands_are_one_line(served: Served, instrument: LucidacInstrument) -> None:
+    other = LucidacConnection("127.0.0.1", served.port, 30.0)
+    pb = protocol()
+    config = pb.RunConfig(op_time=pb.Time(value=600))
+    other.ask("start_run_command", run_config=config, daq_config=pb.DaqConfig(sample_rate=1000))
+    with pytest.raises(RigRefused, match=r"reset_command: the device is busy with another client's run"):
+        instrument.record(10)
+    with pytest.raises(RigRefused, match=r"instrument .*: update_command: 'update_command is not supported'"):
+        other.ask("update_command")
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("excitation", "why"),
+    [
+        (Excitation("prbs", 0.0, 1.0), "the generator of a LUCIDAC has no prbs: use square"),
+        (Excitation(high_v=2.1), "the generator would have to give 0 V to 2.1 V, and has -2 V to 2 V"),
+        (Excitation(high_v=1.0, frequency_hz=123.0), 'on the clock "card" needs edges that are whole samples apart'),
+    ],
+)
+def test_waveform_that_the_generator_lacks_is_refused(excitation: Excitation, why: str) -> None:
+    with pytest.raises(ConfigurationError, match=why):
+        LucidacInstrument.check(excitation)
+
+
+# ---- programs
+
+
+def factors(name: str) -> dict[tuple[int, int], float]:
+    """Sum of the lanes by input and output."""
+    program = Program.load(name)
+    values = {parameter: row.value for parameter, row in program.parameters.items()}
+    patch = LinearPatch(program)
+    configuration = patch.configuration(values, [0.0] * len(patch.states), SignalGenerator())
+    found: dict[tuple[int, int], float] = {}
+    for lane in configuration.lanes.values():
+        if lane.source is not None:
+            key = (lane.target, lane.source)
+            found[key] = found.get(key, 0.0) + lane.factor * lane.gain
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("front", {(0, 1): -0.2004, (1, 12): 0.256, (1, 1): 0.525, (1, 0): 0.425}),
+        ("shock", {(0, 1): -0.2004, (1, 12): 7.35, (1, 1): 9.0, (1, 0): 12.225}),
+    ],
+)
+def test_lanes_of_the_thesis_programs(name: str, expected: dict[tuple[int, int], float]) -> None:
+    """Worked by hand: 200 F / (M v), 200 B / M, 200 K x / (M v), 200 v / x with full scales, over 10,000.
+
+    Signs are those of an integrator that inverts; the force comes inverted.
+    """
+    found = factors(name)
+    assert found.keys() == expected.keys()
+    for key, factor in expected.items():
+        assert found[key] == pytest.approx(factor, rel=2e-2), key
+
+
+@pytest.mark.parametrize("name", ["duffing", "pendulum", "van-der-pol"])
+def test_program_that_cannot_be_patched_is_one_line(name: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"program {name}: .* linear programs alone"):
+        LinearPatch(Program.load(name))
+
+
+def test_other_linear_program_fits() -> None:
+    assert len(factors("dc-motor")) == 5
+
+
+def test_program_whose_output_has_no_integrator_is_one_line() -> None:
+    with pytest.raises(ConfigurationError, match="program two-mass: its output 'displacement' is no state"):
+        LinearPatch(Program.load("two-mass"))
+
+
+# ---- a device that misbehaves
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (b"", "connection closed"),
+        (b"\xff" * 20, "at most"),
+        (b"\x03\xff\xff\xff", "sent no message of this protocol"),
+    ],
+)
+def test_malformed_device_is_one_line(said: bytes, why: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def answer() -> None:
+            connection, _ = listening.accept()
+            connection.recv(65536)
+            connection.sendall(said)
+            connection.close()
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(RigError, match=why) as caught:
+            LucidacInstrument.open(f"127.0.0.1:{listening.getsockname()[1]}", 30.0)
+        thread.join()
+    assert str(caught.value).startswith("instrument 127.0.0.1:")
+
+
+def test_unreachable_device_is_one_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+    with pytest.raises(RigClosed, match="cannot be reached"):
+        LucidacInstrument.open(f"127.0.0.1:{port}", 30.0)
+
+
+def test_data_of_another_form_is_refused(served: Served) -> None:
+    connection = LucidacConnection("127.0.0.1", served.port, 30.0)
+    pb = protocol()
+    good = pb.DaqData(data=bytes(8), sample_count=2, channel_stride=2)
+    good.type.integer.bitwidth = 16
+    good.channels.add(gain=1.0, probe=1)
+    good.channels.add(gain=1.0, probe=0)
+    assert connection._samples(good, 2)[0].shape == (2, 2)
+    for change in (
+        {"sample_count": 2**31},
+        {"channel_stride": 1},
+        {"type": pb.DataType(integer=pb.IntegerType(bitwidth=12))},
+        {"channels": [pb.AdcChannel(gain=1.0, probe=7)] * 2},
+    ):
+        fields = {
+            "data": bytes(8),
+            "sample_count": 2,
+            "channel_stride": 2,
+            "type": good.type,
+            "channels": good.channels,
+        }
+        with pytest.raises(RigError, match="sent"):
+            connection._samples(pb.DaqData(**{**fields, **change}), 2)
+    connection.close()
