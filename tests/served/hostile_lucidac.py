@@ -178,6 +178,7 @@ def leave_half_open(served: ServedByProcess, draw: random.Random, stop: Stop) ->
     while True:
         with ignore_disconnection():
             connection = served.connect()
+            left.append(connection)
             connection.sendall(draw.choice((b"", b"\x80", command("reset_command"), random_frame(draw)[:-1])))
             match draw.randrange(3):
                 case 0:
@@ -185,7 +186,6 @@ def leave_half_open(served: ServedByProcess, draw: random.Random, stop: Stop) ->
                 case 1:
                     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                     connection.close()
-            left.append(connection)
         count += 1
         for connection in left[:-200]:
             connection.close()
