@@ -174,6 +174,22 @@ class Program:
         scale = np.abs(points[2]) + np.abs(points[0]) + np.abs(points[1])
         return bool((np.abs(points[2] - expected) <= _LINEAR_TO * scale).all() and not points[3].any() and not direct)
 
+    def values_at(self, coefficients: Mapping[str, float]) -> dict[str, float]:
+        """Values of the parameters whose pots have these coefficients under load.
+
+        :raises ConfigurationError: a pot stands at 0, or several parameters turn it.
+        """
+        circuit, values = self.circuit, {}
+        for pot, row in circuit.pots.items():
+            if len(row.settings) != 1 or not coefficients[pot] > 0.0:
+                raise ConfigurationError(
+                    f"program {self.name}: pot {pot} with the coefficient {coefficients[pot]:g} shows no parameter"
+                )
+            (name,) = row.settings
+            at_one = circuit.pot_coefficient(pot, {name: 1.0})
+            values[name] = at_one / coefficients[pot] if name in self.inverse else coefficients[pot] / at_one
+        return values
+
     def _rates(self, point: Any, values: Mapping[str, Any]) -> Any:
         """Rates of the states, and the output, at a point: states and input (n + 1, ...)."""
         equations = self.equations

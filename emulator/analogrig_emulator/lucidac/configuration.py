@@ -31,6 +31,8 @@ ADC_CHANNELS = 8
 FIRST_PORT_LANE = 24
 FIRST_IDENTITY = INTEGRATORS + MULTIPLIERS
 UPSCALE = 8.0
+COEFFICIENT_STEPS = 2048
+"""Steps of a coefficient from 0 to 1: 11 bits and sign by the manual; the size of a step is assumed."""
 FAST, SLOW = 10_000, 100
 """Time constants k0 in 1/s."""
 

@@ -32,6 +32,7 @@ from analogrig_emulator.circuit.nonlinear import Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.lucidac.configuration import (
+    COEFFICIENT_STEPS,
     FAST,
     FIRST_IDENTITY,
     FIRST_PORT_LANE,
@@ -87,7 +88,7 @@ class LucidacParts:
             ),
         )
     )
-    coefficient_steps: int = 2048
+    coefficient_steps: int = COEFFICIENT_STEPS
     gain_step: float = 2.0**-16
     offset_step: float = 2.0**-17
     multiplier_step: float = 2.0**-14

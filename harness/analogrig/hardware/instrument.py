@@ -77,6 +77,10 @@ class Pots:
     def set_one(self, pot: str, dial: float) -> None:
         """Set a pot. :raises RigError: that failed."""
 
+    def standing(self, dials: Mapping[str, float]) -> dict[str, float]:
+        """Positions that pots take when they are set to these, as far as their resolution is known."""
+        return dict(dials)
+
     def close(self) -> None:
         """Release the connection to the pots."""
 

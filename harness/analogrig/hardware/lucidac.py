@@ -26,7 +26,7 @@ from analogrig.hardware.instrument import (
 )
 from analogrig.hardware.lucidac_connection import LucidacConnection
 from analogrig.hardware.lucidac_messages import PORT
-from analogrig.hardware.lucidac_patch import LinearPatch, module_of, values_of
+from analogrig.hardware.lucidac_patch import LinearPatch, module_of
 from analogrig.hardware.tcp_address import host_and_port, tcp_place
 from analogrig.links.wire import Clock
 from analogrig.program import Program
@@ -89,9 +89,8 @@ class LucidacInstrument(Instrument):
         check_edges(excitation, cls.datasheet.rate_hz)
 
     def patch(self, program: str) -> None:
-        loaded = Program.load(program)
-        self._patched = LinearPatch(loaded)
-        self._box = self.pots = _Coefficients(loaded, self.name)
+        self._patched = LinearPatch(Program.load(program))
+        self._box = self.pots = _Coefficients(self._patched, self.name)
 
     def rest(self, settle_s: float) -> None:
         """Wait for nothing: every run begins at the initial conditions."""
@@ -166,10 +165,10 @@ class LucidacInstrument(Instrument):
 class _Coefficients(PotBox):
     """Coefficients of a program's parameters, set as if they were the pots of a computer with that program."""
 
-    def __init__(self, program: Program, name: str) -> None:
-        self._program = program
+    def __init__(self, patch: LinearPatch, name: str) -> None:
+        self._patch = patch
         self._name = name
-        self._computer = SuspensionComputer(program.circuit)
+        self._computer = SuspensionComputer(patch.program.circuit)
         self.names = tuple(self._computer.dials)
         self._changes: tuple[DialChange, ...] = ()
 
@@ -178,15 +177,27 @@ class _Coefficients(PotBox):
 
     def set_all(self, dials: Mapping[str, float]) -> None:
         """Set pots. :raises RigError: one cannot stand there."""
-        try:
-            self._computer.set(**{f"{pot}_dial": dial for pot, dial in dials.items()})
-        except EmulatorError as error:
-            raise RigError(f"{self._name}: {error}") from error
+        self._turn(self._computer, dials)
+
+    def standing(self, dials: Mapping[str, float]) -> dict[str, float]:
+        computer = SuspensionComputer(self._patch.program.circuit)
+        self._turn(computer, {**self._computer.dials, **dials})
+        return computer.dials_for(**self._patch.rounded(self._values(computer)))
 
     def values(self) -> dict[str, float]:
         """Present values of the parameters."""
-        shown = values_of(self._program, self._computer.coefficients)
-        return {name: shown.get(name, row.value) for name, row in self._program.parameters.items()}
+        return self._values(self._computer)
+
+    def _turn(self, computer: SuspensionComputer, dials: Mapping[str, float]) -> None:
+        try:
+            computer.set(**{f"{pot}_dial": dial for pot, dial in dials.items()})
+        except EmulatorError as error:
+            raise RigError(f"{self._name}: {error}") from error
+
+    def _values(self, computer: SuspensionComputer) -> dict[str, float]:
+        program = self._patch.program
+        shown = program.values_at(computer.coefficients)
+        return {name: shown.get(name, row.value) for name, row in program.parameters.items()}
 
     def schedule(self, changes: Sequence[DialChange]) -> None:
         self._changes = tuple(changes)

@@ -22,6 +22,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.hardware.lucidac_messages import protocol
 from analogrig.program import Program
 from analogrig_emulator.lucidac.configuration import (
+    COEFFICIENT_STEPS,
     FAST,
     FIRST_IDENTITY,
     FIRST_PORT_LANE,
@@ -43,6 +44,9 @@ _INPUT = 8
 """Input of the first multiplier, whose identity shows the port."""
 
 _NEGLIGIBLE = 1e-12
+
+_LOG_STEP, _ROUNDING_STEPS = 1e-6, 3
+"""Step of difference quotients, and number of Gauss-Newton steps: a rounding is small."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class LinearPatch:
         :raises ConfigurationError: it needs more lanes than there are.
         """
         weights = self._weights(values)
-        fast = [bool(np.abs(row).max() * FAST / SLOW > UPSCALE) for row in weights]
+        fast = _fast(weights)
         lanes = list(self._lanes(weights, fast))
         numbers = [n for n in range(LANES) if not FIRST_PORT_LANE <= n < FIRST_PORT_LANE + PORTS]
         if len(lanes) > len(numbers):
@@ -99,6 +103,41 @@ class LinearPatch:
             adc=(FIRST_IDENTITY, *range(len(self.states))),
             generator=generator,
         )
+
+    def rounded(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Values of the parameters that the coefficients realise, which have COEFFICIENT_STEPS steps.
+
+        Input and output keep their scales; the other states may have scales of their own. Logarithms of the weights are
+        fitted by Gauss-Newton steps: exactly where there are at least as many unknowns as lanes, else by least squares.
+        """
+        names, scales = list(self.program.parameters), [i for i in range(len(self.states)) if i != self.output]
+        realised = self._realised(self._weights(values))
+        rows, columns = np.nonzero(realised)
+        by_scale = np.zeros((len(rows), len(scales)))
+        for k, i in enumerate(scales):
+            by_scale[:, k] = (rows == i).astype(float) - (columns == i)
+        logs, offsets = np.log([values[name] for name in names]), np.zeros(len(scales))
+        for _ in range(_ROUNDING_STEPS):
+            here = self._logs(logs, rows, columns)
+            by_value = [(self._logs(logs + _LOG_STEP * unit, rows, columns) - here) / _LOG_STEP for unit in np.eye(len(names))]
+            misses = np.log(np.abs(realised[rows, columns])) - here - by_scale @ offsets
+            step = np.linalg.lstsq(np.column_stack([*by_value, by_scale]), misses, rcond=None)[0]
+            logs, offsets = logs + step[: len(names)], offsets + step[len(names) :]
+        return dict(zip(names, np.exp(logs).tolist(), strict=True))
+
+    def _logs(self, logs: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Logarithms of some weights by those of the parameters."""
+        values = dict(zip(self.program.parameters, np.exp(logs).tolist(), strict=True))
+        return np.log(np.abs(self._weights(values)[rows, columns]))
+
+    def _realised(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weights that the rounded coefficients give."""
+        realised = np.zeros_like(weights)
+        fast = _fast(weights)
+        for lane in self._lanes(weights, fast):
+            column = len(self.states) if lane.source == FIRST_IDENTITY else lane.source
+            realised[lane.target, column] += lane.factor * lane.gain * (1 if fast[lane.target] else SLOW / FAST)
+        return realised * np.where(np.arange(realised.shape[1]) < len(self.states), -1.0, 1.0)
 
     def _weights(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Rates of the states by states and input, (n, n + 1), all in machine units and per 1 / FAST seconds."""
@@ -119,29 +158,19 @@ class LinearPatch:
                     continue
                 count = max(1, math.ceil(abs(factor) / UPSCALE))
                 upscaled = abs(factor) > 1.0
-                yield from [LucidacLane(output, i, factor / count / (UPSCALE if upscaled else 1.0), upscaled)] * count
+                coefficient = factor / count / (UPSCALE if upscaled else 1.0)
+                rounded = round(coefficient * COEFFICIENT_STEPS) / COEFFICIENT_STEPS
+                yield from [LucidacLane(output, i, rounded, upscaled)] * count
+
+
+def _fast(weights: NDArray[np.float64]) -> list[bool]:
+    """True for each state whose integrator has the short time constant."""
+    return [bool(np.abs(row).max() * FAST / SLOW > UPSCALE) for row in weights]
 
 
 @functools.lru_cache(maxsize=8)
 def _scales(program: Program) -> dict[str, float]:
     return {name: row.full for name, row in program.circuit.scales.quantities.items()}
-
-
-def values_of(program: Program, coefficients: Mapping[str, float]) -> dict[str, float]:
-    """Values of the parameters whose pots have these coefficients under load.
-
-    :raises ConfigurationError: a pot stands at 0, or several parameters turn it.
-    """
-    circuit, values = program.circuit, {}
-    for pot, row in circuit.pots.items():
-        if len(row.settings) != 1 or not coefficients[pot] > 0.0:
-            raise ConfigurationError(
-                f"program {program.name}: pot {pot} with the coefficient {coefficients[pot]:g} shows no parameter"
-            )
-        (name,) = row.settings
-        at_one = circuit.pot_coefficient(pot, {name: 1.0})
-        values[name] = at_one / coefficients[pot] if name in program.inverse else coefficients[pot] / at_one
-    return values
 
 
 def module_of(configuration: Configuration, mac: str) -> Any:

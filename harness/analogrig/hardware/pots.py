@@ -109,6 +109,12 @@ class _SteppedPots(PotsKind):
         }
         return _PLACEHOLDER.sub(lambda found: values[found.group(1)], template)
 
+    def rounded(self, template: str, dials: Mapping[str, float]) -> dict[str, float]:
+        """Positions that the text of a template sets."""
+        if "step" in _PLACEHOLDER.findall(template):
+            return {pot: round(dial * (self.steps - 1)) / (self.steps - 1) for pot, dial in dials.items()}
+        return {pot: round(dial, DECIMALS) for pot, dial in dials.items()}
+
 
 @dataclass(frozen=True, kw_only=True)
 class CommandPots(_SteppedPots, Pots):
@@ -148,6 +154,9 @@ class CommandPots(_SteppedPots, Pots):
         if status:
             how = f"status {status}" if status > 0 else f"signal {-status}"
             raise RigError(f"{where}: ended with {how}{_quote(output)}")
+
+    def standing(self, dials: Mapping[str, float]) -> dict[str, float]:
+        return self.rounded(" ".join(self.arguments), dials)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,6 +290,9 @@ class _Box(Pots):
         except LinkError as error:
             raise RigError(f"{where}: {str(error).removeprefix(f'{description.url}: ')}") from error
 
+    def standing(self, dials: Mapping[str, float]) -> dict[str, float]:
+        return self._description.rounded(self._description.line, dials)
+
     def _expect(self, wanted: str, where: str) -> None:
         """Await a reply.
 
@@ -333,6 +345,9 @@ class _Operator(Pots):
                     raise RigError(f"pots: the operator at {self._name} has left (end of input)")
         except (OSError, termios.error) as error:
             raise RigError(f"pots: the operator at {self._name} has left ({error.args[-1]})") from error
+
+    def standing(self, dials: Mapping[str, float]) -> dict[str, float]:
+        return {pot: round(dial, DECIMALS) for pot, dial in dials.items()}
 
     def close(self) -> None:
         fd, self._fd = self._fd, -1

@@ -14,7 +14,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
@@ -56,6 +56,8 @@ class PlayPlan:
     """Evidence of the samples against the instants of the instrument's own pots."""
     dated: list[Segment] | None
     """Segments dated by the samples; None if the instrument's instants are exact."""
+    standing: dict[str, float] = field(default_factory=dict)
+    """Values of the parameters at the first sample, by the positions that the pots took."""
 
 
 class RealRig(Rig):
@@ -98,6 +100,7 @@ class RealRig(Rig):
                 segments=scenario.segments() if plan.dated is None else tuple(plan.dated),
                 caveats=(*(self._caveats or ()), *plan.contradictions),
                 noise_lsb=self._noise_lsb,
+                standing=plan.standing,
             ),
         )
 
@@ -158,6 +161,7 @@ class RealRig(Rig):
         period_s = self._description.time_scale(plan.computer) / self._datasheet.rate_hz
         cuts = split_records(scenario.samples, self._datasheet.record_n, [change.sample for change in plan.changes])
         dials, plant = dict(plan.computer.dials), scenario.plant
+        plan.standing.update(_values_standing(scenario.program, pots, dials))
         for record, (start, end) in enumerate(cuts):
             changes = [dataclasses.replace(c, sample=c.sample - start) for c in plan.changes if start <= c.sample < end]
             with self._leave_safe(instrument):
@@ -281,6 +285,16 @@ class RealRig(Rig):
             self._pots.close()
             self._pots = None
         self._standing = {}
+
+
+def _values_standing(program: Program, pots: Pots, dials: Mapping[str, float]) -> dict[str, float]:
+    """Values of the parameters when pots are set to these dials; empty if they stand there exactly, or at their end."""
+    standing = pots.standing(dials)
+    if standing == dials or not all(standing.values()):
+        return {}
+    computer = SuspensionComputer(program.circuit)
+    computer.set(**{f"{pot}_dial": dial for pot, dial in standing.items()})
+    return program.values_at(computer.coefficients)
 
 
 def _switch_off(instrument: Instrument) -> str:

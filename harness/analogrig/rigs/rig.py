@@ -59,6 +59,8 @@ class Hindsight:
     """Reasons why the performance cannot be judged; empty if it can."""
     noise_lsb: Mapping[str, float] = field(default_factory=dict)
     """Noise before quantisation, rms, by channel name, where it was measured."""
+    standing: Mapping[str, float] = field(default_factory=dict)
+    """Values of the parameters at the first sample where the resolution of the pots moved them."""
 
 
 @dataclass(frozen=True, eq=False)

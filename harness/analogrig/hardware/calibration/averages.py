@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -110,7 +111,7 @@ class SquareWaveRecording:
 
 
 def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
-    """Play the scenario on the rig and return its samples.
+    """Play the scenario on the rig and return its samples, with the values at which the rig's pots stood.
 
     :raises ConfigurationError: the rig cannot play it.
     :raises RigError: the rig failed, has caveats or gaps, or an amplifier was overloaded.
@@ -126,7 +127,7 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
     if obstacles:
         raise RigError(f"scenario {scenario.name}: {obstacles[0]}: nothing can be fitted")
     return SquareWaveRecording(
-        scenario,
+        dataclasses.replace(scenario, set={**scenario.set, **hindsight.standing}),
         performance.sample_period_s,
         {name: performance.channels[name] for name in MEASURED},
         np.concatenate([block.codes[:, _COLUMNS] for block in blocks]),
