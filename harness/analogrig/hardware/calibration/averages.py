@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
 
 Vector = NDArray[np.float64]
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 ProgramName = Literal["front", "shock"]
 
 SAMPLES = 1400
@@ -33,6 +34,7 @@ FORCE, DISPLACEMENT = range(2)
 """Columns of a recording, as in MEASURED."""
 
 _COLUMNS = [INPUT, OUTPUT]
+_GRID = ("low_v", "lsb_v")
 
 _Plant = tuple[float, float, float]
 _PLAYS: tuple[tuple[_Plant, _Plant, tuple[float, float, int]], ...] = (
@@ -79,7 +81,7 @@ class SquareWaveRecording:
     scenario: Scenario
     sample_period_s: float
     channels: Mapping[str, Channel]
-    codes: NDArray[np.uint16]  # (n, 2): force, displacement
+    codes: Vector  # (n, 2): force, displacement; not rounded where the rig gives the volts that it measured
     clipped: NDArray[np.bool_]  # (n, 2)
 
     @property
@@ -97,7 +99,7 @@ class SquareWaveRecording:
             )
         return round(period_n)
 
-    def split_periods(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
+    def split_periods(self, values: NDArray[_Scalar]) -> NDArray[_Scalar]:
         """(periods, samples of a period): the settled part of ``values`` (n,)."""
         period_n = self.period_n
         first = -(-SETTLING_N // period_n) * period_n
@@ -107,7 +109,7 @@ class SquareWaveRecording:
     def periods(self, channel: int) -> tuple[Vector, NDArray[np.intp]]:
         """Codes (periods, samples of a period) of a channel, and the phases, in samples, without a clipped sample."""
         clipped = self.split_periods(self.clipped[:, channel]).any(axis=0)
-        return self.split_periods(self.codes[:, channel]).astype(np.float64), np.flatnonzero(~clipped)
+        return self.split_periods(self.codes[:, channel]), np.flatnonzero(~clipped)
 
 
 def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
@@ -126,11 +128,16 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
         obstacles.append("the samples have a gap")
     if obstacles:
         raise RigError(f"scenario {scenario.name}: {obstacles[0]}: nothing can be fitted")
+    channels = {name: performance.channels[name] for name in MEASURED}
+    codes = np.concatenate([block.codes[:, _COLUMNS] for block in blocks]).astype(np.float64)
+    if not rig.computes_circuit:  # whose volts are without noise
+        low_v, lsb_v = (np.array([getattr(channel, name) for channel in channels.values()]) for name in _GRID)
+        codes = (np.concatenate([block.volts[:, _COLUMNS] for block in blocks]) - low_v) / lsb_v
     return SquareWaveRecording(
         dataclasses.replace(scenario, set={**scenario.set, **hindsight.standing}),
         performance.sample_period_s,
-        {name: performance.channels[name] for name in MEASURED},
-        np.concatenate([block.codes[:, _COLUMNS] for block in blocks]),
+        channels,
+        codes,
         np.concatenate([block.clipped[:, _COLUMNS] for block in blocks]),
     )
 
