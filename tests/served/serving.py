@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from analogrig.config import locate
 from analogrig.hardware.simulator.served import ServedDescription
 from analogrig.hardware.simulator.server import Server
 from analogrig.program import Program
@@ -58,6 +59,12 @@ class Served:
         path = folder / "rigs.toml"
         path.write_text(RIG.format(address=self.address, self_test=str(self_test).lower()))
         return path
+
+    def lucidac_file(self, folder: Path) -> str:
+        """Shipped rig of a LUCIDAC at this address."""
+        path = folder / "lucidac.toml"
+        path.write_text(locate("rigs", "lucidac").read_text().replace("//127.0.0.1", f"//{self.address}"))
+        return str(path)
 
     def connect(self) -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), timeout=LONG_S)

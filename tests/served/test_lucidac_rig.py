@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
-from analogrig.config import locate
 from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused
 from analogrig.hardware.instrument import DialChange
 from analogrig.hardware.lucidac import LucidacInstrument
@@ -48,13 +47,6 @@ def instrument(served: Served) -> Iterator[LucidacInstrument]:
     opened.close()
 
 
-def rig_file(folder: Path, served: Served) -> str:
-    """Shipped rig at the address of the served machine."""
-    path = folder / "bench.toml"
-    path.write_text(locate("rigs", "lucidac").read_text().replace("//127.0.0.1", f"//{served.address}"))
-    return str(path)
-
-
 def played(rig: str, address: str) -> Run:
     with open_rig(rig, allow=[address], self_test=False) as opened, open_dut("inproc") as dut:
         return Bench(opened, dut).play(Scenario.load("thesis"), seed=7)
@@ -62,14 +54,14 @@ def played(rig: str, address: str) -> Run:
 
 def test_thesis_has_the_verdict_of_the_emulated_rig(served: Served, tmp_path: Path) -> None:
     """On 20 seeds: analogrig compare-rigs emulator lucidac --plays 20."""
-    verdicts = [judge(played(rig, served.address)) for rig in (rig_file(tmp_path, served), "emulator")]
+    verdicts = [judge(played(rig, served.address)) for rig in (served.lucidac_file(tmp_path), "emulator")]
     assert [verdict.outcome for verdict in verdicts] == ["passed", "passed"]
     latencies = [[change.latency_n for change in verdict.tweaks] for verdict in verdicts]
     assert np.abs(np.diff(np.array(latencies, np.float64), axis=0)).max() <= MOST_LATENCY_N
 
 
 def test_self_test_finds_nothing_wrong(served: Served, tmp_path: Path) -> None:
-    with open_rig(rig_file(tmp_path, served), allow=[served.address], self_test=False) as rig:
+    with open_rig(served.lucidac_file(tmp_path), allow=[served.address], self_test=False) as rig:
         assert not self_test(rig, 0, "front").reasons
 
 

@@ -34,7 +34,8 @@ def test_devices_behind_a_link_answer_live(dut: str, tmp_path: Path) -> None:
         played(work)
 
 
-def test_served_instrument_is_driven_record_by_record(tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", [(), ("--as", "lucidac")], ids=["redpitaya", "lucidac"])
+def test_served_instrument_is_driven_record_by_record(tmp_path: Path, options: tuple[str, ...]) -> None:
     async def work() -> None:
         async with open_client(bench) as socket:
             client = Client(socket)
@@ -52,9 +53,9 @@ def test_served_instrument_is_driven_record_by_record(tmp_path: Path) -> None:
             assert not state["recording"]
             assert Run.load(Path(state["saved"][0]["run"])).samples == 4000
 
-    with serving() as served:
-        rigs = served.rigs_file(tmp_path)
-        with benched("--rig", f"{rigs}:bench", "--allow", served.address, folder=tmp_path / "out") as bench:
+    with serving(*options) as served:
+        rig = served.lucidac_file(tmp_path) if options else f"{served.rigs_file(tmp_path)}:bench"
+        with benched("--rig", rig, "--allow", served.address, folder=tmp_path / "out") as bench:
             played(work)
 
 
