@@ -21,12 +21,17 @@ from analogrig_emulator.lucidac.configuration import (
 Values = NDArray[np.float64]
 
 _STEPS = 2048
+_FIRST_STEP_S = 1e-6
+"""The step that scipy would try first overflows where a fast element has settled."""
 _PASSES = 3
 """Passes that settle a chain of multipliers and identities."""
 
 
-def ideal_solution(configuration: Configuration, samples: int, rate_hz: float) -> Values:
-    """Values of the converter's outputs in machine units at k / rate_hz, (samples, channels)."""
+def ideal_solution(configuration: Configuration, samples: int, rate_hz: float, start: Values | None = None) -> Values:
+    """Values of the converter's outputs in machine units at k / rate_hz, (samples, channels).
+
+    start: values of the first integrators at the beginning, by default their initial conditions.
+    """
     sources = np.zeros((OUTPUTS, OUTPUTS))
     constants = np.zeros(OUTPUTS)
     for number, lane in configuration.lanes.items():
@@ -45,13 +50,16 @@ def ideal_solution(configuration: Configuration, samples: int, rate_hz: float) -
         return out
 
     k0 = np.array([each.k0 for each in configuration.integrators], np.float64)
-    start = np.array([-each.ic for each in configuration.integrators])
+    initial = np.array([-each.ic for each in configuration.integrators])
+    if start is not None:
+        initial[: len(start)] = start
     instants_s = np.arange(samples) / rate_hz
 
     def slope(_: float, y: Values) -> Values:
         return np.asarray(-k0 * (sources @ outputs(y) + constants)[:INTEGRATORS])
 
-    solved = solve_ivp(slope, (0.0, instants_s[-1]), start, "DOP853", instants_s, rtol=1e-7, atol=1e-9)
+    settings = {"method": "DOP853", "rtol": 1e-7, "atol": 1e-9, "first_step": _FIRST_STEP_S}
+    solved = solve_ivp(slope, (0.0, instants_s[-1]), initial, t_eval=instants_s, **settings)
     return np.array([outputs(y)[list(configuration.adc)] for y in solved.y.T])
 
 

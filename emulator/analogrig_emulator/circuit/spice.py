@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +125,9 @@ Vnode node 0 PULSE(0 1 0 1n 1n {period / 2} {period})
 
 @dataclass(frozen=True)
 class Accuracy:
-    """ngspice's tolerances; max_step_s is its longest time step.
+    """ngspice's tolerances; max_step_s is its longest time step, method its integration: trap or gear.
+
+    After a limit is reached, trap may alternate about the solution, and shrink its step without end; gear does not.
 
     With the defaults its error on the suspension is below 0.01 LSB of a 12-bit card.
     """
@@ -135,6 +137,7 @@ class Accuracy:
     abstol_a: float = 1e-12
     trtol: float = 0.1
     max_step_s: float = 1e-5
+    method: Literal["trap", "gear"] = "trap"
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +234,7 @@ class _DeckWriter:
         yield from self._initial_conditions()
         yield ".save " + " ".join(f"v({node})" for node in (self._circuit.nodes if nodes is None else nodes))
         yield f".options reltol={accuracy.reltol:g} vntol={accuracy.vntol_v:g} abstol={accuracy.abstol_a:g}"
-        yield f".options trtol={accuracy.trtol:g}"
+        yield f".options trtol={accuracy.trtol:g} method={accuracy.method}"
         if self._deck.samples > 0:
             stop_s = (self._deck.samples - 1) * self._period_s
             yield f".tran {_number(self._period_s)} {_number(stop_s)} 0 {_number(accuracy.max_step_s)} uic"
