@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, 
 from analogrig.hardware.simulator.lucidac_registers import Registers
 from analogrig.hardware.simulator.served_lucidac import CHUNK_VALUES, MAC, specimen
 from analogrig.scenario import DEFAULT_SEED
-from analogrig_emulator.lucidac.configuration import Configuration
+from analogrig_emulator.lucidac.configuration import COEFFICIENT_STEPS, Configuration
 from tests.emulator.ideal_lucidac import ideal_solution
 from tests.harness.processes import LONG_S
 from tests.served.hostile_lucidac import nested, varint
@@ -87,6 +88,33 @@ def test_generator_comes_through_its_cables(runs: Path) -> None:
     square = np.where(t_s * 1000 % 1 < 0.5, 0.7, -0.2)
     assert np.abs(data[0] + square)[np.arange(1000) % 50 > 0].max() < 0.003
     assert np.abs(data[1] + 0.2 + 0.6 * np.sin(2 * np.pi * 1000 * t_s)).max() < 0.003
+
+
+def test_manufacturers_report_is_that_of_an_ideal_machine(served: Served, tmp_path: Path) -> None:
+    """The report measures against a grid that ends at the end of the run; samples come at k / rate."""
+    command = [sys.executable, "-W", "ignore", "-m", "tests.served.lucidac_report", str(served.port)]
+    subprocess.run([*command, str(tmp_path / "plots.npz")], cwd=ROOT, check=True, capture_output=True, timeout=LONG_S)
+    plots = np.load(tmp_path / "plots.npz")
+    misses = {}
+    for i, periods in enumerate((1, 10, 20)):
+        left = plots[f"sin-{i}"]
+        ends, instants = np.linspace(0.0, periods * 2.0 * np.pi, left.shape[1]), 1e4 * np.arange(left.shape[1]) / 31_415
+        misses[f"sin, {periods} periods"] = [
+            left[k] + wave(ends) - wave(instants) for k, wave in enumerate([np.cos, np.sin] * 4)
+        ]
+    misses["lanes"] = plots["lane-0"] + 0.56 - quantised(0.56)
+    misses["multipliers"] = plots["mul-0"] + 0.56 - quantised(0.8) * quantised(0.7)
+    for i, (slope, k0) in enumerate(itertools.product((1.0, 0.1, 0.01), (10_000, 100))):
+        left = plots[f"itor-{i}"]
+        ramp = quantised(slope) * k0 * np.arange(left.shape[1]) / 40_000
+        misses[f"integrators, {slope:g} x {k0}"] = left + np.linspace(0.0, 1.0, left.shape[1]) - ramp
+    most = {name: float(np.abs(values).max()) for name, values in misses.items()}
+    print("".join(f"{name}: {value:.4f} of a machine unit\n" for name, value in most.items()))
+    assert len(most) == 11 and max(most.values()) < 0.002
+
+
+def quantised(factor: float) -> float:
+    return round(factor * COEFFICIENT_STEPS) / COEFFICIENT_STEPS
 
 
 # ---- message by message
