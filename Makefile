@@ -57,7 +57,7 @@ export OPENBLAS_NUM_THREADS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
-        cost coverage bit-exact analyze eva mutate mutants pictures fuzz fuzz-serve faults hostile defects repositories line-faults packages programs kills \
+        cost coverage bit-exact analyze eva mutate mutants pictures fuzz fuzz-serve lucidac lucidac-next faults hostile defects repositories line-faults packages programs kills \
         can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -154,8 +154,21 @@ pictures: $(PRODUCTS) ## screenshots of the pages for README and documentation; 
 fuzz: $(PRODUCTS) ## libFuzzer over core, isolation, fit and device, with sanitizers, FUZZ_S seconds each; findings stay in build/fuzz
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
 
-fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/docs/evidence/hostile-clients.md
+fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; tables of harness/docs/evidence
 	@$(BIN)/python -m tests.served.hostile $(FUZZ_S) 0
+	@$(BIN)/python -m tests.served.hostile_lucidac $(FUZZ_S) 0
+
+lucidac: $(PRODUCTS) ## the emulated LUCIDAC: 50 circuits in ngspice, streams at the full rate, its op-amps, a million frames; harness/docs/evidence/lucidac.md
+	@$(BIN)/python -m tests.benchmarks.soak_lucidac
+	@$(BIN)/python -m tests.benchmarks.stream_lucidac
+	@$(BIN)/python -m tests.benchmarks.bandwidth_lucidac
+	@$(BIN)/python -m tests.served.hostile_lucidac 0 0 1000000
+
+lucidac-next: $(PRODUCTS) ## the emulated LUCIDAC under the newest client of its manufacturer, in an environment of its own
+	@$(PYTHON) -m venv $(BUILD)/lucidac-next
+	@$(BUILD)/lucidac-next/bin/pip install --quiet --upgrade pybrid-computing
+	@$(BUILD)/lucidac-next/bin/pip list 2>/dev/null | grep pybrid
+	@LUCIDAC_CLIENT=$(abspath $(BUILD)/lucidac-next/bin/python) $(BIN)/pytest -q tests/served/test_lucidac.py -k manufacturers
 
 faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
 	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)

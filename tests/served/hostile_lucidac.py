@@ -1,6 +1,8 @@
 """Hostile clients of the served LUCIDAC; as a program, a table of the memory and time that each costs.
 
-python -m tests.served.hostile_lucidac SECONDS SEED
+python -m tests.served.hostile_lucidac SECONDS SEED [FRAMES]
+
+With FRAMES only as many random frames are sent, however long they take.
 """
 
 from __future__ import annotations
@@ -107,8 +109,8 @@ def random_frame(draw: random.Random) -> bytes:
     return varint(max(0, len(content) + wrong)) + bytes(content)
 
 
-def fuzz(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
-    """Send random frames, and read most answers."""
+def fuzz(served: ServedByProcess, draw: random.Random, stop: Stop, least: int = 0) -> int:
+    """Send random frames, at least so many, and read most answers."""
     count = 0
     while True:
         with ignore_disconnection(), served.connect() as connection:
@@ -119,7 +121,7 @@ def fuzz(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
                 if draw.random() < 0.1:
                     with contextlib.suppress(TimeoutError):
                         connection.recv(1 << 20)
-        if stop():
+        if stop() and count >= least:
             return count
 
 
@@ -236,11 +238,14 @@ ATTACKS: tuple[Attack, ...] = (
 )
 
 
-def main(seconds: float, seed: int) -> None:
+def main(seconds: float, seed: int, frames: int = 0) -> None:
+    def fuzz_frames(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
+        return fuzz(served, draw, stop, frames)
+
     with serving("--as", "lucidac") as served:
         query(served)
-        survive_all(served, ATTACKS, seconds, seed, query)
+        survive_all(served, (fuzz_frames,) if frames else ATTACKS, seconds, seed, query)
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]), int(sys.argv[2]))
+    main(float(sys.argv[1]), *map(int, sys.argv[2:]))

@@ -28,10 +28,10 @@ class KeptReport:
     def line_plot(self, _: list[str], __: list[Any], title: str = "") -> None:
         del title
 
-    def drawString(self, *_: Any) -> None:  # noqa: N802 - the package's name
+    def drawString(self, *_: Any) -> None:
         """Draw nothing."""
 
-    def nextPage(self) -> None:  # noqa: N802 - the package's name
+    def nextPage(self) -> None:
         """Turn no page."""
 
 

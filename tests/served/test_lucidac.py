@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
+import os
 import re
 import subprocess
 import sys
@@ -13,25 +13,21 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
 from analogrig.hardware import lucidac_messages
 from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, framed, protocol
-from analogrig.hardware.simulator.lucidac_registers import Registers
 from analogrig.hardware.simulator.served_lucidac import CHUNK_VALUES, MAC, specimen
 from analogrig.scenario import DEFAULT_SEED
-from analogrig_emulator.lucidac.configuration import COEFFICIENT_STEPS, Configuration
-from tests.emulator.ideal_lucidac import ideal_solution
+from analogrig_emulator.lucidac.configuration import COEFFICIENT_STEPS
 from tests.harness.processes import LONG_S
 from tests.served.hostile_lucidac import nested, varint
+from tests.served.lucidac_deviations import deviation, play, read_configuration, run_examples
 from tests.served.lucidac_examples import EXAMPLES
 from tests.served.serving import ROOT, Served, serving
 
-Values = NDArray[np.float64]
-
-SPARSE = 5
-"""Every fifth sample is compared: the ideal solution takes long."""
+CLIENT = os.environ.get("LUCIDAC_CLIENT", sys.executable)
+"""Python with the manufacturer's package: make lucidac-next sets one with its newest version."""
 
 
 @pytest.fixture(scope="module")
@@ -44,40 +40,17 @@ def served() -> Iterator[Served]:
 def runs(served: Served, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with what the manufacturer's client got in all examples."""
     folder = tmp_path_factory.mktemp("lucidac")
-    command = [sys.executable, "-m", "tests.served.lucidac_examples", str(served.port), str(folder)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=LONG_S)
+    run_examples(served.port, folder, CLIENT)
     return folder
-
-
-def configuration(folder: Path, name: str) -> Configuration:
-    items = protocol().Module.FromString((folder / f"{name}.apb").read_bytes()).items
-    return Registers().with_items(items, MAC).configuration()
-
-
-def without_ports(patch: Configuration) -> Configuration:
-    lanes = {number: lane for number, lane in patch.lanes.items() if lane.source is not None}
-    return dataclasses.replace(patch, lanes=lanes, adc=tuple(output for output in patch.adc if output < 12))
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_manufacturers_client_gets_the_ideal_solution_after_calibration_and_not_before(runs: Path, name: str) -> None:
     example, data = EXAMPLES[name], np.load(runs / f"{name}.npz")["data"].T
     assert data.shape == (round(example.op_s * example.sample_rate), example.channels)
-    first, last = (round(time_s * example.sample_rate) for time_s in (example.from_s, example.horizon_s))
-    patch = configuration(runs, name)
-    machine = specimen(DEFAULT_SEED)
+    patch, machine = read_configuration(runs, name), specimen(DEFAULT_SEED)
     machine.configure(patch)
-    codes = np.concatenate(list(machine.play(last, example.sample_rate)))
-    uncalibrated = codes * np.array([scale.gain for scale in machine.scales])
-
-    def deviation(values: Values) -> float:
-        shown = values[first:last:SPARSE]
-        start = shown[0] if first else None
-        expected = ideal_solution(without_ports(patch), len(shown), example.sample_rate / SPARSE, start)
-        return float(np.abs(shown[:, : expected.shape[1]] - expected).max())
-
-    before, after = deviation(uncalibrated), deviation(data)
-    print(f"{name}: {before:.4f} before calibration, {after:.4f} after it, of a machine unit")
+    before, after = (deviation(example, patch, values) for values in (play(machine, example), data))
     assert after < 0.01
     assert before > 0.003 and before > 3 * after
 
@@ -92,7 +65,7 @@ def test_generator_comes_through_its_cables(runs: Path) -> None:
 
 def test_manufacturers_report_is_that_of_an_ideal_machine(served: Served, tmp_path: Path) -> None:
     """The report measures against a grid that ends at the end of the run; samples come at k / rate."""
-    command = [sys.executable, "-W", "ignore", "-m", "tests.served.lucidac_report", str(served.port)]
+    command = [CLIENT, "-W", "ignore", "-m", "tests.served.lucidac_report", str(served.port)]
     subprocess.run([*command, str(tmp_path / "plots.npz")], cwd=ROOT, check=True, capture_output=True, timeout=LONG_S)
     plots = np.load(tmp_path / "plots.npz")
     misses = {}
@@ -109,8 +82,7 @@ def test_manufacturers_report_is_that_of_an_ideal_machine(served: Served, tmp_pa
         ramp = quantised(slope) * k0 * np.arange(left.shape[1]) / 40_000
         misses[f"integrators, {slope:g} x {k0}"] = left + np.linspace(0.0, 1.0, left.shape[1]) - ramp
     most = {name: float(np.abs(values).max()) for name, values in misses.items()}
-    print("".join(f"{name}: {value:.4f} of a machine unit\n" for name, value in most.items()))
-    assert len(most) == 11 and max(most.values()) < 0.002
+    assert len(most) == 11 and max(most.values()) < 0.002, most
 
 
 def quantised(factor: float) -> float:

@@ -119,13 +119,17 @@ class LinearPatch:
         logs, offsets = np.log([values[name] for name in names]), np.zeros(len(scales))
         for _ in range(_ROUNDING_STEPS):
             here = self._logs(logs, rows, columns)
-            by_value = [(self._logs(logs + _LOG_STEP * unit, rows, columns) - here) / _LOG_STEP for unit in np.eye(len(names))]
+            by_value = [
+                (self._logs(logs + _LOG_STEP * unit, rows, columns) - here) / _LOG_STEP for unit in np.eye(len(names))
+            ]
             misses = np.log(np.abs(realised[rows, columns])) - here - by_scale @ offsets
             step = np.linalg.lstsq(np.column_stack([*by_value, by_scale]), misses, rcond=None)[0]
             logs, offsets = logs + step[: len(names)], offsets + step[len(names) :]
         return dict(zip(names, np.exp(logs).tolist(), strict=True))
 
-    def _logs(self, logs: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+    def _logs(
+        self, logs: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
         """Logarithms of some weights by those of the parameters."""
         values = dict(zip(self.program.parameters, np.exp(logs).tolist(), strict=True))
         return np.log(np.abs(self._weights(values)[rows, columns]))
