@@ -110,6 +110,21 @@ def test_command_receives_each_pot_and_its_dial(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("kind", "standing"),
+    [
+        ({"kind": "command", "arguments": ["set", "{pot}", "{step}"], "steps": 101}, {"K": 0.64, "B": 0.82}),
+        ({"kind": "command", "arguments": ["set", "{pot}", "{dial}"]}, {"K": 0.6380, "B": 0.8152}),
+        ({"kind": "serial", "url": "loop://", "line": "{pot} {step}", "steps": 11}, {"K": 0.6, "B": 0.8}),
+        ({"kind": "none"}, {"K": 0.63801, "B": 0.81524}),
+    ],
+)
+def test_pots_stand_at_a_step_or_a_decimal(kind: Mapping[str, Any], standing: Mapping[str, float]) -> None:
+    pots = opened(**kind)
+    assert pots.standing({"K": 0.63801, "B": 0.81524}) == pytest.approx(standing)
+    pots.close()
+
+
 def test_no_shell_interprets_the_arguments(tmp_path: Path) -> None:
     pots = opened(kind="command", arguments=[*script(tmp_path, ""), "{pot}", "{dial}; touch $HOME/x && `id` {oops"])
     pots.set({"K": 0.5}, WORDS, recording=True)

@@ -13,27 +13,43 @@ import pytest
 
 from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
 from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused
+from analogrig.hardware.calibration.averages import record, scenarios
+from analogrig.hardware.calibration.fit import calibrate
 from analogrig.hardware.instrument import DialChange
 from analogrig.hardware.lucidac import LucidacInstrument
 from analogrig.hardware.lucidac_connection import LucidacConnection
 from analogrig.hardware.lucidac_messages import protocol
 from analogrig.hardware.lucidac_patch import LinearPatch
+from analogrig.hardware.real import RealRig
 from analogrig.hardware.self_test import self_test
+from analogrig.hardware.simulator.served_lucidac import specimen
+from analogrig.hardware.wiring import RealDescription
+from analogrig.plant import Plant
 from analogrig.program import Program
-from analogrig_emulator import Excitation, SuspensionComputer
-from analogrig_emulator.lucidac.configuration import SignalGenerator
+from analogrig.rigs.description import describe
+from analogrig.scenario import DEFAULT_SEED
+from analogrig_emulator import Capacitor, Excitation, SuspensionComputer
+from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
+from analogrig_emulator.lucidac.wiring import FAST_FARAD
 from tests.served.serving import Served, serving
 
 MOST_LATENCY_N = 3
 """Largest difference of a latency from that on the emulated rig."""
 
+MOST_ERRORS = 4.0
+"""Largest error of an estimate, in its standard errors."""
+
 SQUARE = Excitation(low_v=0.02, high_v=1.98, frequency_hz=100.0)
 """Force at the generator; a machine unit, 2 V, stands for 10 V."""
 
 
+DRAWN = "components.capacitors.tolerance=0.01"
+"""Lanes have wrong gains and offsets of their own, which depend on their coefficients as no pot of a computer does."""
+
+
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    with serving("--as", "lucidac") as running:
+    with serving("--as", "lucidac", "--defect", DRAWN) as running:
         yield running
 
 
@@ -63,6 +79,32 @@ def test_thesis_has_the_verdict_of_the_emulated_rig(served: Served, tmp_path: Pa
 def test_self_test_finds_nothing_wrong(served: Served, tmp_path: Path) -> None:
     with open_rig(served.lucidac_file(tmp_path), allow=[served.address], self_test=False) as rig:
         assert not self_test(rig, 0, "front").reasons
+
+
+class Uncalibrated(LucidacInstrument):
+    def _calibrate(self) -> None:
+        """Leave the machine as it was drawn."""
+
+
+def test_calibration_finds_the_drawn_capacitors(served: Served, tmp_path: Path) -> None:
+    """Values are those of the rounded coefficients. With the machine's own calibration nothing is left to find."""
+    description = describe(served.lucidac_file(tmp_path))
+    assert isinstance(description, RealDescription)
+    with RealRig(dataclasses.replace(description, self_test=False), Uncalibrated.open) as rig:
+        recordings = [record(rig, scenario, 0) for scenario in scenarios("front")]
+    assert all(value != 24500.0 for each in recordings for value in each.scenario.set.values())
+    found = calibrate(recordings, op_amp="ideal", stocks=["nominal"], pots=["coefficient"])
+    machine = specimen(DEFAULT_SEED, [DRAWN])
+    patch = LinearPatch(Program.load("front"))
+    machine.configure(patch.configuration(recordings[0].scenario.plant.parameters(), [0.0, 0.0], SignalGenerator()))
+    drawn = machine.wiring.specimen()
+    for name, capacitor in (("C2", "CF0"), ("C1", "CF1")):
+        each, element = found.estimate(name), drawn[capacitor]
+        assert isinstance(element, Capacitor)
+        deviation = element.farad / FAST_FARAD - 1.0
+        assert abs(deviation) > 20.0 * each.standard_error
+        assert abs(each.value - deviation) < MOST_ERRORS * each.standard_error
+    assert found.explains_all and found.chi_square > found.freedom - 5.0 * (2.0 * found.freedom) ** 0.5
 
 
 def test_record_is_the_program_on_an_ideal_computer_before_and_after_a_change(instrument: LucidacInstrument) -> None:
@@ -127,14 +169,19 @@ def test_waveform_that_the_generator_lacks_is_refused(excitation: Excitation, wh
 # ---- programs
 
 
+def nominal(program: Program) -> Plant:
+    return Plant(program, tuple(row.value for row in program.parameters.values()))
+
+
+def configured(patch: LinearPatch) -> Configuration:
+    """Configuration for the values of the program."""
+    return patch.configuration(nominal(patch.program).parameters(), [0.0] * len(patch.states), SignalGenerator())
+
+
 def factors(name: str) -> dict[tuple[int, int], float]:
     """Sum of the lanes by input and output."""
-    program = Program.load(name)
-    values = {parameter: row.value for parameter, row in program.parameters.items()}
-    patch = LinearPatch(program)
-    configuration = patch.configuration(values, [0.0] * len(patch.states), SignalGenerator())
     found: dict[tuple[int, int], float] = {}
-    for lane in configuration.lanes.values():
+    for lane in configured(LinearPatch(Program.load(name))).lanes.values():
         if lane.source is not None:
             key = (lane.target, lane.source)
             found[key] = found.get(key, 0.0) + lane.factor * lane.gain
@@ -167,6 +214,23 @@ def test_program_that_cannot_be_patched_is_one_line(name: str) -> None:
 
 def test_other_linear_program_fits() -> None:
     assert len(factors("dc-motor")) == 5
+
+
+@pytest.mark.parametrize("name", ["front", "shock", "dc-motor"])
+def test_rounded_values_have_the_response_of_the_rounded_coefficients(name: str) -> None:
+    """The response is computed by hand from the lanes: poles of the patch, and its gain, by machine time."""
+    program = Program.load(name)
+    patch = LinearPatch(program)
+    plant = nominal(program)
+    rounded = plant.changed(patch.rounded(plant.parameters()))
+    assert rounded.values != plant.values
+    n, lanes = len(patch.states), factors(name)
+    matrix = np.array([[-lanes.get((i, j), 0.0) for j in range(n)] for i in range(n)])
+    k0 = np.array([each.k0 for each in configured(patch).integrators[:n]])
+    poles = np.linalg.eigvals(k0[:, None] * matrix) / program.equations.speed
+    expected = np.poly(poles)[:0:-1]
+    response = rounded.response()
+    np.testing.assert_allclose([response[f"s{i}"] for i in range(n)], expected, rtol=1e-9 if n == 2 else 2e-3)
 
 
 def test_program_whose_output_has_no_integrator_is_one_line() -> None:
