@@ -27,6 +27,16 @@ def test_shipped_program_goes_by_its_name(capsys: pytest.CaptureFixture[str]) ->
     assert "no program is called 'pendolum': there are bump-stop, dc-motor" in capsys.readouterr().err
 
 
+def test_sheet_for_the_analog_thing_or_the_reason_against_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["patch", "front", "--machine", "that"]) == 0
+    assert "front on THE ANALOG THING" in capsys.readouterr().out
+    assert main(["patch", "front", "--machine", "that", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["speed"] == pytest.approx(20.0) and len(found["cables"]) == 6
+    assert main(["patch", "two-mass", "--machine", "that"]) == 2
+    assert "program two-mass: needs 5 summers, and THE ANALOG THING has 4" in capsys.readouterr().err
+
+
 def test_json_has_scales_and_dials(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["patch", str(MOTOR), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -17,9 +17,9 @@ def scaling_sheet(program: PatchedProgram) -> str:
     head = f"{program.name}: {equations.description}" if equations.description else program.name
     parts = [
         [head, f"1 s of the machine is {equations.speed:g} s of the plant."],
-        ["Quantities: 10 V stand for the full scale.", *_table(_quantities(program))],
-        ["Computing elements", *_table(_elements(program))],
-        ["Pots, set under load", *_table(_pots(program))],
+        ["Quantities: 10 V stand for the full scale.", *table(_quantities(program))],
+        ["Computing elements", *table(_elements(program))],
+        ["Pots, set under load", *table(_pots(program))],
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
@@ -98,7 +98,7 @@ def _pots(program: PatchedProgram) -> Iterator[Sequence[str]]:
         yield pot, f"{coefficient:.4f}", f"{at[pot]:.4f}", ", ".join(row.settings) or "nothing"
 
 
-def _table(rows: Iterator[Sequence[str]]) -> list[str]:
+def table(rows: Iterator[Sequence[str]]) -> list[str]:
     """Lines of left-aligned columns."""
     cells = [list(row) for row in rows]
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]

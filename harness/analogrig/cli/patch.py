@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import FILE, add_command, add_json
 from analogrig.cli.terminal import PASSED, show, show_plain, show_result
+
+if TYPE_CHECKING:
+    from analogrig_emulator import PatchedProgram
+    from analogrig_emulator.machine.that_sheet import ThatSheet
 
 _SAMPLES = 800
 
@@ -19,8 +23,15 @@ def add(commands: Any) -> None:
         "compile a program file, and print its scaling sheet",
         "patch dc-motor",
         "patch motor.toml --drawing build/motor.svg --netlist build/motor.cir",
+        "patch front --machine that",
     )
     command.add_argument("program", metavar="PROGRAM", help="program file, or the name of a shipped one")
+    command.add_argument(
+        "--machine",
+        choices=("own", "that"),
+        default="own",
+        help="own: scaling sheet of the emulated computer; that: patch sheet for THE ANALOG THING (default: own)",
+    )
     command.add_argument("--drawing", type=Path, metavar=FILE, help="drawing of the patch, an .svg file")
     command.add_argument("--netlist", type=Path, metavar=FILE, help="SPICE deck of the patch, for ngspice")
     add_json(command)
@@ -45,6 +56,7 @@ def _patch(arguments: argparse.Namespace) -> int:
     for path in wanted:
         move_aside(path, [file])
     program = load_program(file)
+    that = _that_sheet(program) if arguments.machine == "that" else None
     texts = {}
     if arguments.drawing is not None:
         texts[arguments.drawing] = patch_drawing(program)
@@ -55,13 +67,27 @@ def _patch(arguments: argparse.Namespace) -> int:
             out.write(text.encode())
     if arguments.json:
         full = {name: program.scales.full(name) for name in program.equations.quantities}
-        files = {"files": [str(path) for path in wanted]}
+        files: dict[str, Any] = {"files": [str(path) for path in wanted]}
+        if that is not None:
+            files |= {"speed": that.speed, "slow": that.slow, "cables": [vars(cable) for cable in that.cables]}
         show_result({"program": program.name, "full": full, "dials": dials(program), **files}, arguments)
     else:
-        show_plain(scaling_sheet(program).rstrip("\n"))
+        show_plain((scaling_sheet(program) if that is None else that.text()).rstrip("\n"))
         for path in wanted:
             show(f"written: {path}")
     return PASSED
+
+
+def _that_sheet(program: PatchedProgram) -> ThatSheet:
+    """:raises ConfigurationError: the program does not fit the machine."""
+    from analogrig.errors import ConfigurationError
+    from analogrig_emulator import EmulatorError
+    from analogrig_emulator.machine.that_sheet import ThatSheet
+
+    try:
+        return ThatSheet(program)
+    except EmulatorError as error:
+        raise ConfigurationError(str(error)) from error
 
 
 def _deck(program: Any) -> str:
