@@ -16,7 +16,7 @@ import numpy as np
 
 
 class KeptReport:
-    """Reporter that keeps the data of plots. sign, reference: values plotted are sign x - reference."""
+    """Reporter that keeps the data of plots."""
 
     def __init__(self) -> None:
         self.plots: list[list[Any]] = []
@@ -52,7 +52,9 @@ async def reported(port: int) -> dict[str, list[list[Any]]]:
 
 def main(port: str, file: str) -> None:
     plots = asyncio.run(reported(int(port)))
-    named = {f"{test}-{i}": np.stack(plot) for test, each in plots.items() for i, plot in enumerate(each)}
+    named: dict[str, Any] = {
+        f"{test}-{i}": np.stack(plot) for test, each in plots.items() for i, plot in enumerate(each)
+    }
     np.savez(file, **named)
 
 
