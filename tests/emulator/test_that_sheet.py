@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,7 @@ REFUSED = {
 }
 
 
+@functools.cache
 def program_named(name: str) -> PatchedProgram:
     return load_program(locate("programs", name))
 

@@ -2,7 +2,8 @@
 
     python -m tests.served.lucidac_examples PORT FOLDER
 
-Writes the values of each run and its configuration to FOLDER/NAME.npz and FOLDER/NAME.apb.
+Writes the values of each run and its configuration to FOLDER/NAME.npz and FOLDER/NAME.apb, and the data of the
+package's report to FOLDER/report.npz.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from tests.served.lucidac_report import keep
 
 Patch = Callable[[Any], None]
 
@@ -265,6 +268,7 @@ def main(port: str, folder: str) -> None:
         run = luci.run()
         np.savez(Path(folder, f"{name}.npz"), data=np.array(run.data))
         Path(folder, f"{name}.apb").write_bytes(circuit.to_config().module.SerializeToString())
+    keep(int(port), Path(folder))
 
 
 if __name__ == "__main__":

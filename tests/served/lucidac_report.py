@@ -1,15 +1,13 @@
 """Self-test of the manufacturer's package (`pybrid report`) against a LUCIDAC, its data kept instead of drawn.
 
-    python -m tests.served.lucidac_report PORT FILE.npz
-
-The report subtracts its references and draws what is left; it has no criterion. Here the references are added again:
-FILE holds the values of each plot, an array for each channel, by the name of the test and the number of its plot.
+The report subtracts its references and draws what is left; it has no criterion. The file holds the values of each plot,
+an array for each channel, by the name of the test and the number of its plot.
 """
 
 from __future__ import annotations
 
 import asyncio
-import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,13 +48,10 @@ async def reported(port: int) -> dict[str, list[list[Any]]]:
     return found
 
 
-def main(port: str, file: str) -> None:
-    plots = asyncio.run(reported(int(port)))
+def keep(port: int, folder: Path) -> None:
+    """Write report.npz to a folder."""
+    plots = asyncio.run(reported(port))
     named: dict[str, Any] = {
         f"{test}-{i}": np.stack(plot) for test, each in plots.items() for i, plot in enumerate(each)
     }
-    np.savez(file, **named)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+    np.savez(folder / "report.npz", **named)

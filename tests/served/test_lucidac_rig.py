@@ -91,7 +91,7 @@ def test_calibration_finds_the_drawn_capacitors(served: Served, tmp_path: Path) 
     description = describe(served.lucidac_file(tmp_path))
     assert isinstance(description, RealDescription)
     with RealRig(dataclasses.replace(description, self_test=False), Uncalibrated.open) as rig:
-        recordings = [record(rig, scenario, 0) for scenario in scenarios("front")]
+        recordings = [record(rig, scenario, 0) for scenario in scenarios("front")[:7]]
     assert all(value != 24500.0 for each in recordings for value in each.scenario.set.values())
     found = calibrate(recordings, op_amp="ideal", stocks=["nominal"], pots=["coefficient"])
     machine = specimen(DEFAULT_SEED, [DRAWN])

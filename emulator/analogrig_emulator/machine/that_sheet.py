@@ -11,6 +11,7 @@ Our integrators have k0 = 10,000 per second and more at weight 1. So all rates a
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -73,7 +74,7 @@ class ThatSheet:
     def _error(self, text: str) -> ProgramError:
         return ProgramError(f"program {self.program.name}: {text}")
 
-    @property
+    @functools.cached_property
     def places(self) -> Mapping[str, str]:
         """Element of the machine by the name of ours: {"U2": "INT1"}."""
         counts: Counter[str] = Counter()
@@ -99,7 +100,7 @@ class ThatSheet:
         places = self.places
         return tuple(places[each.name] for each in self.program.patch if each.farad and self._is_slow(each))
 
-    @property
+    @functools.cached_property
     def cables(self) -> tuple[Cable, ...]:
         """Connections in the order of the patch."""
         return tuple(self._cables())
