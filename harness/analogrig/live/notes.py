@@ -19,7 +19,7 @@ from analogrig.judging import information
 from analogrig.judging.courses import Model, PlantChange, first_at_level
 from analogrig.judging.linear import LinearPlant
 from analogrig.judging.verdict import DIAGNOSABLE
-from analogrig.live.desk import Desk, SteppedDesk
+from analogrig.live.desk import Desk
 from analogrig.live.ring import Ring
 from analogrig.live.take import Take
 from analogrig.plant import estimated_parameters
@@ -28,6 +28,8 @@ from analogrig.run import INPUT, LOST, OUTPUT, missing_samples
 
 _BOUND_AFTER_N = (64, 256, 1024)
 """Samples after a change at which its bound is looked for."""
+_AFTER_N = 2000
+"""Samples after an alarm, or after an injected fault, in which another alarm may have the same cause."""
 _MOST_NOTED = 50
 _MOST_TIMED = 1000
 
@@ -40,6 +42,10 @@ class NotedAlarm:
     sample: int
     what: str = ""
     """Names of the changed parameters; empty: no change explains the alarm."""
+    again: str = ""
+    """Names of the parameters of a change that an earlier alarm had found already."""
+    fault: str = ""
+    """Injected fault that was in force, if no change explains the alarm."""
     change: int = 0
     """Sample of the change."""
     latency_n: int | None = None
@@ -62,6 +68,8 @@ class Notes:
         """Samples that feel a turn of a pot, and the times of the turns."""
         self.felt_s: deque[float] = deque(maxlen=_MOST_TIMED)
         """Times from a turn of a pot to the first answered sample that feels it."""
+        self._disturbed: dict[str, float] = {}
+        """Last samples that injected faults of this take act on."""
         self.alarms: deque[NotedAlarm] = deque(maxlen=_MOST_NOTED)
         self.alarm_count = 0
         self.diagnosis = ""
@@ -74,6 +82,11 @@ class Notes:
         self._take, self._number = take, number
         self.forget_turns()
         self.diagnosis, self.misfit = "", ""
+        self._disturbed = {}
+
+    def disturb(self, sample: int, what: str, *, lasts: bool) -> None:
+        """Note an injected fault at a sample, from which alarms may come."""
+        self._disturbed[what] = math.inf if lasts else sample + _AFTER_N
 
     def await_turn(self, sample: int, times_s: Sequence[float]) -> None:
         """Await the first sample that feels a turn of pots, ordered at these times."""
@@ -103,11 +116,14 @@ class Notes:
         alarm = NotedAlarm(self._number, sample)
         earlier = [segment for segment in self._take.segments() if segment.start < sample][-2:]
         start, ramp_n = earlier[-1].start, earlier[-1].ramp_n
-        seen = any(each.take == self._number and each.what and each.change == start for each in self.alarms)
-        if len(earlier) > 1 and (sample <= start + ramp_n or not seen):
-            alarm.what = ", ".join(earlier[0].plant.changes_to(earlier[1].plant))
-            alarm.change = start
-            alarm.latency_n = sample - start
+        seen = [each for each in self.alarms if each.take == self._number and each.change == start]
+        names = ", ".join(earlier[0].plant.changes_to(earlier[-1].plant))
+        if names and (sample <= start + ramp_n or not seen):
+            alarm.what, alarm.change, alarm.latency_n = names, start, sample - start
+        elif names and sample <= seen[-1].sample + _AFTER_N:
+            alarm.again, alarm.change = names, start
+        else:
+            alarm.fault = ", ".join(what for what, end in self._disturbed.items() if sample <= end)
         self.alarms.append(alarm)
         self.alarm_count += 1
 
@@ -139,10 +155,10 @@ class Notes:
         program, output = self._desk.program, performance.channels[self._desk.program.channels[OUTPUT]]
         try:
             clipped: Any = self._ring.read("clipped", change, end)
-            model: Model
+            model: Model | None = self._desk.machine(end, output.lsb_v)
             moment: Any
-            if isinstance(self._desk, SteppedDesk):
-                model, moment = self._desk.machine(end, output.lsb_v), self._desk.moments[change]
+            if model is not None:
+                moment = self._desk.moments[change]
             elif program.is_linear:
                 codes: Any = self._ring.read("codes", 0, end)
                 driven = performance.channels[program.channels[INPUT]].physical(codes[:, INPUT])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.scope import signals_of
 from analogrig.live.session import LiveSession
@@ -43,7 +42,7 @@ def _settings(excitation: Excitation) -> dict[str, Any]:
 def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
     """Amplifiers of the patch: kind, output node and quantity, and for each input its node, pot and resistor."""
     desk = session.desk
-    if not isinstance(desk, SteppedDesk):
+    if desk.computer is None:
         return []
     circuit = desk.computer.circuit
     pots = {pot.wiper: pot for pot in circuit.of(Pot)}
