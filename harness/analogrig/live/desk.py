@@ -115,21 +115,21 @@ class Desk(Rig):
         """
         return None
 
-    def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:
+    def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:  # noqa: ARG002
         """Turn pots after the last sample taken, to values of which these parameters have changed.
 
         :raises ConfigurationError: a pot cannot show a value; none is turned then.
         """
         raise ConfigurationError(_NO_MACHINE)
 
-    def inject(self, fault: Fault, *, on: bool) -> None:
+    def inject(self, fault: Fault, *, on: bool) -> None:  # noqa: ARG002
         """Switch a fault on or off, from the next sample on.
 
         :raises ConfigurationError: the rig has no such fault.
         """
         raise ConfigurationError(_NO_MACHINE)
 
-    def switch(self, mode: Mode) -> None:
+    def switch(self, mode: Mode) -> None:  # noqa: ARG002
         """Switch the relays, through the modes between.
 
         :raises ConfigurationError: the circuit has no solution in that mode.

@@ -62,6 +62,10 @@ class Notes:
         self._device = device
         self._ring = ring
         self._seed = seed
+        self._sheet = device.datasheet
+        """Data sheet, which a device may suit to the program as a take begins."""
+        self._is_new = True
+        """True until the first block of a take."""
         self._take = Take(desk.scenario)
         self._number = 0
         self._unfelt: deque[tuple[int, float]] = deque(maxlen=_MOST_TIMED)
@@ -79,7 +83,7 @@ class Notes:
 
     def begin(self, take: Take, number: int) -> None:
         """Begin a take."""
-        self._take, self._number = take, number
+        self._take, self._number, self._is_new = take, number, True
         self.forget_turns()
         self.diagnosis, self.misfit = "", ""
         self._disturbed = {}
@@ -98,6 +102,8 @@ class Notes:
 
     def watch(self, block: Block, answers: Answers, now_s: float) -> bool:
         """Take note of an answered block that is in the ring. Return True if there is news."""
+        if self._is_new:
+            self._sheet, self._is_new = self._device.datasheet, False
         end = self._ring.end
         self.missing_n += int(np.count_nonzero(~block.samples().valid[: len(answers)] | (answers.flags & LOST != 0)))
         self.felt_s.extend(now_s - at_s for sample, at_s in self._unfelt if sample < end)
@@ -174,11 +180,11 @@ class Notes:
             found = information.information_of(model, PlantChange(0, before, after, moment, course_lsb), weight)
         except (LookupError, ConfigurationError):  # no longer in the ring; or a machine that cannot play so
             return None
-        return first_at_level(found, self._device.datasheet.log_arl0(self._take.scenario.expect.arl0))
+        return first_at_level(found, self._sheet.log_arl0(self._take.scenario.expect.arl0))
 
     def estimated(self, theta: NDArray[np.floating]) -> NDArray[np.float64]:
         """Parameters ``program.estimates`` (n, m) of estimates theta; NaN if they describe no such plant."""
-        program, sheet, performance = self._desk.program, self._device.datasheet, self._desk.performance
+        program, sheet, performance = self._desk.program, self._sheet, self._desk.performance
         if sheet.model is None:
             return np.full((len(theta), len(program.estimates)), np.nan)
         input_per_code, output_per_code = (performance.channels[name].lsb for name in program.measured)
@@ -188,7 +194,7 @@ class Notes:
     @property
     def estimate_names(self) -> tuple[str, ...]:
         """Parameters that the device estimates."""
-        return self._desk.program.estimates if self._device.datasheet.model is not None else ()
+        return self._desk.program.estimates if self._sheet.model is not None else ()
 
     def estimates(self) -> dict[str, float | None]:
         """Last estimates by parameter."""

@@ -6,8 +6,16 @@ import dataclasses
 from typing import Any
 
 from analogrig.live.faults import LINE_LABELS
-from analogrig.live.scope import signals_of
+from analogrig.live.scope import (
+    LEAST_COLUMNS,
+    LEAST_WINDOW_N,
+    MOST_COLUMNS,
+    MOST_SIGNALS,
+    MOST_WINDOW_N,
+    signals_of,
+)
 from analogrig.live.session import LiveSession
+from analogrig.scenario import MAX_RAMP_N
 from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
 from analogrig_emulator.machine.patching import patches
 
@@ -24,6 +32,13 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
         "faults": dict(desk.faults),
         "line_faults": {kind: LINE_LABELS[kind] for kind in session.line_faults},
         "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
+        "rate": session.sample_rate_hz,
+        "limits": {
+            "signals": MOST_SIGNALS,
+            "samples": (LEAST_WINDOW_N, MOST_WINDOW_N),
+            "columns": (LEAST_COLUMNS, MOST_COLUMNS),
+            "ramp_n": MAX_RAMP_N,
+        },
         "level": sum(session.excitation.range_v) / 2.0,
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
         "patch": patch_rows(session),

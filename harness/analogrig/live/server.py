@@ -70,7 +70,7 @@ PING_S, SILENT_S = 1.0, 4.0
 """Time between two pings, and the longest time until their answer: a driver that has stopped is gone soon."""
 WATCHER_PAUSE_S = 0.005
 """Least time between two messages of a client that does not drive."""
-FRAME_S = 1.0 / 45.0
+FRAME_S = 1.0 / 50.0
 """Time between two frames."""
 LEAST_PAUSE_S = 0.002
 """Least time between the work for two frames, which is left to other clients."""

@@ -16,7 +16,6 @@ from analogrig import cli
 from analogrig.catalogue import BLOCK_SAMPLES
 from analogrig.cli.bench import NO_FAULTS
 from analogrig.devices.opening import open_dut
-from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, RigError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
@@ -203,7 +202,8 @@ def test_step_shows_its_own_samples(dut: str, tmp_path: Path) -> None:
     ends: list[int] = []
     steps = ((0.2 + 0.1 * k, Step(10)) for k in range(3))
     notes = ((0.25 + 0.1 * k, lambda session: ends.append(session.ring.end)) for k in range(3))
-    script = sorted([(0.01, SetPlaying(on=False)), *steps, *notes], key=lambda each: each[0])
+    script: list[tuple[float, Action]] = [(0.01, SetPlaying(on=False)), *steps, *notes]
+    script.sort(key=lambda each: each[0])
     session = scripted_session(script, tmp_path, dut=open_dut(dut))
     assert np.diff(ends).tolist() == [10, 10]
     assert session.ring.end == session._taken
@@ -212,7 +212,7 @@ def test_step_shows_its_own_samples(dut: str, tmp_path: Path) -> None:
 def test_false_alarms_that_were_seen_are_allowed_in_the_scenario(tmp_path: Path) -> None:
     estimator = EstimatorConfig(orders="program", arl0=3.0)
     script = ((0.0, SetRecording(on=True)), (0.1, Turn("K", 18000.0)), (0.2, SetRecording(on=False)))
-    session = scripted_session(script, tmp_path, dut=replace(describe("inproc"), estimator=estimator).direct())
+    session = scripted_session(script, tmp_path, dut=open_dut("inproc", estimator=estimator))
     (saved,) = session.saved
     assert saved.alarms > saved.false_alarms > 0
     notice = session.notices[0][1]
