@@ -404,7 +404,8 @@ def _check_origin(origin: str) -> None:
     """:raises ConfigurationError: an origin is not a scheme and a host, as browsers send it."""
     with contextlib.suppress(ValueError):
         url = urlsplit(origin)
-        if url.scheme and url.netloc and origin == f"{url.scheme}://{url.netloc}" and origin.isascii():
+        is_plain = origin.isascii() and origin.isprintable() and " " not in origin
+        if is_plain and url.scheme and url.netloc and origin == f"{url.scheme}://{url.netloc}":
             return
     raise ConfigurationError(f"origin {origin[:80]!r}: expected one such as http://localhost:8080, without a path")
 

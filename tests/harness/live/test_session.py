@@ -39,7 +39,7 @@ from analogrig.live.commands import (
 )
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
-from analogrig.live.panel import state_table
+from analogrig.live.panel import bench_table, state_table
 from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
 from analogrig.live.session import BLOCK_S, LiveSession
 from analogrig.live.take import MOST_KEPT_CHANGES, Take
@@ -49,6 +49,7 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import SuspensionComputer
+from tests import tools
 from tests.harness.live.benches import SEED, Action, RecordsRig, linked, scripted_session
 
 RATE_HZ = 20_000
@@ -118,6 +119,20 @@ def test_alarm_of_any_program_has_the_latency_and_the_bound_of_its_recording(pro
     alarm = next(alarm for alarm in session.notes.alarms if alarm.what)
     (tweak,) = judge(Run.load(session.saved[0].run)).tweaks
     assert (alarm.what, alarm.latency_n, alarm.bound_n) == (name, tweak.latency_n, tweak.bound_n)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((tools.ROOT / "fixtures" / "programs").glob("*.toml")), ids=lambda path: path.stem
+)
+def test_every_shipped_program_has_knobs_signals_and_a_patch(path: Path, tmp_path: Path) -> None:
+    scenario = Scenario.of_program(Program.load(path.stem))
+    session = scripted_session(((0.02, SetPlaying(on=False)),), tmp_path, scenario=scenario)
+    table = json.loads(json.dumps([bench_table(session), state_table(session)], allow_nan=False))[0]
+    assert len(table["knobs"]) == len(session.knobs) > 0
+    assert len(table["patch"]) == len(session.desk.amplifiers) > 0
+    screen = Screen()
+    screen.change(View(tuple(signals_of(session))[:16], Trigger(table["signals"][0]["id"])))
+    assert screen.frame(session) is not None
 
 
 def test_digital_pots_that_show_two_parameters_follow_both(tmp_path: Path) -> None:

@@ -148,7 +148,7 @@
     if (!$("source").value) level = bench.level;
     const base = $("base").value;
     $("base").replaceChildren();
-    for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")} per division`);
+    for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")}/div`);
     $("base").value = base || "0.02";
     const source = $("source").value;
     $("source").replaceChildren();
@@ -309,7 +309,8 @@
       this.input.step = "any";
       title.append(`${name}${unit ? `, ${unit}` : ""}`, this.input);
       const limits = document.createElement("small");
-      limits.textContent = `${short(knob.low, 3)} to ${short(knob.high, 3)}, pot ${pots.join(", ")}`;
+      const shownBy = pots.join(", ");
+      limits.textContent = `${short(knob.low, 3)} to ${short(knob.high, 3)}${shownBy === name ? "" : `, pot ${shownBy}`}`;
       this.element.append(this.slider, title, limits);
       this.slider.onkeydown = (event) => this.key(event);
       this.slider.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
@@ -625,7 +626,9 @@
   function redraw() {
     isDue = false;
     if (!frame || !frame.signals.every((id) => shown.includes(id))) return;
-    for (const id of frame.signals) if (!scaleOf(id).per) fit(id);
+    const fresh = frame.signals.filter((id) => !scaleOf(id).per);
+    fresh.forEach(fit);
+    if (fresh.length) buildSignals();
     if (frame.kind === "xy") drawXy();
     else drawPlot();
     if (measures) showMeasures();
@@ -705,7 +708,7 @@
         scales: { x: { time: false }, y: { range: [-DIVISIONS, DIVISIONS] } },
         series: [{}, {}],
         axes: [
-          plotting.axis("x", isSpectrum ? "frequency, Hz" : "time, ms", 2, ink, {}),
+          plotting.axis("x", isSpectrum ? "frequency, Hz" : "time, ms", 2, ink, { size: 28, labelSize: 18 }),
           plotting.axis("y", title, 3, ink, { size: 70, splits: () => vertical, values: ticks }),
         ],
       },
