@@ -119,11 +119,6 @@ class ClearLamps:
     """Put the overload lamps out."""
 
 
-@dataclass(frozen=True)
-class Drive:
-    """Drive, if no other client does."""
-
-
 Command = (
     Turn | Generate | Operate | SetPlaying | Step | Tempo | Restart | Inject | Spoil | Mend | SetRecording | ClearLamps
 )

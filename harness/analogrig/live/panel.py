@@ -15,7 +15,6 @@ from analogrig.live.scope import (
     signals_of,
 )
 from analogrig.live.session import LiveSession
-from analogrig.scenario import MAX_RAMP_N
 from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
 from analogrig_emulator.machine.patching import patches
 
@@ -37,7 +36,6 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
             "signals": MOST_SIGNALS,
             "samples": (LEAST_WINDOW_N, MOST_WINDOW_N),
             "columns": (LEAST_COLUMNS, MOST_COLUMNS),
-            "ramp_n": MAX_RAMP_N,
         },
         "level": sum(session.excitation.range_v) / 2.0,
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],

@@ -51,7 +51,7 @@ from websockets.http11 import Request, Response
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.live import foxglove
-from analogrig.live.commands import Drive, command_of
+from analogrig.live.commands import command_of
 from analogrig.live.panel import bench_table, state_table
 from analogrig.live.scope import Screen, View, signals_of
 from analogrig.pages import PLOTS, assemble_page
@@ -312,7 +312,8 @@ class BenchServer:
                     raise ConfigurationError(f"no signal is called {signal!r}: there are {', '.join(known)}")
             client.screen.change(view)
         elif name == "drive":
-            config.build(Drive, table, name)
+            if table:
+                raise ConfigurationError(f"drive: unknown key {next(iter(table))!r}")
             if self._driver not in (None, client):
                 raise ConfigurationError("another client drives")
             self._appoint(client)

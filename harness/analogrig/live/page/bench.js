@@ -10,6 +10,7 @@
   const KEPT = 12; // frames of the persistence
   const RETRY_MS = 500;
   const HAND_MS = 40; // time between two messages of a hand that turns a pot
+  const RAMP_N = 16; // samples of its ramps: each takes the emulator as long as fifty of a pot that stands still
   const BEHIND_MS = 3000; // time for which the page warns that the bench has fallen behind real time
   const SVG = "http://www.w3.org/2000/svg";
   const $ = (id) => document.getElementById(id);
@@ -374,7 +375,7 @@
       this.turn(this.value * 1.01 ** (event.deltaY < 0 ? 1 : -1));
     }
 
-    // A ramp lasts until the next message of the hand, so that the pot follows it evenly.
+    // A ramp lasts until the next message of the hand, unless the emulator would fall behind.
     grasp(event) {
       if (this.isDisabled) return;
       this.held = true;
@@ -388,8 +389,8 @@
         this.show(value);
         if (last || performance.now() - sent >= HAND_MS) {
           sent = performance.now();
-          const ramp = bench.stepped && state ? Math.round((state.rate / state.factor) * (HAND_MS / 1000)) : 0;
-          this.turn(value, Math.min(ramp, bench.limits.ramp_n));
+          const ramp = bench.stepped && state ? Math.round((bench.rate / state.factor) * (HAND_MS / 1000)) : 0;
+          this.turn(value, Math.min(ramp, RAMP_N));
         }
       };
       this.slider.onpointermove = (moved) => moved.clientY !== y && move(moved);
