@@ -82,6 +82,7 @@ class Take:
             samples=run.samples,
             tweaks=changes,
             expect=dataclasses.replace(expect, false_alarms=max(expect.false_alarms, self.false_alarms(run))),
+            name="by hand",
             description=f"Recorded by hand: {', '.join(told[:_MOST_TOLD]) or 'no change'}{more}.",
         )
 
