@@ -33,6 +33,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
 from analogrig.live.commands import Tempo, Turn
+from analogrig.live.foxglove import SUBPROTOCOL
 from analogrig.live.session import LiveSession
 from analogrig.run import Run
 from tests import tools
@@ -122,6 +123,7 @@ class _Process:
         url, _, token = self.address.replace("http:", "ws:").replace("/?", f"/{path}?").partition("=")
         url = f"{url}={more.pop('token', token)}"
         more.setdefault("origin", self.address.partition("/?")[0])
+        more.setdefault("subprotocols", [SUBPROTOCOL] if path == "foxglove" else None)
         return connect(url, max_size=None, **more)
 
     def cpu_s(self) -> float:
@@ -261,6 +263,8 @@ async def _hostile(path: str, seconds: float) -> list[Figure]:
             sent = sum(await asyncio.gather(*attacks))
             state = await _state(socket)
             growth_mb = bench.memory_mb() - before_mb
+    if not sent:
+        raise RuntimeError("no hostile client got in")
     if not state["drives"] or state["values"]["K"] != 20000.0:
         raise RuntimeError(f"the driver was harmed: {state}")
     return [
