@@ -178,8 +178,7 @@ class BenchServer:
                 max_queue=4,
                 open_timeout=5,
                 close_timeout=1,
-                ping_interval=PING_S,
-                ping_timeout=self._silent_s,
+                ping_interval=None,  # such a ping would wait as long as a full buffer does
                 server_header=None,
                 create_connection=functools.partial(_Connection, noted=self._open),  # type: ignore[arg-type]
             )
@@ -240,6 +239,8 @@ class BenchServer:
 
     async def _serve_socket(self, socket: ServerConnection) -> None:
         path = "" if socket.request is None else urlsplit(socket.request.path).path
+        pinging = asyncio.create_task(self._drop_when_silent(socket))
+        pinging.add_done_callback(lambda _: socket.transport.abort())
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             if path == _FOXGLOVE:
                 try:
@@ -251,6 +252,14 @@ class BenchServer:
                     self._setter = None if self._setter is socket else self._setter
             else:
                 await self._serve_client(_PageClient(socket))
+
+    async def _drop_when_silent(self, socket: ServerConnection) -> None:
+        """Return once a client has not answered a ping for ``silent_s``, or has gone."""
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            while True:
+                await asyncio.sleep(PING_S)
+                async with asyncio.timeout(self._silent_s):
+                    await (await socket.ping())
 
     def _may_set(self, viewer: ServerConnection) -> bool:
         """True if a viewer may set parameters: it is the one that does."""
