@@ -81,6 +81,7 @@ def test_pot_turned_by_the_keyboard_raises_an_alarm_within_twice_its_bound(opene
     expect(page.locator(K)).to_have_attribute("aria-valuetext", re.compile("^K 22180"))
     page.wait_for_function("() => document.getElementById('play').textContent === 'Run'")
     session.do(Step(300))
+    expect(page.locator("#clock")).to_contain_text("2000 samples")
     row = page.locator("#alarms tbody tr").first
     expect(row).to_contain_text("K")
     expect(row.locator("td").nth(4)).not_to_have_text("–")
@@ -89,6 +90,9 @@ def test_pot_turned_by_the_keyboard_raises_an_alarm_within_twice_its_bound(opene
     assert int(sample) == 1699 + int(latency)
     assert 0 < int(latency) <= 2 * int(bound)
     expect(page.locator("#alarm")).to_contain_text(f"K changed: alarm {latency} samples later")
+    curves, axes = (page.locator(each).bounding_box() for each in ("#curves", ".u-over"))
+    assert curves is not None
+    assert curves == pytest.approx(axes, abs=0.5)
 
 
 def test_recording_made_on_the_page_replays_with_the_same_alarms(

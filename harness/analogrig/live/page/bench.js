@@ -245,8 +245,8 @@
       head.append(swatch, name, " ", remove);
       row.append(head);
       row.setAttribute("aria-current", String(id === current));
-      cell(row, "").append(field(id, "per", `${label}: per division`), ` ${unitOf(id)}`);
-      cell(row, "").append(field(id, "middle", `${label}: at the middle`), ` ${unitOf(id)}`);
+      cell(row, "").append(field(id, "per", `${label}: per division`));
+      cell(row, "").append(field(id, "middle", `${label}: at the middle`));
       for (let i = 0; i < 6; i++) cell(row, "–", "number");
     }
     $("add").replaceChildren();
@@ -687,8 +687,9 @@
       layOut(ends);
     } else if (ends.some((end, i) => end !== plot.data[0][i])) {
       plot.setData([ends, [null, null]]);
+    } else {
+      drawCurves(plot);
     }
-    drawCurves();
   }
 
   function layOut(ends) {
@@ -712,15 +713,15 @@
           plotting.axis("x", isSpectrum ? "frequency, Hz" : "time, ms", 2, ink, { size: 28, labelSize: 18 }),
           plotting.axis("y", title, 3, ink, { size: 70, splits: () => vertical, values: ticks }),
         ],
+        hooks: { draw: [drawCurves] }, // it lays the axes out later
       },
       [ends, [null, null]],
       $("axes"),
     );
   }
 
-  function drawCurves() {
+  function drawCurves({ bbox: { left, top, width, height }, data: [ends] }) {
     const canvas = $("curves");
-    const { left, top, width, height } = plot.bbox;
     const px = devicePixelRatio;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     Object.assign(canvas.style, { left: `${left / px}px`, top: `${top / px}px`, width: `${width / px}px`, height: `${height / px}px` });
@@ -729,17 +730,16 @@
     context.lineWidth = WIDTH * px;
     context.globalAlpha = 0.25;
     for (const old of kept.slice(0, -1)) {
-      if (old.kind === frame.kind) for (const id of old.signals) if (shown.includes(id)) drawCurve(context, old, id);
+      if (old.kind === frame.kind) for (const id of old.signals) if (shown.includes(id)) drawCurve(context, ends, old, id);
     }
     context.globalAlpha = 1;
-    for (const id of frame.signals) drawCurve(context, frame, id);
-    drawMarks(context);
+    for (const id of frame.signals) drawCurve(context, ends, frame, id);
+    drawMarks(context, ends);
   }
 
-  function drawCurve(context, of, id) {
+  function drawCurve(context, [low, high], of, id) {
     const { width, height } = context.canvas;
     const { start, pitch } = across(of);
-    const [low, high] = plot.data[0];
     const { per, middle } = heightScale(of, id);
     const unit = height / (2 * DIVISIONS) / per;
     const values = of.values[id];
@@ -755,9 +755,8 @@
     context.stroke();
   }
 
-  function drawMarks(context) {
+  function drawMarks(context, [low, high]) {
     const { width, height } = context.canvas;
-    const [low, high] = plot.data[0];
     const line = (colour, dash, from, to) => {
       context.strokeStyle = ink(colour);
       context.setLineDash(dash.map((each) => each * devicePixelRatio));
