@@ -53,8 +53,8 @@ _TICK_HZ = os.sysconf("SC_CLK_TCK")
 NOTE = """\
 The emulator plays 20,000 samples/s into the in-process device, an estimate every 64 samples.
 One client shows four channels, an estimate and the statistic, and turns a pot twice a second.
-Frames are drawn by Chromium without a graphics processor, at 1280 by 900 pixels; all its processes
-share one core, and the server runs on the others.
+Frames are drawn by Chromium without a graphics processor, at 1280 by 900 pixels. All
+its processes share one core, and the server runs on the others.
 Processor time and memory are those of the process `analogrig bench`. A turn is felt when the
 first sample after it has been answered. Hostile clients send random and almost valid messages,
 wrong tokens and origins, and read nothing; a driver works beside them."""
