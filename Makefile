@@ -57,7 +57,7 @@ export OPENBLAS_NUM_THREADS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
-        cost coverage bit-exact analyze eva mutate mutants pictures fuzz fuzz-serve lucidac lucidac-next faults hostile defects repositories line-faults packages programs kills \
+        cost coverage bit-exact analyze eva mutate mutants foxglove pictures fuzz fuzz-serve lucidac lucidac-next faults hostile defects repositories line-faults packages programs kills \
         can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -147,6 +147,9 @@ no-firmware:
 tools: ## install the tools of the tests from the operating system (apt, sudo if you are not root), and the guest's kernel
 	@$(PYTHON) -m tests.tools install
 	@$(MAKE) --no-print-directory $(BUILD)/can_guest/linux
+
+foxglove: $(PRODUCTS) ## the endpoint for viewers of the live bench under Foxglove's own client, from npm
+	@$(BIN)/python -m tests.harness.live.foxglove_npm
 
 pictures: $(PRODUCTS) ## screenshots of the pages for README and documentation; ARGS="report" makes that one
 	@$(BIN)/python -m tests.pictures $(ARGS)

@@ -196,7 +196,9 @@ class Plan:
         if name == NOISE:
             return "noise", "LSB rms"
         program = self._base.program
-        return name.replace("_", " "), program.unit(self._starts[name]) if name in self._starts else ""
+        unit = program.unit(self._starts[name]) if name in self._starts else ""
+        spelled = unit.lower().replace("/", " per ").replace(" ", "_")  # of names such as damping_n_s_per_m
+        return name.removesuffix(f"_{spelled}").replace("_", " "), unit
 
     @property
     def estimates(self) -> tuple[str, ...]:

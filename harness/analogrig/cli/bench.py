@@ -29,7 +29,9 @@ TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
 NO_FAULTS = "seed=1995"
 """Line without faults, into which a hand can inject some."""
 REPORT_INTERVAL_N = 64
-"""Samples between estimates from a device of our catalogue: the page shows ten states a second."""
+"""Samples between estimates from a device of our catalogue: the page shows five states a second."""
+ARL0 = 1e8
+"""Mean samples between false alarms of the device that is used if none is named: hours, not seconds."""
 
 
 def add(commands: Any) -> None:
@@ -83,7 +85,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--out {arguments.out}: cannot create the folder: {error}") from error
     with (
         open_what_to_play(arguments) as (rig, scenario, seed),
-        _open_device(arguments.dut or scenario.dut or "inproc", arguments) as device,
+        _open_device(arguments.dut or scenario.dut, arguments) as device,
     ):
         identity = Identity.here(arguments.command_line, arguments.started, device.files())
         session = LiveSession(rig, scenario, device, seed, folder=arguments.out, identity=identity)
@@ -93,12 +95,16 @@ def _run(arguments: argparse.Namespace) -> int:
 def _open_device(name: str, arguments: argparse.Namespace) -> Device:
     """Open the device. The defaults of one of our catalogue are blocks, and an estimate every ``REPORT_INTERVAL_N``.
 
+    :param name: empty: a device that raises a false alarm every ``ARL0`` samples.
     :raises ConfigurationError, LinkError, DeviceError: as ``open_dut``.
     """
     from analogrig.devices.opening import open_dut
     from analogrig.devices.registry import trusted
+    from analogrig.estimator_config import EstimatorConfig
 
     trust, changes = trust_of(arguments), changes_of_dut(arguments)
+    if not name:
+        name, changes["estimator"] = "inproc", EstimatorConfig(orders="program", arl0=ARL0)
     description = trusted(name, trust)
     if "pace" in description.capabilities and "report_interval_n" in vars(description):
         changes["report_interval_n"] = changes["report_interval_n"] or REPORT_INTERVAL_N

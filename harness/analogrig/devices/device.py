@@ -100,7 +100,8 @@ class Device(ABC):
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         """Feed blocks of samples without a pause, and yield the answers to each block, in order.
 
-        It may take several blocks before it yields. A sample lost on the way has the flag LOST, a missing one MISSING.
+        It may take several blocks before it yields. A block without samples demands the answers to all before it.
+        A sample lost on the way has the flag LOST, a missing one MISSING.
 
         :raises LinkTimeout, LinkClosed, DeviceError: names the sample; the answers yielded before are valid.
         :raises TimeLimitReached: after all answers that came in time; the last block may be answered in part.

@@ -221,6 +221,8 @@ class EstimatorLibraryDevice(Device):
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         try:
             for block in blocks:
+                while self._posted and not len(block):
+                    yield from self._take()
                 for piece in self._pieces(block):
                     if len(self._posted) == SLOTS:
                         yield from self._take()

@@ -275,6 +275,8 @@ class LineDevice(TemplateDevice):
             for block, is_gap in self._with_gaps(blocks):
                 waiting.append((len(block), block.first, is_gap))
                 self._feed(block)
+                if not len(block):
+                    self._collect(0)
                 yield from self._take_complete(waiting)
             self._collect(0)
         except (LinkTimeout, TimeLimitReached):

@@ -585,7 +585,7 @@ def _attribute_alarms(
         # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
         in_segment = [index for index in alarms if start < index <= end]
         detection = in_segment[0] if in_segment else None
-        detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
+        detected |= alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
         late = first_at_level(gathered, expect.late_information_ratio * level)
         tweaks.append(
@@ -632,7 +632,7 @@ def _judge_diagnosis(
     )
 
 
-def _alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
+def alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
     """Alarms attributed to a change: all until the end of its ramp, and the first one after it.
 
     An alarm on a ramp restarts the device on a plant that keeps changing. It must detect that change again.

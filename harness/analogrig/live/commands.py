@@ -9,6 +9,7 @@ from typing import Any, Literal
 from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.links.wire_faults import Direction
+from analogrig.scenario import MAX_RAMP_N
 
 MOST_STEPS = 1_000_000
 SLOWEST, FASTEST = 1e6, 1e-3
@@ -27,8 +28,8 @@ class Turn:
     ramp_n: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.ramp_n <= 100_000:
-            raise ValueError(f"ramp_n must be 0 to 100000, not {self.ramp_n}")
+        if not 0 <= self.ramp_n <= MAX_RAMP_N:
+            raise ValueError(f"ramp_n must be 0 to {MAX_RAMP_N}, not {self.ramp_n}")
 
 
 @dataclass(frozen=True)

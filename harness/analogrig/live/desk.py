@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import OUTPUT
 from analogrig.scenario import Scenario
 from analogrig_emulator import Mode as Relays
-from analogrig_emulator import Moment, probes_per_sample
+from analogrig_emulator import Moment, SuspensionComputer, probes_per_sample
 from analogrig_emulator.machine.patching import patches
 
 RECORD_N = 4000
@@ -34,7 +35,9 @@ CHANGE_N = 2000
 """Sample of a record after which the pots turn, if the hand has turned them."""
 
 Lengths = Callable[[], Iterator[int]]
-"""Function that yields the length of each next block when it is due."""
+"""Function that yields the length of each next block when it is due; 0: the device answers all blocks before."""
+
+_NO_MACHINE = "this rig plays whole records: it has no modes, no faults to inject and no single step"
 
 
 class Desk(Rig):
@@ -48,6 +51,8 @@ class Desk(Rig):
     """Amplifiers whose outputs are read."""
     nodes: tuple[str, ...] = ()
     """Nodes of their outputs."""
+    moments: Mapping[int, Moment] = {}
+    """State of the machine at the last turns of pots, by sample."""
     performance: Performance
     """Play under way; before the first, one that is not taken."""
 
@@ -88,6 +93,52 @@ class Desk(Rig):
         """Amplifiers with a lit overload lamp."""
         return ()
 
+    @property
+    def is_turning(self) -> bool:
+        """True while a pot turns."""
+        return False
+
+    @property
+    def injected(self) -> set[Fault]:
+        """Faults in force."""
+        return set()
+
+    @property
+    def computer(self) -> SuspensionComputer | None:
+        """Emulated computer; None: a rig that plays records."""
+        return None
+
+    def machine(self, samples: int, lsb_v: float) -> Machine | None:  # noqa: ARG002
+        """Machine of the play as a model of its plant, for so many samples; None: unknown.
+
+        :raises ConfigurationError: it cannot be.
+        """
+        return None
+
+    def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:  # noqa: ARG002
+        """Turn pots after the last sample taken, to values of which these parameters have changed.
+
+        :raises ConfigurationError: a pot cannot show a value; none is turned then.
+        """
+        raise ConfigurationError(_NO_MACHINE)
+
+    def inject(self, fault: Fault, *, on: bool) -> None:  # noqa: ARG002
+        """Switch a fault on or off, from the next sample on.
+
+        :raises ConfigurationError: the rig has no such fault.
+        """
+        raise ConfigurationError(_NO_MACHINE)
+
+    def switch(self, mode: Mode) -> None:  # noqa: ARG002
+        """Switch the relays, through the modes between.
+
+        :raises ConfigurationError: the circuit has no solution in that mode.
+        """
+        raise ConfigurationError(_NO_MACHINE)
+
+    def clear_lamps(self) -> None:
+        """Put the overload lamps out."""
+
 
 class SteppedDesk(Desk):
     """Emulated computer that is operated between two blocks."""
@@ -105,11 +156,12 @@ class SteppedDesk(Desk):
         self._playing = self.scenario
         self._probed: deque[NDArray[np.float64]] = deque()
         """Volts of the amplifiers in each block that is not answered."""
+        self._length = 0
+        """Length of the block that is due."""
         self.moments: dict[int, Moment] = {}
-        """State of the machine at the last turns of pots, by sample."""
         self.faults = labels(scenario.program.channels[OUTPUT].replace("_", " "))
-        self.computer = rig.set_up(self.scenario, seed).computer
-        found = patches(self.computer.circuit)
+        self._computer = rig.set_up(self.scenario, seed).computer
+        found = patches(self._computer.circuit)
         self.amplifiers = tuple(found)
         self.nodes = tuple(patch.out for patch in found.values())
 
@@ -120,77 +172,73 @@ class SteppedDesk(Desk):
 
     def check_values(self, values: Mapping[str, float]) -> None:
         with emulator_errors():
-            self.computer.dials_for(**self._emulated.pot_settings(self.scenario.plant.changed(values), values))
+            self._computer.dials_for(**self._emulated.pot_settings(self.scenario.plant.changed(values), values))
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         set_up = self._emulated.set_up(scenario, seed)
         on = self.injected
-        self._playing, self.computer, self.moments = scenario, set_up.computer, {}
+        self._playing, self._computer, self.moments = scenario, set_up.computer, {}
         self._faults = ChannelFaults(float(self._card.lsb_v[OUTPUT]), self._card.rate_hz, np.random.default_rng(seed))
         for fault in on:
             self._faults.switch(fault, on=True)
         performance = self._emulated.perform_in_steps(
-            set_up, self.program, seed, self._lengths(), self.nodes, self._faults.alter
+            set_up, self.program, seed, iter(lambda: self._length, 0), self.nodes, self._faults.alter
         )
         self._probed.clear()
-        self.performance = dataclasses.replace(performance, blocks=self._probe(performance.blocks))
+        self.performance = dataclasses.replace(performance, blocks=self._play(performance.blocks))
         return self.performance
 
-    def machine(self, samples: int, lsb_v: float) -> Machine:
-        """Machine of the play as a model of its plant, for so many samples.
+    @property
+    def computer(self) -> SuspensionComputer:
+        return self._computer
 
-        :raises ConfigurationError: it cannot be.
-        """
+    def machine(self, samples: int, lsb_v: float) -> Machine:
         with emulator_errors():
             return Machine(self._emulated.courses(self._playing, self._seed, samples), lsb_v)
 
     def probed(self, samples: int) -> NDArray[np.float64]:
         return self._probed.popleft()[:samples]
 
-    def _probe(self, blocks: Iterator[Block]) -> Iterator[Block]:
-        """Keep the volts of the amplifiers with each block: the next one is played before it is answered."""
-        for block in blocks:
-            self._probed.append(self.computer.probed[:: self._probes_per_sample].copy())
-            yield block
+    def _play(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        """Play blocks as they are due, and keep the volts of the amplifiers until each is answered."""
+        end, nothing = 0, np.empty((0, len(self.program.channels)))
+        for length in self._lengths():
+            if length:
+                self._length = length
+                for block in islice(blocks, 1):
+                    self._probed.append(self._computer.probed[:: self._probes_per_sample].copy())
+                    end = block.first + len(block.codes)
+                    yield block
+            else:
+                yield Block(end, nothing, nothing.astype(np.uint16), nothing.astype(np.bool_))
 
     def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:
-        """Turn pots after the last sample taken, to values of which these parameters have changed.
-
-        :raises ConfigurationError: a pot cannot show a value; none is turned then.
-        """
         with emulator_errors():
             settings = self._emulated.pot_settings(self.scenario.plant.changed(values), names)
-            self.computer.set(ramp_n * self._probes_per_sample, **settings)
+            self._computer.set(ramp_n * self._probes_per_sample, **settings)
         if self.mode == "OPERATE":
-            self.moments[sample] = Moment(sample, self.computer.machine.state)
+            self.moments[sample] = Moment(sample, self._computer.machine.state)
         if len(self.moments) > MOST_KEPT_CHANGES:
             del self.moments[min(self.moments)]
 
     @property
     def is_turning(self) -> bool:
-        """True while a pot turns."""
-        return self.computer.machine.is_turning
+        return self._computer.machine.is_turning
 
     def inject(self, fault: Fault, *, on: bool) -> None:
-        """Switch a fault on or off, from the next sample on."""
         if self._faults is not None:
             self._faults.switch(fault, on=on)
 
     @property
     def injected(self) -> set[Fault]:
-        """Faults in force."""
         return set() if self._faults is None else self._faults.on
 
     @property
     def mode(self) -> Mode:
-        return self.computer.machine.mode.value
+        return self._computer.machine.mode.value
 
     def switch(self, mode: Mode) -> None:
-        """Switch the relays, through the modes between.
-
-        :raises ConfigurationError: the circuit has no solution in that mode.
-        """
-        machine, goal = self.computer.machine, Relays(mode)
+        machine, goal = self._computer.machine, Relays(mode)
         if goal is machine.mode:
             return
         self.moments.clear()  # no course passes through another mode
@@ -202,11 +250,10 @@ class SteppedDesk(Desk):
 
     @property
     def lamps(self) -> Sequence[str]:
-        return [name for name, sample in self.computer.machine.lamps.items() if sample is not None]
+        return [name for name, sample in self._computer.machine.lamps.items() if sample is not None]
 
     def clear_lamps(self) -> None:
-        """Put the overload lamps out."""
-        self.computer.machine.clear_lamps()
+        self._computer.machine.clear_lamps()
 
 
 def open_desk(rig: Rig, scenario: Scenario, seed: int, lengths: Lengths) -> Desk:

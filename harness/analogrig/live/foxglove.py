@@ -13,6 +13,7 @@ import logging
 import struct
 import time
 from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,8 @@ _ROWS = 8
 """Samples of the signals that are sent in each period."""
 _MOST_SUBSCRIPTIONS = 64
 _SLOW_S = 10.0
+_PAUSE_S = 0.005
+"""Least time between two messages of a viewer."""
 _WARNING, _ERROR = 1, 2
 
 _log = logging.getLogger(__name__)
@@ -83,11 +86,23 @@ def channels_of(session: LiveSession) -> dict[int, Topic]:
 class Viewer:
     """One viewer at its connection."""
 
-    def __init__(self, socket: ServerConnection, session: LiveSession, *, may_set: Callable[[], bool]) -> None:
-        """:param may_set: true while this viewer may set parameters."""
+    def __init__(
+        self,
+        socket: ServerConnection,
+        session: LiveSession,
+        *,
+        may_set: Callable[[], bool],
+        work: Callable[[], AbstractAsyncContextManager[None]],
+    ) -> None:
+        """Prepare; nothing is sent before ``serve``.
+
+        :param may_set: true while this viewer may set parameters.
+        :param work: context of work that other clients must wait for.
+        """
         self._socket = socket
         self._session = session
         self._may_set = may_set
+        self._work = work
         self._channels = channels_of(session)
         self._subscribed: dict[int, int] = {}
         """Channels by number of the subscription."""
@@ -106,6 +121,7 @@ class Viewer:
         try:
             async for message in self._socket:
                 await self._receive(message)
+                await asyncio.sleep(_PAUSE_S)
         finally:
             publishing.cancel()
             for error in await asyncio.gather(publishing, return_exceptions=True):
@@ -189,7 +205,11 @@ class Viewer:
                     take, end = session.take_number, 0
                     began_ns = max(time.time_ns(), sent_ns)
                 last, end = end, session.ring.end
-                for row in self._rows(last, end) if "/signals" in self._topics() else ():
+                rows: list[dict[str, Any]] = []
+                if "/signals" in self._topics():
+                    async with self._work():
+                        rows = self._rows(last, end)
+                for row in rows:
                     sent_ns = began_ns + round(1e9 * row["sample"] / session.sample_rate_hz)
                     await self._send("/signals", row, sent_ns)
                 fresh = min(session.notes.alarm_count - sent_alarms, len(session.notes.alarms))

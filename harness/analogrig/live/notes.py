@@ -19,7 +19,7 @@ from analogrig.judging import information
 from analogrig.judging.courses import Model, PlantChange, first_at_level
 from analogrig.judging.linear import LinearPlant
 from analogrig.judging.verdict import DIAGNOSABLE
-from analogrig.live.desk import Desk, SteppedDesk
+from analogrig.live.desk import Desk
 from analogrig.live.ring import Ring
 from analogrig.live.take import Take
 from analogrig.plant import estimated_parameters
@@ -28,6 +28,8 @@ from analogrig.run import INPUT, LOST, OUTPUT, missing_samples
 
 _BOUND_AFTER_N = (64, 256, 1024)
 """Samples after a change at which its bound is looked for."""
+_AFTER_N = 2000
+"""Samples after an alarm, or after an injected fault, in which another alarm may have the same cause."""
 _MOST_NOTED = 50
 _MOST_TIMED = 1000
 
@@ -40,6 +42,10 @@ class NotedAlarm:
     sample: int
     what: str = ""
     """Names of the changed parameters; empty: no change explains the alarm."""
+    again: str = ""
+    """Names of the parameters of a change that an earlier alarm had found already."""
+    fault: str = ""
+    """Injected fault that was in force, if no change explains the alarm."""
     change: int = 0
     """Sample of the change."""
     latency_n: int | None = None
@@ -56,12 +62,18 @@ class Notes:
         self._device = device
         self._ring = ring
         self._seed = seed
+        self._sheet = device.datasheet
+        """Data sheet, which a device may suit to the program as a take begins."""
+        self._is_new = True
+        """True until the first block of a take."""
         self._take = Take(desk.scenario)
         self._number = 0
         self._unfelt: deque[tuple[int, float]] = deque(maxlen=_MOST_TIMED)
         """Samples that feel a turn of a pot, and the times of the turns."""
         self.felt_s: deque[float] = deque(maxlen=_MOST_TIMED)
         """Times from a turn of a pot to the first answered sample that feels it."""
+        self._disturbed: dict[str, float] = {}
+        """Last samples that injected faults of this take act on."""
         self.alarms: deque[NotedAlarm] = deque(maxlen=_MOST_NOTED)
         self.alarm_count = 0
         self.diagnosis = ""
@@ -71,9 +83,14 @@ class Notes:
 
     def begin(self, take: Take, number: int) -> None:
         """Begin a take."""
-        self._take, self._number = take, number
+        self._take, self._number, self._is_new = take, number, True
         self.forget_turns()
         self.diagnosis, self.misfit = "", ""
+        self._disturbed = {}
+
+    def disturb(self, sample: int, what: str, *, lasts: bool) -> None:
+        """Note an injected fault at a sample, from which alarms may come."""
+        self._disturbed[what] = math.inf if lasts else sample + _AFTER_N
 
     def await_turn(self, sample: int, times_s: Sequence[float]) -> None:
         """Await the first sample that feels a turn of pots, ordered at these times."""
@@ -85,6 +102,8 @@ class Notes:
 
     def watch(self, block: Block, answers: Answers, now_s: float) -> bool:
         """Take note of an answered block that is in the ring. Return True if there is news."""
+        if self._is_new:
+            self._sheet, self._is_new = self._device.datasheet, False
         end = self._ring.end
         self.missing_n += int(np.count_nonzero(~block.samples().valid[: len(answers)] | (answers.flags & LOST != 0)))
         self.felt_s.extend(now_s - at_s for sample, at_s in self._unfelt if sample < end)
@@ -103,11 +122,14 @@ class Notes:
         alarm = NotedAlarm(self._number, sample)
         earlier = [segment for segment in self._take.segments() if segment.start < sample][-2:]
         start, ramp_n = earlier[-1].start, earlier[-1].ramp_n
-        seen = any(each.take == self._number and each.what and each.change == start for each in self.alarms)
-        if len(earlier) > 1 and (sample <= start + ramp_n or not seen):
-            alarm.what = ", ".join(earlier[0].plant.changes_to(earlier[1].plant))
-            alarm.change = start
-            alarm.latency_n = sample - start
+        seen = [each for each in self.alarms if each.take == self._number and each.change == start]
+        names = ", ".join(earlier[0].plant.changes_to(earlier[-1].plant))
+        if names and (sample <= start + ramp_n or not seen):
+            alarm.what, alarm.change, alarm.latency_n = names, start, sample - start
+        elif names and sample <= seen[-1].sample + _AFTER_N:
+            alarm.again, alarm.change = names, start
+        else:
+            alarm.fault = ", ".join(what for what, end in self._disturbed.items() if sample <= end)
         self.alarms.append(alarm)
         self.alarm_count += 1
 
@@ -139,10 +161,10 @@ class Notes:
         program, output = self._desk.program, performance.channels[self._desk.program.channels[OUTPUT]]
         try:
             clipped: Any = self._ring.read("clipped", change, end)
-            model: Model
+            model: Model | None = self._desk.machine(end, output.lsb_v)
             moment: Any
-            if isinstance(self._desk, SteppedDesk):
-                model, moment = self._desk.machine(end, output.lsb_v), self._desk.moments[change]
+            if model is not None:
+                moment = self._desk.moments[change]
             elif program.is_linear:
                 codes: Any = self._ring.read("codes", 0, end)
                 driven = performance.channels[program.channels[INPUT]].physical(codes[:, INPUT])
@@ -158,11 +180,11 @@ class Notes:
             found = information.information_of(model, PlantChange(0, before, after, moment, course_lsb), weight)
         except (LookupError, ConfigurationError):  # no longer in the ring; or a machine that cannot play so
             return None
-        return first_at_level(found, self._device.datasheet.log_arl0(self._take.scenario.expect.arl0))
+        return first_at_level(found, self._sheet.log_arl0(self._take.scenario.expect.arl0))
 
     def estimated(self, theta: NDArray[np.floating]) -> NDArray[np.float64]:
         """Parameters ``program.estimates`` (n, m) of estimates theta; NaN if they describe no such plant."""
-        program, sheet, performance = self._desk.program, self._device.datasheet, self._desk.performance
+        program, sheet, performance = self._desk.program, self._sheet, self._desk.performance
         if sheet.model is None:
             return np.full((len(theta), len(program.estimates)), np.nan)
         input_per_code, output_per_code = (performance.channels[name].lsb for name in program.measured)
@@ -172,7 +194,7 @@ class Notes:
     @property
     def estimate_names(self) -> tuple[str, ...]:
         """Parameters that the device estimates."""
-        return self._desk.program.estimates if self._device.datasheet.model is not None else ()
+        return self._desk.program.estimates if self._sheet.model is not None else ()
 
     def estimates(self) -> dict[str, float | None]:
         """Last estimates by parameter."""

@@ -5,9 +5,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
-from analogrig.live.scope import signals_of
+from analogrig.live.scope import (
+    LEAST_COLUMNS,
+    LEAST_WINDOW_N,
+    MOST_COLUMNS,
+    MOST_SIGNALS,
+    MOST_WINDOW_N,
+    signals_of,
+)
 from analogrig.live.session import LiveSession
 from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
 from analogrig_emulator.machine.patching import patches
@@ -25,6 +31,12 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
         "faults": dict(desk.faults),
         "line_faults": {kind: LINE_LABELS[kind] for kind in session.line_faults},
         "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
+        "rate": session.sample_rate_hz,
+        "limits": {
+            "signals": MOST_SIGNALS,
+            "samples": (LEAST_WINDOW_N, MOST_WINDOW_N),
+            "columns": (LEAST_COLUMNS, MOST_COLUMNS),
+        },
         "level": sum(session.excitation.range_v) / 2.0,
         "signals": [dataclasses.asdict(signal) for signal in signals_of(session).values()],
         "patch": patch_rows(session),
@@ -43,7 +55,7 @@ def _settings(excitation: Excitation) -> dict[str, Any]:
 def patch_rows(session: LiveSession) -> list[dict[str, Any]]:
     """Amplifiers of the patch: kind, output node and quantity, and for each input its node, pot and resistor."""
     desk = session.desk
-    if not isinstance(desk, SteppedDesk):
+    if desk.computer is None:
         return []
     circuit = desk.computer.circuit
     pots = {pot.wiper: pot for pot in circuit.of(Pot)}

@@ -20,7 +20,7 @@ from analogrig.live.session import LiveSession
 
 MOST_SIGNALS = 16
 LEAST_WINDOW_N, MOST_WINDOW_N = 16, RING_N // 2
-MOST_COLUMNS = 4000
+LEAST_COLUMNS, MOST_COLUMNS = 10, 4000
 _MOST_ESTIMATES = 512
 """Rows of theta that are converted for one screen."""
 _MEASURE_S = 0.2
@@ -78,7 +78,7 @@ class View:
         if not 1 <= len(self.signals) <= MOST_SIGNALS:
             raise ValueError(f"signals must be 1 to {MOST_SIGNALS}, not {len(self.signals)}")
         config.check_range(self, "samples", LEAST_WINDOW_N, MOST_WINDOW_N)
-        config.check_range(self, "columns", 10, MOST_COLUMNS)
+        config.check_range(self, "columns", LEAST_COLUMNS, MOST_COLUMNS)
 
 
 def signals_of(session: LiveSession) -> dict[str, Signal]:

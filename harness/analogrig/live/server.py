@@ -21,8 +21,9 @@ Limits of a client:
 
     address  the token, a Host of this server, an Origin of the page (viewers outside a browser have none)
     memory   messages of MOST_MESSAGE_BYTES, one frame on its way, the buffers of the connection
-    time     a client that accepts no data for SLOW_S is dropped
+    time     a client that accepts no data for SLOW_S, or answers no ping for SILENT_S, is dropped
     place    one of MOST_CLIENTS, and of MOST_SOCKETS before it is let in
+    work     watchers get their frames one after another, for at most half of the time; a message each WATCHER_PAUSE_S
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ import logging
 import secrets
 import socket as socketlib
 import time
-from collections.abc import Collection
+from collections.abc import AsyncIterator, Collection
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
@@ -65,11 +66,15 @@ MOST_SOCKETS = 4 * MOST_CLIENTS
 MOST_MESSAGE_BYTES = 8192
 BUFFERED_BYTES = 262_144
 SLOW_S = 10.0
-FRAME_S = 1.0 / 45.0
+PING_S, SILENT_S = 1.0, 4.0
+"""Time between two pings, and the longest time until their answer: a driver that has stopped is gone soon."""
+WATCHER_PAUSE_S = 0.005
+"""Least time between two messages of a client that does not drive."""
+FRAME_S = 1.0 / 50.0
 """Time between two frames."""
 LEAST_PAUSE_S = 0.002
 """Least time between the work for two frames, which is left to other clients."""
-STATE_S = 0.1
+STATE_S = 0.2
 """Time between two states while the session plays."""
 _PAGE = Path(__file__).parent / "page"
 _LIVE, _FOXGLOVE = "/live", "/foxglove"
@@ -116,6 +121,7 @@ class BenchServer:
         token: str = "",
         origins: Collection[str] = (),
         slow_s: float = SLOW_S,
+        silent_s: float = SILENT_S,
         frame_s: float = FRAME_S,
     ) -> None:
         """Prepare the page.
@@ -123,13 +129,17 @@ class BenchServer:
         :param token: by default a random one.
         :param origins: origins of other pages that may use the endpoint of viewers.
         :param slow_s: a client that takes nothing for so long is dropped.
+        :param silent_s: a client that answers no ping for so long is dropped.
         :param frame_s: least time between two frames.
         :raises RecordingError: uPlot is not installed by the build.
+        :raises ConfigurationError: an origin is none.
         """
+        for origin in origins:
+            _check_origin(origin)
         self.session = session
         self.token = token or secrets.token_urlsafe(16)
         self._origins = frozenset(origins)
-        self._slow_s = slow_s
+        self._slow_s, self._silent_s = slow_s, silent_s
         self._frame_s = frame_s
         self._clients: list[_PageClient] = []
         self._open: dict[ServerConnection, bool] = {}
@@ -140,6 +150,8 @@ class BenchServer:
         self._server: Server | None = None
         self._hosts: frozenset[str] = frozenset()
         self._page = page()
+        self._work = asyncio.Lock()
+        """Held by the watcher that is being served."""
 
     @property
     def address(self) -> str:
@@ -165,7 +177,8 @@ class BenchServer:
                 max_size=MOST_MESSAGE_BYTES,
                 max_queue=4,
                 open_timeout=5,
-                close_timeout=2,
+                close_timeout=1,
+                ping_interval=None,  # such a ping would wait as long as a full buffer does
                 server_header=None,
                 create_connection=functools.partial(_Connection, noted=self._open),  # type: ignore[arg-type]
             )
@@ -195,6 +208,8 @@ class BenchServer:
         except ValueError:
             return connection.respond(HTTPStatus.BAD_REQUEST, "the address is malformed\n")
         refusal = self._refusal(url, request.headers)
+        if refusal is None and url.path == _FOXGLOVE and not _offers_subprotocol(request.headers):
+            refusal = HTTPStatus.BAD_REQUEST, f"the subprotocol {foxglove.SUBPROTOCOL} is needed\n"
         if refusal is not None:
             return connection.respond(*refusal)
         if url.path == "/":
@@ -224,14 +239,27 @@ class BenchServer:
 
     async def _serve_socket(self, socket: ServerConnection) -> None:
         path = "" if socket.request is None else urlsplit(socket.request.path).path
+        pinging = asyncio.create_task(self._drop_when_silent(socket))
+        pinging.add_done_callback(lambda _: socket.transport.abort())
         with contextlib.suppress(ConnectionClosed, TimeoutError):
             if path == _FOXGLOVE:
                 try:
-                    await foxglove.Viewer(socket, self.session, may_set=lambda: self._may_set(socket)).serve()
+                    viewer = foxglove.Viewer(
+                        socket, self.session, may_set=lambda: self._may_set(socket), work=self._share_work
+                    )
+                    await viewer.serve()
                 finally:
                     self._setter = None if self._setter is socket else self._setter
             else:
                 await self._serve_client(_PageClient(socket))
+
+    async def _drop_when_silent(self, socket: ServerConnection) -> None:
+        """Return once a client has not answered a ping for ``silent_s``, or has gone."""
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            while True:
+                await asyncio.sleep(PING_S)
+                async with asyncio.timeout(self._silent_s):
+                    await (await socket.ping())
 
     def _may_set(self, viewer: ServerConnection) -> bool:
         """True if a viewer may set parameters: it is the one that does."""
@@ -249,6 +277,8 @@ class BenchServer:
         try:
             async for message in client.socket:
                 await self._send(client, json.dumps(self._reply(client, message)))
+                if client is not self._driver:
+                    await asyncio.sleep(WATCHER_PAUSE_S)
         finally:
             sending.cancel()
             for error in await asyncio.gather(sending, return_exceptions=True):
@@ -291,6 +321,8 @@ class BenchServer:
                     raise ConfigurationError(f"no signal is called {signal!r}: there are {', '.join(known)}")
             client.screen.change(view)
         elif name == "drive":
+            if table:
+                raise ConfigurationError(f"drive: unknown key {next(iter(table))!r}")
             if self._driver not in (None, client):
                 raise ConfigurationError("another client drives")
             self._appoint(client)
@@ -306,8 +338,9 @@ class BenchServer:
             await self._send(client, json.dumps({"bench": bench_table(self.session)}))
             told_s, version = 0.0, -1
             while True:
-                due_s = time.monotonic() + self._frame_s
-                frame = client.screen.frame(self.session)
+                began_s = time.monotonic()
+                async with self._share_work() if client is not self._driver else contextlib.nullcontext():
+                    frame = client.screen.frame(self.session)
                 if frame is not None:
                     await self._send(client, frame)
                 is_due = self.session.is_playing and time.monotonic() - told_s >= STATE_S
@@ -316,12 +349,20 @@ class BenchServer:
                     told_s, version = time.monotonic(), self.session.version
                     await self._send(client, json.dumps({"state": self._state(client)}))
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(max(LEAST_PAUSE_S, due_s - time.monotonic())):
+                    async with asyncio.timeout(max(LEAST_PAUSE_S, began_s + self._frame_s - time.monotonic())):
                         await client.changed.wait()
         except ConnectionClosed:
             pass
         except TimeoutError:
             _log.info("a client accepts no data: dropped")
+
+    @contextlib.asynccontextmanager
+    async def _share_work(self) -> AsyncIterator[None]:
+        """Work for one watcher at a time; afterwards, nothing is done for any for as long as it has taken."""
+        async with self._work:
+            began_s = time.monotonic()
+            yield
+            await asyncio.sleep(time.monotonic() - began_s)
 
     def _state(self, client: _PageClient) -> dict[str, Any]:
         roles = {"drives": client is self._driver, "driven": self._driver is not None, "clients": len(self._clients)}
@@ -367,6 +408,21 @@ def _one(headers: Headers, name: str) -> str | None:
     """Value of a header; a text that nothing equals if it comes several times."""
     values = headers.get_all(name)
     return None if not values else values[0] if len(values) == 1 else "\0"
+
+
+def _check_origin(origin: str) -> None:
+    """:raises ConfigurationError: an origin is not a scheme and a host, as browsers send it."""
+    with contextlib.suppress(ValueError):
+        url = urlsplit(origin)
+        is_plain = origin.isascii() and origin.isprintable() and " " not in origin
+        if is_plain and url.scheme and url.netloc and origin == f"{url.scheme}://{url.netloc}":
+            return
+    raise ConfigurationError(f"origin {origin[:80]!r}: expected one such as http://localhost:8080, without a path")
+
+
+def _offers_subprotocol(headers: Headers) -> bool:
+    offered = ",".join(headers.get_all("Sec-WebSocket-Protocol"))
+    return foxglove.SUBPROTOCOL in map(str.strip, offered.split(","))
 
 
 def _select_subprotocol(socket: ServerConnection, offered: Any) -> Any:

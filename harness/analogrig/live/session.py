@@ -26,13 +26,15 @@ from analogrig.identity import Identity
 from analogrig.live import commands
 from analogrig.live.clock import LiveClock, WallClock
 from analogrig.live.commands import Command
-from analogrig.live.desk import CHANGE_N, SteppedDesk, open_desk
+from analogrig.live.desk import CHANGE_N, open_desk
+from analogrig.live.faults import LINE_LABELS
 from analogrig.live.notes import Notes
 from analogrig.live.rates import RateMeter
 from analogrig.live.ring import Ring
 from analogrig.live.take import MOST_RECORDED_N, Take, TakeBuilder
 from analogrig.plant import MAX_CHANGES
 from analogrig.rigs.emulator import emulator_errors
+from analogrig.rigs.recording import WRONG_SAMPLES
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
@@ -73,6 +75,8 @@ class Saved:
     scenario: Path
     samples: int
     alarms: int
+    false_alarms: int
+    """Alarms that no change explains; its scenario allows them."""
 
 
 class LiveSession:
@@ -299,7 +303,7 @@ class LiveSession:
     @property
     def injected(self) -> set[commands.Fault]:
         """Faults in force."""
-        return set(self.desk.injected) if isinstance(self.desk, SteppedDesk) else set()
+        return set(self.desk.injected)
 
     @property
     def _plays(self) -> bool:
@@ -316,25 +320,32 @@ class LiveSession:
 
     def _lengths(self) -> Iterator[int]:
         """Lengths of the blocks, each when it is due; ends with the take."""
+        demanded = 0  # samples whose answers were demanded
         while True:
             self._apply_commands()
             if self._ends_take or self._is_closed:
-                return
-            if self._steps:
+                if not (self.take.is_recorded and self.desk.is_turning):
+                    return
+                length = MOST_BLOCK_N  # at once: a scenario holds whole ramps
+            elif self._steps:
                 length = min(self._steps, MOST_BLOCK_N)
                 self._steps -= length
                 self._pace = None
             elif not self.is_playing:
-                self._wait(None)
+                if max(self.ring.end, demanded) < self._taken:
+                    demanded = self._taken
+                    yield 0
+                else:
+                    self._wait(None)
                 continue
             else:
                 length = self._paced_length()
                 if not length:
                     continue
-            if self.take.is_recorded and self._taken + length > MOST_RECORDED_N:
+            if self.take.is_recorded and not self._ends_take and self._taken + length > MOST_RECORDED_N:
                 self.notify(f"the recording has reached its limit of {MOST_RECORDED_N} samples")
                 self.is_recording, self._ends_take = False, True
-                return
+                continue
             self._taken += length
             yield length
 
@@ -392,8 +403,8 @@ class LiveSession:
                 if isinstance(command, commands.Turn):
                     self._end_turns({command.name: self._turns[command.name]}, {})
             self.version += 1
-        if isinstance(self.desk, SteppedDesk):
-            self._turn_pots(self.desk)
+        if self.desk.is_stepped and not self._ends_take:
+            self._turn_pots()
 
     def _apply(self, command: Command) -> None:
         match command:
@@ -418,34 +429,38 @@ class LiveSession:
                 self.is_recording = command.on
             case commands.Spoil() | commands.Mend():
                 self._alter_line(command)
-            case _ if isinstance(self.desk, SteppedDesk):
-                self._operate(self.desk, command)
+            case _:
+                self._operate(command)
 
     def _alter_line(self, command: commands.Spoil | commands.Mend) -> None:
         if isinstance(command, commands.Spoil):
             self._spoils.append(command)
         elif self.device.faulty_line is not None:
             self.device.faulty_line.mend()
+            self.notify("the line is mended" if self.is_playing else "the line is mended: press Run")
 
-    def _operate(self, desk: SteppedDesk, command: Command) -> None:
+    def _operate(self, command: Command) -> None:
         """Apply a command that only an emulated computer has."""
         match command:
             case commands.Operate():
-                desk.switch(command.mode)
+                self.desk.switch(command.mode)
             case commands.Inject():
-                desk.inject(command.fault, on=command.on)
-                if command.on:
-                    self._note_fault(command.fault)
+                self.desk.inject(command.fault, on=command.on)
+                self._note_fault(command.fault)
             case commands.ClearLamps():
-                desk.clear_lamps()
-        self.mode, self.lamps = desk.mode, tuple(desk.lamps)
+                self.desk.clear_lamps()
+        self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
 
     def _note_fault(self, fault: commands.Fault) -> None:
-        self.take.add_caveat(f"{self.desk.faults[fault]}: injected by hand at sample {self._taken}")
+        """Note that a fault of a channel begins, or ends."""
+        label = self.desk.faults[fault]
+        self.notes.disturb(self._taken, label, lasts=fault in self.injected)
+        if fault in self.injected:
+            self.take.add_caveat(f"{WRONG_SAMPLES}{label}, injected by hand at sample {self._taken}")
 
-    def _turn_pots(self, desk: SteppedDesk) -> None:
+    def _turn_pots(self) -> None:
         """Turn the pots that the hand has turned, unless one is still turning."""
-        if not self._turns or desk.is_turning:
+        if not self._turns or self.desk.is_turning:
             return
         if self.take.is_recorded and len(self.take.changes) >= MAX_CHANGES:
             self.notify(f"the recording has reached its limit of {MAX_CHANGES} changes")
@@ -461,7 +476,7 @@ class LiveSession:
         ramp_n = ramp_n if is_fresh else 0
         try:
             if values:
-                desk.turn(self.values | values, values, sample, ramp_n)
+                self.desk.turn(self.values | values, values, sample, ramp_n)
                 self.take.change(sample, values, ramp_n)
                 self._await_turns(sample + 1, [ramped[name] for name in values])
                 self.version += 1
@@ -491,9 +506,10 @@ class LiveSession:
         if self.device.faulty_line is not None:
             for each in spoils:
                 self.device.faulty_line.inject(each.kind, each.direction)
-                self.take.add_caveat(
-                    f"line fault {each.kind}, {each.direction} the device: injected by hand at sample {self.ring.end}"
-                )
+                what = f"line fault {each.kind}, {each.direction} the device"
+                self.take.add_caveat(f"{what}: injected by hand at sample {self.ring.end}")
+                self.notes.disturb(self.ring.end, what, lasts=False)
+                self.notify(f"{LINE_LABELS[each.kind]}, {each.direction} the device: at sample {self.ring.end}")
 
     def _watch(self, block: Block, answers: Answers) -> None:
         """Take note of an answered block."""
@@ -525,9 +541,17 @@ class LiveSession:
         except (AnalogrigError, OSError) as error:
             self.notify(f"the recording could not be saved: {error}")
             return
-        saved = Saved(self._file(number, "npz"), self._file(number, "toml"), run.samples, len(run.alarm_index))
+        saved = Saved(
+            self._file(number, "npz"),
+            self._file(number, "toml"),
+            concluded.samples,
+            len(concluded.alarm_index),
+            self.take.false_alarms(concluded),
+        )
         self.saved.append(saved)
         held = f"{number_of(run.samples, 'sample', form=',')}, {number_of(saved.alarms, 'alarm')}"
+        if saved.false_alarms:
+            held += f", {saved.false_alarms} of them without a change: allowed in the scenario"
         self.notify(f"saved {saved.run}: {held}; scenario: {saved.scenario}")
 
     def _reserve_number(self) -> int:
@@ -543,7 +567,7 @@ class LiveSession:
         raise AssertionError
 
     def _file(self, number: int, suffix: str) -> Path:
-        return self._folder / f"take-{number}.{suffix}"
+        return self._folder / f"recording-{number}.{suffix}"
 
     def _stop_after(self, reason: str) -> None:
         """Pause after a failure."""
@@ -564,3 +588,4 @@ class LiveSession:
             self._stop_after(str(error))
         else:
             self._has_failed = False
+            self.notify("the device runs again")

@@ -9,13 +9,19 @@ from dataclasses import dataclass, field
 from analogrig.answers import Answers
 from analogrig.bench import RunBuilder
 from analogrig.datasheet import Datasheet
+from analogrig.judging.verdict import alarms_of_change
 from analogrig.plant import MAX_CHANGES, Segment
 from analogrig.rigs.rig import Block
 from analogrig.run import Run
-from analogrig.scenario import PotChange, Scenario, segments_of
+from analogrig.scenario import MAX_RAMP_N, PotChange, Scenario, segments_of
 
 MOST_RECORDED_N = 2_000_000
 """Samples of the longest recording: 100 s at 20,000 samples/s, 80 MB."""
+
+_MOST_ENDING_N = MAX_RAMP_N + 1024
+"""Samples that the end of the last ramp may add."""
+_MOST_TOLD = 5
+"""Changes that the description of a recording names."""
 
 MOST_KEPT_CHANGES = 50
 """Changes that a take keeps if it is not recorded: bounds are looked for after the last ones only."""
@@ -55,21 +61,34 @@ class Take:
         """True plant from the start and after each change."""
         return segments_of(self.scenario.plant, self.changes)
 
-    def played(self, samples: int) -> Scenario:
-        """Scenario that plays this take again: the first ``samples``, with the changes among them."""
-        changes = [change for change in self.changes if change.sample < samples]
-        if changes:
-            left_n = samples - changes[-1].sample
-            changes[-1] = dataclasses.replace(changes[-1], ramp_n=min(changes[-1].ramp_n, left_n))
-        return dataclasses.replace(self.scenario, samples=samples, tweaks=tuple(changes))
+    def false_alarms(self, run: Run) -> int:
+        """Number of alarms of its run that no change explains."""
+        alarms, segments = run.alarm_index.tolist(), self.segments()[1:]
+        ends = [*(segment.start for segment in segments[1:]), run.samples]
+        explained = [
+            alarms_of_change([k for k in alarms if segment.start < k <= end], segment.start + segment.ramp_n)
+            for segment, end in zip(segments, ends, strict=bool(segments))
+        ]
+        return len(set(alarms).difference(*explained))
+
+    def played(self, run: Run) -> Scenario:
+        """Scenario that plays this take again, and allows the false alarms that were seen."""
+        changes = tuple(change for change in self.changes if change.sample < run.samples)
+        told = [f"{name} to {value:.6g} at {each.sample}" for each in changes for name, value in each.set.items()]
+        more = f" and {len(told) - _MOST_TOLD} more" if len(told) > _MOST_TOLD else ""
+        expect = self.scenario.expect
+        return dataclasses.replace(
+            self.scenario,
+            samples=run.samples,
+            tweaks=changes,
+            expect=dataclasses.replace(expect, false_alarms=max(expect.false_alarms, self.false_alarms(run))),
+            name="by hand",
+            description=f"Recorded by hand: {', '.join(told[:_MOST_TOLD]) or 'no change'}{more}.",
+        )
 
     def concluded(self, run: Run) -> Run:
         """Run with the scenario that was played by hand, instead of the endless one."""
-        scenario = self.played(run.samples)
-        if scenario.tweaks and scenario.tweaks[-1].ramp_n < next(
-            change.ramp_n for change in self.changes if change.sample == scenario.tweaks[-1].sample
-        ):
-            self.add_caveat("the recording ends while a pot turns: its scenario turns the pot faster")
+        scenario = self.played(run)
         conditions = dataclasses.replace(
             run.conditions,
             samples_asked=run.samples,
@@ -84,7 +103,7 @@ class TakeBuilder(RunBuilder):
     """Collector of a take: passes every block on, and keeps the samples only of a take that is recorded."""
 
     def __init__(self, channels: int, sheet: Datasheet, watch: Watch, *, keeps: bool) -> None:
-        super().__init__(MOST_RECORDED_N if keeps else 0, channels, sheet)
+        super().__init__(MOST_RECORDED_N + _MOST_ENDING_N if keeps else 0, channels, sheet)
         self._keeps = keeps
         self._watch = watch
 

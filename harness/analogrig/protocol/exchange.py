@@ -140,6 +140,8 @@ class Exchange:
                 self._enter(
                     block.first, list(zip(block.u.tolist(), block.y.tolist(), block.valid.tolist(), strict=True))
                 )
+                if not len(block):
+                    self._collect(0)
                 while waiting and len(self._rows.flags) >= waiting[0][0]:
                     yield self._rows.take(*waiting.popleft())
             self._collect(0)

@@ -14,6 +14,8 @@ _SMALL = 9
 """Side of a square of a map that has too many of them for numbers."""
 _LEAST_WIDTH, _LEAST_HEIGHT = 230, 150
 """Room for the titles of the axes of a small map."""
+_LETTER = 7
+"""Room for a letter of a title."""
 _STEPS = 5
 
 
@@ -40,7 +42,7 @@ def legend(name: str, most: float, form: str) -> str:
     if not most:
         return f'<p class="legend">{text(name)}: {most:{form}} in all cells.</p>'
     swatches = [
-        f'<rect x="{60 * i + 1}" y="1" width="60" height="16" {_fill(i / (_STEPS - 1))}/>'
+        f'<rect x="{60 * i + 1}" y="1" width="60" height="16" stroke="var(--line)" {_fill(i / (_STEPS - 1))}/>'
         + words(60 * i + 31, 32, format(most * i / (_STEPS - 1), form))
         for i in range(_STEPS)
     ]
@@ -66,14 +68,18 @@ def heat_map(caption: str, axes: Sequence[str], squares: Squares, most: float, *
     across, down = (_ticked(each, with_numbers=with_numbers) for each in (columns, rows))
     parts = [words(_LEFT + (i + 0.5) * width, _TOP - 8, name) for i, name in across]
     parts += [words(_LEFT - 8, _TOP + (j + 0.5) * height + 4, name, "end") for j, name in down]
-    parts.append(words(max(_LEFT, (_LEFT + right) / 2 - 60), 14, axes[0], "start", is_faint=True))
+    title_x = max(_LEFT, (_LEFT + right) / 2 - 60)
+    parts.append(words(title_x, 14, axes[0], "start", is_faint=True))
     if axes[1]:
         parts.append(upright(14, max((_TOP + bottom) / 2, _LEAST_HEIGHT / 2), axes[1]))
     for (i, column), (j, row) in itertools.product(enumerate(columns), enumerate(rows)):
         draw = _large if with_numbers else _small
         parts.append(draw(_LEFT + i * width, _TOP + j * height, squares[column, row], most))
     described = f"{caption}; across: {axes[0]}{f', down: {axes[1]}' if axes[1] else ''}"
-    size = max(right + 2, _LEAST_WIDTH), max(bottom + 2, _LEAST_HEIGHT if axes[1] else 0)
+    size = (
+        max(right + 2, _LEAST_WIDTH, title_x + _LETTER * len(axes[0])),
+        max(bottom + 2, _LEAST_HEIGHT if axes[1] else 0),
+    )
     return figure(caption, described, *size, parts, has_links=any(each.link for each in squares.values()))
 
 

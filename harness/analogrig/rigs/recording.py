@@ -17,6 +17,9 @@ from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.trust import FiledName
 
+WRONG_SAMPLES = "wrong samples: "
+"""Start of the fault of a run whose samples are wrong. A replay of them has this fault too."""
+
 
 @dataclass(frozen=True)
 class RecordingDescription(RigDescription):
@@ -79,7 +82,11 @@ class RecordingRig(Rig):
             conditions.time_scale,
             conditions.channels,
             self._blocks(),
-            hindsight=lambda: Hindsight(conditions.segments, conditions.overloads),
+            hindsight=lambda: Hindsight(
+                conditions.segments,
+                conditions.overloads,
+                tuple(fault for fault in conditions.faults if fault.startswith(WRONG_SAMPLES)),
+            ),
         )
 
     def _blocks(self) -> Iterator[Block]:

@@ -120,10 +120,11 @@ class LiveBench:
         device: Callable[[], Device] = lambda: describe("inproc").direct(),
         scenario: str | Scenario = "thesis",
         slow_s: float = 10.0,
+        silent_s: float = 600.0,
     ) -> None:
         self._folder, self._device = folder, device
         self._scenario = Scenario.load(scenario) if isinstance(scenario, str) else scenario
-        self._settings: dict[str, Any] = {"token": token, "slow_s": slow_s, "frame_s": 0.1}
+        self._settings: dict[str, Any] = {"token": token, "slow_s": slow_s, "silent_s": silent_s, "frame_s": 0.1}
         self._port = port
         self._ready: Future[BenchServer] = Future()
         self._stop: asyncio.Event | None = None

@@ -40,7 +40,7 @@ def kill_browsers(kills: int, seed: int) -> None:
             url = json.loads(bench.stdout.readline())["address"]
             for number in range(1, kills + 1):
                 record_until_killed(playwright.chromium, url, 1000.0 * draw.random())
-                name = f"take-{number}.npz"
+                name = f"recording-{number}.npz"
                 with open_page(url) as socket:
                     state = state_with(socket, name)
                     assert not state["generator"]["on"]

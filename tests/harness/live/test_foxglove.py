@@ -30,7 +30,7 @@ def bench(tmp_path: Path) -> Iterator[BenchServer]:
 
 def open_viewer(bench: BenchServer) -> Any:
     """Connection of a viewer outside a browser: it has no origin."""
-    return open_client(bench, "/foxglove", origin=None, subprotocols=[SUBPROTOCOL])
+    return open_client(bench, "/foxglove", origin=None)
 
 
 async def text(socket: ClientConnection, operation: str) -> dict[str, Any]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import socket
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Awaitable, Callable, Iterator
@@ -20,6 +22,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.http11 import USER_AGENT
 
 from analogrig.errors import ConfigurationError
+from analogrig.live.foxglove import SUBPROTOCOL
 from analogrig.live.scope import unpacked
 from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from analogrig.run import Run
@@ -77,6 +80,7 @@ class Client:
 def open_client(server: BenchServer, path: str = "/live", **more: Any) -> Any:
     """Connection to an endpoint, with the token and the origin of the page unless ``more`` has others."""
     token = more.pop("token", server.token)
+    more.setdefault("subprotocols", [SUBPROTOCOL] if path == "/foxglove" else None)
     more.setdefault("origin", f"http://{host_of(server)}")
     if "named" in more:  # the host of the URL, as a browser that was led here by another name sends it
         address, _, port = host_of(server).rpartition(":")
@@ -134,6 +138,22 @@ def test_socket_needs_token_host_and_origin(bench: BenchServer, path: str, wrong
     assert not bench._clients
 
 
+def test_endpoint_of_viewers_needs_their_subprotocol(bench: BenchServer) -> None:
+    async def work() -> int:
+        with pytest.raises(InvalidStatus) as refused:
+            async with open_client(bench, "/foxglove", subprotocols=None):
+                pass
+        return int(refused.value.response.status_code)
+
+    assert played(work) == 400
+
+
+@pytest.mark.parametrize("origin", ["", "junk", "http://", "http://a/path", "http://a b", "//a"])
+def test_origin_that_no_browser_sends_is_refused(bench: BenchServer, origin: str) -> None:
+    with pytest.raises(ConfigurationError, match="expected one such as"):
+        BenchServer(bench.session, origins=[origin])
+
+
 def test_endpoint_of_the_page_needs_an_origin(bench: BenchServer) -> None:
     async def work() -> None:
         with pytest.raises(InvalidStatus):
@@ -150,6 +170,7 @@ def test_first_client_drives_and_others_watch(bench: BenchServer) -> None:
             assert await driver.ask("turn", name="K", value=18000.0) == ""
             assert "watches" in await watcher.ask("turn", name="K", value=20000.0)
             assert "another client drives" in await watcher.ask("drive")
+            assert "unknown key 'fast'" in await watcher.ask("drive", fast=True)
             assert await watcher.ask("view", signals=["U1"], trigger=TRIGGER, samples=100) == ""
             state = await watcher.until(lambda state: state["values"]["K"] == 18000.0)
             assert not state["drives"]
@@ -255,6 +276,36 @@ def test_client_that_takes_nothing_is_dropped_and_holds_up_nobody(tmp_path: Path
 
     with LiveBench(tmp_path, slow_s=0.5) as bench:
         played(lambda: work(bench))
+
+
+def test_driver_that_answers_no_ping_is_gone_and_the_generator_off(tmp_path: Path) -> None:
+    async def work(bench: BenchServer) -> None:
+        frozen = await open_client(bench).__aenter__()
+        frozen.transport.pause_reading()
+        async with open_client(bench) as second:
+            client = Client(second)
+            await client.until(lambda state: not state["driven"] and not state["generator"]["on"])
+        frozen.transport.abort()
+
+    with LiveBench(tmp_path, silent_s=0.5) as bench:
+        played(lambda: work(bench))
+
+
+def test_work_for_watchers_leaves_as_much_time_for_the_driver(bench: BenchServer) -> None:
+    spans_s: list[tuple[float, float]] = []
+
+    async def work() -> None:
+        async with bench._share_work():
+            began_s = time.monotonic()
+            sum(range(100_000))
+            spans_s.append((began_s, time.monotonic()))
+
+    async def work_at_once() -> None:
+        await asyncio.gather(*(work() for _ in range(4)))
+
+    played(work_at_once)
+    for (began_s, ended_s), (next_s, _) in itertools.pairwise(spans_s):
+        assert next_s - ended_s >= 0.9 * (ended_s - began_s)  # the clock of the loop is coarser
 
 
 def test_newcomers_are_turned_away_when_all_places_are_taken(bench: BenchServer) -> None:

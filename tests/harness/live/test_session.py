@@ -17,6 +17,7 @@ from analogrig.catalogue import BLOCK_SAMPLES
 from analogrig.cli.bench import NO_FAULTS
 from analogrig.devices.opening import open_dut
 from analogrig.errors import ConfigurationError, RigError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
 from analogrig.links.faulty_bus import FaultyBus
 from analogrig.links.wire_faults import FaultyLine, FaultyWire
@@ -38,7 +39,7 @@ from analogrig.live.commands import (
 )
 from analogrig.live.desk import SteppedDesk
 from analogrig.live.faults import LINE_LABELS
-from analogrig.live.panel import state_table
+from analogrig.live.panel import bench_table, state_table
 from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
 from analogrig.live.session import BLOCK_S, LiveSession
 from analogrig.live.take import MOST_KEPT_CHANGES, Take
@@ -48,6 +49,7 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import SuspensionComputer
+from tests import tools
 from tests.harness.live.benches import SEED, Action, RecordsRig, linked, scripted_session
 
 RATE_HZ = 20_000
@@ -117,6 +119,20 @@ def test_alarm_of_any_program_has_the_latency_and_the_bound_of_its_recording(pro
     alarm = next(alarm for alarm in session.notes.alarms if alarm.what)
     (tweak,) = judge(Run.load(session.saved[0].run)).tweaks
     assert (alarm.what, alarm.latency_n, alarm.bound_n) == (name, tweak.latency_n, tweak.bound_n)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((tools.ROOT / "fixtures" / "programs").glob("*.toml")), ids=lambda path: path.stem
+)
+def test_every_shipped_program_has_knobs_signals_and_a_patch(path: Path, tmp_path: Path) -> None:
+    scenario = Scenario.of_program(Program.load(path.stem))
+    session = scripted_session(((0.02, SetPlaying(on=False)),), tmp_path, scenario=scenario)
+    table = json.loads(json.dumps([bench_table(session), state_table(session)], allow_nan=False))[0]
+    assert len(table["knobs"]) == len(session.knobs) > 0
+    assert len(table["patch"]) == len(session.desk.amplifiers) > 0
+    screen = Screen()
+    screen.change(View(tuple(signals_of(session))[:16], Trigger(table["signals"][0]["id"])))
+    assert screen.frame(session) is not None
 
 
 def test_digital_pots_that_show_two_parameters_follow_both(tmp_path: Path) -> None:
@@ -194,6 +210,40 @@ def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) 
         ((0.0, SetPlaying(on=False)), (1.0, note), (2.0, Step(1)), (3.0, note), (4.0, Step(7)), (5.0, note)), tmp_path
     )
     assert ends == [0, 1, 8]
+
+
+@pytest.mark.parametrize("dut", ["inproc", "inproc?exchange=block", "host"])
+def test_step_shows_its_own_samples(dut: str, tmp_path: Path) -> None:
+    ends: list[int] = []
+    steps = ((0.2 + 0.1 * k, Step(10)) for k in range(3))
+    notes = ((0.25 + 0.1 * k, lambda session: ends.append(session.ring.end)) for k in range(3))
+    script: list[tuple[float, Action]] = [(0.01, SetPlaying(on=False)), *steps, *notes]
+    script.sort(key=lambda each: each[0])
+    session = scripted_session(script, tmp_path, dut=open_dut(dut))
+    assert np.diff(ends).tolist() == [10, 10]
+    assert session.ring.end == session._taken
+
+
+def test_false_alarms_that_were_seen_are_allowed_in_the_scenario(tmp_path: Path) -> None:
+    estimator = EstimatorConfig(orders="program", arl0=3.0)
+    script = ((0.0, SetRecording(on=True)), (0.1, Turn("K", 18000.0)), (0.2, SetRecording(on=False)))
+    session = scripted_session(script, tmp_path, dut=open_dut("inproc", estimator=estimator))
+    (saved,) = session.saved
+    assert saved.alarms > saved.false_alarms > 0
+    notice = session.notices[0][1]
+    assert f"{saved.false_alarms} of them without a change: allowed in the scenario" in notice
+    scenario = Scenario.load(str(saved.scenario))
+    assert scenario.expect.false_alarms == saved.false_alarms == len(judge(Run.load(saved.run)).false_alarms)
+    assert scenario.description.startswith("Recorded by hand: K to 18000 at ")
+    assert cli.main(["replay", str(saved.run), "--out", str(tmp_path / "again")]) == 0
+
+
+def test_alarm_names_the_injected_fault_unless_a_change_explains_it(tmp_path: Path) -> None:
+    stuck = (0.1, Inject("stuck", on=True)), (0.15, Inject("stuck", on=False))
+    session = scripted_session((*stuck, (0.5, SetPlaying(on=False))), tmp_path)
+    faults = {alarm.fault for alarm in session.notes.alarms}
+    assert faults == {"channel displacement stuck"}
+    assert not any(alarm.what for alarm in session.notes.alarms)
 
 
 def test_amplifiers_are_shown_with_the_block_of_their_channels(tmp_path: Path) -> None:
@@ -291,8 +341,9 @@ def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path
     (saved,) = scripted_session(script, tmp_path).saved
     run = Run.load(saved.run)
     assert np.unique(run.codes[2500:, 1]).size <= 12  # the noise of the card alone
-    assert "channel displacement stuck: injected by hand at sample 1750" in run.conditions.faults
-    assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
+    assert "wrong samples: channel displacement stuck, injected by hand at sample 1750" in run.conditions.faults
+    for command in ("judge", "replay"):
+        assert cli.main([command, str(saved.run), "--out", str(tmp_path / command)]) == 3
 
 
 @pytest.mark.parametrize(
@@ -407,20 +458,25 @@ def test_lasting_line_fault_from_before_the_recording_makes_it_inconclusive(tmp_
     assert "line fault babble: injected by hand before the recording" in Run.load(saved.run).conditions.faults
 
 
-def test_recording_that_ends_within_a_ramp_is_inconclusive(tmp_path: Path) -> None:
-    script = ((0.0, SetRecording(on=True)), (0.05, Turn("K", 18000.0, 2000)), (0.1, SetRecording(on=False)))
-    (saved,) = scripted_session(script, tmp_path).saved
-    assert any("while a pot turns" in fault for fault in Run.load(saved.run).conditions.faults)
-    assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
+def test_recording_that_is_ended_within_a_ramp_holds_it_whole_and_plays_again(tmp_path: Path) -> None:
+    ramp = Turn("K", 18000.0, 500)
+    script = ((0.0, SetRecording(on=True)), (0.05, ramp), (0.06, SetPlaying(on=False)), (0.1, SetRecording(on=False)))
+    (saved,) = scripted_session(script, tmp_path, dut=linked()).saved
+    by_hand = Run.load(saved.run)
+    assert by_hand.samples > 1499  # the turn acts after 999
+    assert not by_hand.conditions.faults
+    with open_rig("emulator") as rig:
+        blocks = rig.perform(Scenario.load(str(saved.scenario)), SEED).blocks
+        np.testing.assert_array_equal(np.concatenate([block.codes for block in blocks]), by_hand.codes)
 
 
 def test_recording_takes_no_number_that_another_file_has(tmp_path: Path) -> None:
-    (tmp_path / "take-1.toml").write_text("mine")
-    (tmp_path / "take-2.npz").write_text("mine")
+    (tmp_path / "recording-1.toml").write_text("mine")
+    (tmp_path / "recording-2.npz").write_text("mine")
     script = ((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False)))
     (saved,) = scripted_session(script, tmp_path).saved
-    assert saved.scenario.name == "take-3.toml"
-    assert (tmp_path / "take-1.toml").read_text() == "mine"
+    assert saved.scenario.name == "recording-3.toml"
+    assert (tmp_path / "recording-1.toml").read_text() == "mine"
 
 
 def test_recording_that_cannot_be_saved_is_named_and_ends_nothing(
@@ -455,8 +511,12 @@ def test_cut_line_stops_the_session_until_it_is_mended(tmp_path: Path) -> None:
     assert [playing for playing, _ in ends] == [False, False, True]
     assert ends[2][1] > 1000
     notices = [text for _, text in session.notices]
-    assert len(notices) == 2  # one for each attempt
-    assert all("the line is cut" in text for text in notices)
+    assert [text for text in notices if "stopped" not in text] == [
+        "line cut, from the device: at sample 750",
+        "the line is mended: press Run",
+        "the device runs again",
+    ]
+    assert sum("the line is cut" in text for text in notices) == 2  # one for each attempt
 
 
 @pytest.mark.parametrize("kind", FaultyWire.KINDS)

@@ -5,10 +5,13 @@
   const BASES_S = [0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2];
   const DIVISIONS = 5; // above and below the middle
   const SCALES = [1, 2, 2.5, 5];
+  const SPECTRUM = { per: 20, middle: -60 }; // dB
   const WIDTH = 1; // of curves: wider ones take three times as long to draw without a graphics processor
   const KEPT = 12; // frames of the persistence
   const RETRY_MS = 500;
   const HAND_MS = 40; // time between two messages of a hand that turns a pot
+  const RAMP_N = 16; // samples of its ramps: each takes the emulator as long as fifty of a pot that stands still
+  const BEHIND_MS = 3000; // time for which the page warns that the bench has fallen behind real time
   const SVG = "http://www.w3.org/2000/svg";
   const $ = (id) => document.getElementById(id);
   const ink = plotting.inks();
@@ -23,8 +26,11 @@
   let shown = [];
   let current = "";
   const scales = new Map(); // of each signal: volts per division, and volts at the middle
-  let plot = null;
+  let plot = null; // axes and grid, drawn when they change; the curves are drawn above it
   let plotKey = "";
+  let size = { width: 800, height: 420 }; // of the screen: asking the page for it would lay it out anew
+  let known = {}; // last measures of each signal
+  let behind = { samples: 0, until: 0 };
   let kept = [];
   let arm = 0;
   let level = 0; // of the trigger, in volts or in the device's own numbers
@@ -44,6 +50,7 @@
     socket.onmessage = ({ data }) => (typeof data === "string" ? told(JSON.parse(data)) : drawn(data));
     socket.onclose = () => {
       document.documentElement.removeAttribute("data-connected");
+      leave();
       complain("The bench does not answer. Trying again; if it was started anew, open the address that it prints.");
       setTimeout(connect, RETRY_MS);
     };
@@ -58,6 +65,7 @@
     if (message.bench) {
       views.clear();
       bench = message.bench;
+      behind = { samples: Infinity, until: 0 };
       complain("");
       build();
       look();
@@ -141,7 +149,7 @@
     if (!$("source").value) level = bench.level;
     const base = $("base").value;
     $("base").replaceChildren();
-    for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")} per division`);
+    for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")}/div`);
     $("base").value = base || "0.02";
     const source = $("source").value;
     $("source").replaceChildren();
@@ -237,8 +245,8 @@
       head.append(swatch, name, " ", remove);
       row.append(head);
       row.setAttribute("aria-current", String(id === current));
-      cell(row, "").append(field(id, "per", `${label}: per division`), ` ${unitOf(id)}`);
-      cell(row, "").append(field(id, "middle", `${label}: at the middle`), ` ${unitOf(id)}`);
+      cell(row, "").append(field(id, "per", `${label}: per division`));
+      cell(row, "").append(field(id, "middle", `${label}: at the middle`));
       for (let i = 0; i < 6; i++) cell(row, "–", "number");
     }
     $("add").replaceChildren();
@@ -270,7 +278,7 @@
       if (shown.length === 1) return;
       shown = shown.filter((each) => each !== id);
     } else {
-      shown = [...shown, id].slice(-16);
+      shown = [...shown, id].slice(-bench.limits.signals);
     }
     if (!shown.includes(current)) [current] = shown;
     buildSignals();
@@ -302,7 +310,8 @@
       this.input.step = "any";
       title.append(`${name}${unit ? `, ${unit}` : ""}`, this.input);
       const limits = document.createElement("small");
-      limits.textContent = `${short(knob.low, 3)} to ${short(knob.high, 3)}, pot ${pots.join(", ")}`;
+      const shownBy = pots.join(", ");
+      limits.textContent = `${short(knob.low, 3)} to ${short(knob.high, 3)}${shownBy === name ? "" : `, pot ${shownBy}`}`;
       this.element.append(this.slider, title, limits);
       this.slider.onkeydown = (event) => this.key(event);
       this.slider.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
@@ -310,7 +319,7 @@
       this.input.onchange = () => {
         const value = Number(this.input.value);
         if (this.input.value !== "" && Number.isFinite(value)) this.turn(value);
-        else this.show(this.value);
+        else this.input.value = short(this.value, 6);
       };
     }
 
@@ -319,7 +328,8 @@
     }
 
     show(value) {
-      this.value = value;
+      if (value === this.shown) return;
+      this.value = this.shown = value;
       const { unit, name } = this.knob;
       this.slider.setAttribute("aria-valuenow", String(value));
       this.slider.setAttribute("aria-valuetext", `${name} ${short(value, 5)} ${unit}`.trimEnd());
@@ -338,6 +348,11 @@
 
     answered(turn) {
       if (turn === this.awaited) this.awaited = 0;
+    }
+
+    disable(on) {
+      this.input.disabled = on;
+      this.slider.setAttribute("aria-disabled", String(on));
     }
 
     get isDisabled() {
@@ -360,7 +375,7 @@
       this.turn(this.value * 1.01 ** (event.deltaY < 0 ? 1 : -1));
     }
 
-    // A ramp lasts until the next message of the hand, so that the pot follows it evenly.
+    // A ramp lasts until the next message of the hand, unless the emulator would fall behind.
     grasp(event) {
       if (this.isDisabled) return;
       this.held = true;
@@ -374,8 +389,8 @@
         this.show(value);
         if (last || performance.now() - sent >= HAND_MS) {
           sent = performance.now();
-          const ramp = bench.stepped && state ? Math.round((state.rate / state.factor) * (HAND_MS / 1000)) : 0;
-          this.turn(value, Math.min(ramp, 100000));
+          const ramp = bench.stepped && state ? Math.round((bench.rate / state.factor) * (HAND_MS / 1000)) : 0;
+          this.turn(value, Math.min(ramp, RAMP_N));
         }
       };
       this.slider.onpointermove = (moved) => moved.clientY !== y && move(moved);
@@ -446,26 +461,34 @@
 
   // ---- the state
 
+  function leave() {
+    put($("role"), "The bench is not connected.");
+    $("drive").hidden = true;
+    document.documentElement.dataset.role = "watches";
+    for (const each of operated) each.disabled = true;
+    for (const knob of knobs.values()) knob.disable(true);
+  }
+
   function show() {
     if (!bench) return;
     const drives = state.drives;
-    $("role").textContent = drives
-      ? `This page drives the bench.${state.generator.on ? "" : " The generator is off: switch it on."}`
-      : state.driven
-        ? "This page watches: another one drives."
-        : "Nobody drives the bench.";
+    const off = state.generator.on ? "" : " The generator is off: switch it on.";
+    const watches = state.driven ? "This page watches: another one drives." : "Nobody drives the bench.";
+    put($("role"), drives ? `This page drives the bench.${off}` : watches);
+    const now = performance.now();
+    behind = { samples: state.overruns, until: state.overruns > behind.samples ? now + BEHIND_MS : behind.until };
+    $("behind").hidden = now > behind.until;
     $("drive").hidden = state.driven;
     document.documentElement.dataset.role = drives ? "drives" : "watches";
     for (const each of operated) each.disabled = !drives;
     if (!bench.stepped) $("tempo").disabled = true;
-    pressed("play", state.playing, state.playing ? "Pause" : "Run");
-    pressed("record", state.recording, state.recording ? "End the recording" : "Record");
-    pressed("generator-on", state.generator.on, state.generator.on ? "Switch off" : "Switch on");
+    pressed($("play"), state.playing, state.playing ? "Pause" : "Run");
+    pressed($("record"), state.recording, state.recording ? "End the recording" : "Record");
+    pressed($("generator-on"), state.generator.on, state.generator.on ? "Switch off" : "Switch on");
     if (document.activeElement !== $("tempo")) $("tempo").value = String(state.factor);
     put($("clock"), `take ${state.take}, ${withPrefix(state.samples / state.rate, "s")}, ${state.samples} samples`);
     for (const [name, knob] of knobs) {
-      knob.input.disabled = !drives;
-      knob.slider.setAttribute("aria-disabled", String(!drives));
+      knob.disable(!drives);
       if (!knob.held && !knob.awaited && state.values[name] !== undefined) knob.show(state.values[name]);
     }
     for (const each of settings) {
@@ -474,7 +497,10 @@
       if (each.dataset.key === "duty") each.disabled ||= state.generator.shape !== "pulse";
     }
     for (const each of $("modes").children) each.setAttribute("aria-pressed", String(each.dataset.mode === state.mode));
-    for (const each of $("faults").children) each.setAttribute("aria-pressed", String(state.faults.includes(each.dataset.fault)));
+    for (const each of $("faults").children) {
+      const on = state.faults.includes(each.dataset.fault);
+      pressed(each, on, `${bench.faults[each.dataset.fault]}${on ? ": on" : ""}`);
+    }
     put($("line-faults"), state.line_faults.length ? `in force: ${state.line_faults.join(", ")}` : "");
     put($("lamps"), state.lamps.length ? state.lamps.join(", ") : "none");
     $("lamps").classList.toggle("lit", state.lamps.length > 0);
@@ -488,9 +514,9 @@
     list($("notices"), [...notices, ...files.map((text) => `to play it again: ${text}`)]);
   }
 
-  function pressed(id, on, text) {
-    $(id).setAttribute("aria-pressed", String(on));
-    put($(id), text);
+  function pressed(button, on, text) {
+    button.setAttribute("aria-pressed", String(on));
+    put(button, text);
   }
 
   function list(parent, texts) {
@@ -503,14 +529,12 @@
   function showDevice() {
     const alarms = [...state.alarms].reverse();
     const [last] = alarms;
-    const place = last && (last.what ? `${last.what} changed: alarm ${last.latency_n} samples later` : "no change explains it");
-    const bound = last && last.bound_n !== null ? `, bound ${last.bound_n}` : "";
-    const text = last ? `alarm at sample ${last.sample}: ${place}${bound}` : "no alarm yet";
-    put($("alarm"), text);
+    put($("alarm"), last ? `alarm at sample ${last.sample}: ${cause(last)}` : "no alarm yet");
     rows($("alarms"), alarms, (row, alarm) => {
       cell(row, alarm.take);
       cell(row, alarm.sample, "number");
-      cell(row, alarm.what || "none", alarm.what ? "text" : "text bad");
+      const short = alarm.what || (alarm.again && `${alarm.again} again`) || alarm.fault || "none: false alarm";
+      cell(row, short, alarm.what || alarm.again || alarm.fault ? "text" : "text bad");
       cell(row, alarm.latency_n ?? "–", "number");
       cell(row, alarm.bound_n ?? "–", "number");
     });
@@ -542,6 +566,12 @@
     put($("counters"), counted(state.counters));
   }
 
+  function cause({ what, again, fault, latency_n: latency, bound_n: bound }) {
+    if (what) return `${what} changed: alarm ${latency} samples later${bound === null ? "" : `, best possible ${bound}`}`;
+    if (again) return `the change of ${again} again`;
+    return fault ? `injected fault: ${fault}` : "false alarm, no change explains it";
+  }
+
   function counted(counters) {
     return Object.entries(counters).map(([name, count]) => `${count} ${name.replaceAll("_", " ")}`).join(", ") || "none";
   }
@@ -557,8 +587,9 @@
   // ---- the screen
 
   function look() {
-    const rate = state?.rate ?? 20000;
-    const samples = Math.min(65536, Math.max(16, Math.round(Number($("base").value) * rate)));
+    const { limits } = bench;
+    const within = (value, [low, high]) => Math.round(Math.min(high, Math.max(low, value)));
+    const samples = within(Number($("base").value) * bench.rate, limits.samples);
     const trigger = {
       source: $("source").value,
       slope: $("slope").value,
@@ -566,7 +597,7 @@
       mode: $("mode").value,
       position: Number($("position").value),
     };
-    const columns = Math.min(4000, Math.max(200, Math.round($("screen").clientWidth || 800)));
+    const columns = within(size.width, limits.columns);
     const kind = $("kind").value;
     kept = [];
     $("arm").hidden = $("mode").value !== "single";
@@ -596,15 +627,26 @@
   function redraw() {
     isDue = false;
     if (!frame || !frame.signals.every((id) => shown.includes(id))) return;
-    for (const id of frame.signals) if (!scaleOf(id).per) fit(id);
+    const fresh = frame.signals.filter((id) => !scaleOf(id).per);
+    fresh.forEach(fit);
+    if (fresh.length) buildSignals();
     if (frame.kind === "xy") drawXy();
     else drawPlot();
     if (measures) showMeasures();
     if (!$("cursor-panel").hidden) showCursors();
-    put($("triggered"), frame.kind === "fft" ? "" : frame.trigger === null ? "no trigger" : "triggered");
+    put($("triggered"), triggering());
     frames += 1;
-    document.documentElement.setAttribute("data-drawn", "");
     document.documentElement.dataset.frames = frames;
+    if (frames === 1) document.documentElement.setAttribute("data-drawn", "");
+  }
+
+  function triggering() {
+    if (frame.kind === "fft") return "";
+    if (frame.trigger !== null) return "triggered";
+    const source = $("source").value;
+    const { min, max } = known[source] ?? {};
+    const side = level >= max ? "above" : level < min ? "below" : "";
+    return side ? `no trigger: the level is ${side} all values of ${signal(source).label}` : "no trigger";
   }
 
   function fit(id) {
@@ -619,100 +661,138 @@
     scales.set(id, { per, middle: Math.round((low + high) / 2 / per) * per });
   }
 
-  function times(of) {
-    const [step, zero] = of.kind === "fft" ? [of.step, 0] : [1000 / of.rate, of.first - (of.trigger ?? of.first)];
-    const out = new Float64Array(of.points);
-    for (let i = 0; i < out.length; i++) out[i] = (zero + i * of.per) * step;
-    return out;
+  // Position of the first point on the x axis, distance of two points, and both ends of the axis.
+  function across(of) {
+    if (of.kind === "fft") {
+      const pitch = of.per * of.step;
+      return { start: 0, pitch, ends: [0, (of.points - 1) * pitch] };
+    }
+    const before = of.trigger === null ? 0 : of.trigger - of.first;
+    const ms = 1000 / of.rate;
+    const low = -Math.floor(before); // the axis stays where it is from frame to frame
+    return { start: -before * ms, pitch: of.per * ms, ends: [low * ms, (low + of.points * of.per) * ms] };
   }
 
-  function heights(of, id) {
-    const { per, middle } = of.kind === "fft" ? { per: 20, middle: -60 } : scaleOf(id);
-    const values = of.values[id];
-    const out = new Array(values.length);
-    for (let i = 0; i < out.length; i++) out[i] = Number.isFinite(values[i]) ? (values[i] - middle) / per : null;
-    return out;
+  function heightScale(of, id) {
+    return of.kind === "fft" ? SPECTRUM : scaleOf(id);
   }
 
   function drawPlot() {
-    const box = $("screen");
-    const key = [frame.kind, frame.signals.join(), box.clientWidth, box.clientHeight, current, $("units").value, dark()].join(";");
-    const data = [times(frame), ...frame.signals.map((id) => heights(frame, id))];
-    if (key === plotKey) {
-      plot.setData(data, false);
-      plot.setScale("x", { min: data[0][0], max: data[0][data[0].length - 1] });
-      return;
+    const { per, middle } = heightScale(frame, current);
+    const { width, height } = size;
+    const key = [frame.kind, width, height, current, colourOf(current), per, middle, $("units").value, dark(), devicePixelRatio].join(";");
+    const { ends } = across(frame);
+    if (key !== plotKey) {
+      plotKey = key;
+      layOut(ends);
+    } else if (ends.some((end, i) => end !== plot.data[0][i])) {
+      plot.setData([ends, [null, null]]);
+    } else {
+      drawCurves(plot);
     }
-    plotKey = key;
+  }
+
+  function layOut(ends) {
     plot?.destroy();
-    box.replaceChildren();
+    $("axes").replaceChildren();
     const isSpectrum = frame.kind === "fft";
-    const title = isSpectrum ? "dB of 1 V rms" : `${signal(current).label}${unitOf(current) ? `, ${unitOf(current)}` : ""}`;
-    const ticks = (_, splits) =>
-      splits.map((at) => {
-        const { per, middle } = isSpectrum ? { per: 20, middle: -60 } : scaleOf(current);
-        return short((at * per + middle) * (isSpectrum ? 1 : factorOf(current)), 3);
-      });
+    const unit = unitOf(current) ? `, ${unitOf(current)}` : "";
+    const title = isSpectrum ? "dB of 1 V rms" : `selected: ${signal(current).label}${unit}`;
+    const { per, middle } = heightScale(frame, current);
+    const factor = isSpectrum ? 1 : factorOf(current);
+    const ticks = (_, splits) => splits.map((at) => short((at * per + middle) * factor, 3));
     const vertical = Array.from({ length: 2 * DIVISIONS + 1 }, (_, i) => i - DIVISIONS);
-    const curves = frame.signals.map((id) => plotting.curve(id, ink(colourOf(id)), { unit: "", width: WIDTH }));
     plot = new uPlot(
       {
-        width: box.clientWidth,
-        height: box.clientHeight,
+        ...size,
         cursor: { show: false },
         legend: { show: false },
         scales: { x: { time: false }, y: { range: [-DIVISIONS, DIVISIONS] } },
-        series: [{}, ...curves],
+        series: [{}, {}],
         axes: [
-          plotting.axis("x", isSpectrum ? "frequency, Hz" : "time, ms", 2, ink, {}),
+          plotting.axis("x", isSpectrum ? "frequency, Hz" : "time, ms", 2, ink, { size: 28, labelSize: 18 }),
           plotting.axis("y", title, 3, ink, { size: 70, splits: () => vertical, values: ticks }),
         ],
-        hooks: { drawAxes: [drawKept], draw: [drawMarks] },
+        hooks: { draw: [drawCurves] }, // it lays the axes out later
       },
-      data,
-      box,
+      [ends, [null, null]],
+      $("axes"),
     );
+  }
+
+  function drawCurves({ bbox: { left, top, width, height }, data: [ends] }) {
+    const canvas = $("curves");
+    const px = devicePixelRatio;
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    Object.assign(canvas.style, { left: `${left / px}px`, top: `${top / px}px`, width: `${width / px}px`, height: `${height / px}px` });
+    const context = canvas.getContext("2d");
+    context.clearRect(0, 0, width, height);
+    context.lineWidth = WIDTH * px;
+    context.globalAlpha = 0.25;
+    for (const old of kept.slice(0, -1)) {
+      if (old.kind === frame.kind) for (const id of old.signals) if (shown.includes(id)) drawCurve(context, ends, old, id);
+    }
+    context.globalAlpha = 1;
+    for (const id of frame.signals) drawCurve(context, ends, frame, id);
+    drawMarks(context, ends);
+  }
+
+  function drawCurve(context, [low, high], of, id) {
+    const { width, height } = context.canvas;
+    const { start, pitch } = across(of);
+    const { per, middle } = heightScale(of, id);
+    const unit = height / (2 * DIVISIONS) / per;
+    const values = of.values[id];
+    let x = ((start - low) * width) / (high - low);
+    const step = (pitch * width) / (high - low);
+    context.strokeStyle = ink(colourOf(id));
+    context.beginPath();
+    for (let i = 0; i < values.length; i++) {
+      const y = height / 2 - (values[i] - middle) * unit;
+      context.lineTo(x, Math.round(Math.min(2 * height, Math.max(-height, y))) + 0.5); // one that is no number is left out
+      x += step;
+    }
+    context.stroke();
+  }
+
+  function drawMarks(context, [low, high]) {
+    const { width, height } = context.canvas;
+    const line = (colour, dash, from, to) => {
+      context.strokeStyle = ink(colour);
+      context.setLineDash(dash.map((each) => each * devicePixelRatio));
+      context.beginPath();
+      context.moveTo(...from);
+      context.lineTo(...to);
+      context.stroke();
+    };
+    const source = $("source").value;
+    if (frame.kind === "yt" && frame.trigger !== null) {
+      const x = Math.round((-low * width) / (high - low)) + 0.5;
+      line("muted", [2, 4], [x, 0], [x, height]);
+    }
+    if (frame.kind === "yt" && shown.includes(source)) {
+      const { per, middle } = scaleOf(source);
+      const y = Math.round(height / 2 - ((level - middle) * height) / (2 * DIVISIONS) / per) + 0.5;
+      line(colourOf(source), [2, 4], [0, y], [width, y]);
+    }
+    if ($("cursors").checked) {
+      for (const [id, dash] of [["cursor-a", [6, 3]], ["cursor-b", [2, 3]]]) {
+        const x = Math.round(Number($(id).value) * width) + 0.5;
+        line("ink", dash, [x, 0], [x, height]);
+      }
+    }
+    context.setLineDash([]);
   }
 
   function dark() {
     return matchMedia("(prefers-color-scheme: dark)").matches;
   }
 
-  function drawKept(u) {
-    u.ctx.save();
-    u.ctx.globalAlpha = 0.25;
-    u.ctx.lineWidth = devicePixelRatio;
-    for (const old of kept.slice(0, -1)) {
-      if (old.signals.join() !== frame.signals.join() || old.kind !== frame.kind) continue;
-      const at = times(old);
-      for (const id of old.signals) {
-        u.ctx.strokeStyle = ink(colourOf(id));
-        u.ctx.beginPath();
-        heights(old, id).forEach((y, i) => y !== null && u.ctx.lineTo(u.valToPos(at[i], "x", true), u.valToPos(y, "y", true)));
-        u.ctx.stroke();
-      }
-    }
-    u.ctx.restore();
-  }
-
-  function drawMarks(u) {
-    if (frame.kind === "yt" && frame.trigger !== null) {
-      plotting.verticals(u, [{ at: 0 }], { colour: ink("muted"), width: 1, dash: [2, 4] });
-    }
-    if (!$("cursors").checked) return;
-    const at = times(frame);
-    for (const [id, dash] of [["cursor-a", [6, 3]], ["cursor-b", [2, 3]]]) {
-      const place = at[0] + Number($(id).value) * (at[at.length - 1] - at[0]);
-      plotting.verticals(u, [{ at: place }], { colour: ink("ink"), width: 1.5, dash });
-    }
-  }
-
   function showCursors() {
     if (!(current in frame.values)) return; // it was added after this frame
-    const at = times(frame);
-    const places = ["cursor-a", "cursor-b"].map((id) => Math.round(Number($(id).value) * (at.length - 1)));
+    const places = ["cursor-a", "cursor-b"].map((id) => Math.round(Number($(id).value) * (frame.points - 1)));
     const [a, b] = places.map((i) => frame.values[current][i]);
-    const apart = at[places[1]] - at[places[0]];
+    const apart = (places[1] - places[0]) * across(frame).pitch;
     if (frame.kind === "fft") {
       $("cursor-text").textContent = `A ${short(a)} dB, B ${short(b)} dB; B − A: ${withPrefix(apart, "Hz")}, ${short(b - a)} dB`;
       return;
@@ -737,14 +817,12 @@
       context.strokeRect(place(-DIVISIONS, canvas.width, 1), place(i, canvas.height, 1), size, 0);
     }
     for (const each of kept.length ? kept.filter(({ kind }) => kind === "xy") : [frame]) {
-      const [h, v] = [heights(each, x), heights(each, y)];
+      const [h, v] = [x, y].map((id) => [...each.values[id]].map((value) => (value - scaleOf(id).middle) / scaleOf(id).per));
       context.globalAlpha = each === frame ? 1 : 0.25;
       context.strokeStyle = ink("first");
       context.lineWidth = 1.5 * px;
       context.beginPath();
-      h.forEach((value, i) => {
-        if (value !== null && v[i] !== null) context.lineTo(place(value, canvas.width, 1), place(v[i], canvas.height, -1));
-      });
+      h.forEach((value, i) => context.lineTo(place(value, canvas.width, 1), place(v[i], canvas.height, -1)));
       context.stroke();
     }
     context.globalAlpha = 1;
@@ -762,6 +840,7 @@
       texts.push(withPrefix(found.frequency, "Hz"), found.overshoot === null ? "–" : `${(100 * found.overshoot).toFixed(1)} %`);
       texts.forEach((text, i) => put(row.cells[3 + i], text));
     }
+    known = measures;
     measures = null;
   }
 
@@ -812,7 +891,10 @@
       buildSignals();
       redraw();
     };
-    new ResizeObserver(() => bench && look()).observe($("screen"));
+    new ResizeObserver(([{ contentRect: { width, height } }]) => {
+      if (width) size = { width, height };
+      if (bench) look();
+    }).observe($("screen"));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   }
 
