@@ -33,6 +33,7 @@ from . import (
     bench_link,
     bench_live,
     bench_onset,
+    bench_programs,
     bench_properties,
     bench_reality,
     bench_self_test,
@@ -66,9 +67,10 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "detectors": bench_detectors.figures,
     "reality": bench_reality.figures_of,
     "silverbox": bench_silverbox.figures,
+    "programs": bench_programs.figures,
 }
 
-OPTIONED = {"campaign", "live", "reality", "statistics"}
+OPTIONED = {"campaign", "live", "programs", "reality", "statistics"}
 """Benchmarks that take options."""
 
 

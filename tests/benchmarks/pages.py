@@ -11,6 +11,7 @@ from . import (
     bench_certificates,
     bench_detectors,
     bench_live,
+    bench_programs,
     bench_reality,
     bench_silverbox,
     bench_two_mass,
@@ -37,6 +38,7 @@ TITLES: Mapping[str, str] = {
     "properties": "False failures of the shipped properties",
     "detectors": "Detectors at the same measured ARL0",
     "reality": "The shipped device under the conditions that users meet",
+    "programs": "Random programs, beside scipy and ngspice",
     "silverbox": "Twin of the Silverbox",
 }
 """Page titles by the name of the benchmark."""
@@ -49,6 +51,7 @@ NOTES: Mapping[str, str] = {
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
     "live": bench_live.NOTE,
+    "programs": bench_programs.NOTE,
     "reality": bench_reality.NOTE,
     "silverbox": bench_silverbox.NOTE,
     "two-mass": bench_two_mass.NOTE,
