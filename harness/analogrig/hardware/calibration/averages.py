@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.instrument import MEASURED
 from analogrig.program import Program
 from analogrig.rigs.rig import Rig
 from analogrig.run import INPUT, OUTPUT, Channel
@@ -29,7 +28,7 @@ RATE_HZ = 20e3
 """Sample rate of the card. The periods below are whole numbers of its samples."""
 
 FORCE, DISPLACEMENT = range(2)
-"""Columns of a recording, as in MEASURED."""
+"""Columns of a recording: input and output of the program."""
 
 _COLUMNS = [INPUT, OUTPUT]
 
@@ -128,7 +127,7 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
     return SquareWaveRecording(
         scenario,
         performance.sample_period_s,
-        {name: performance.channels[name] for name in MEASURED},
+        {name: performance.channels[name] for name in scenario.program.measured},
         np.concatenate([block.codes[:, _COLUMNS] for block in blocks]),
         np.concatenate([block.clipped[:, _COLUMNS] for block in blocks]),
     )
@@ -174,7 +173,8 @@ def estimate_noise(recordings: Sequence[SquareWaveRecording], channel: int) -> t
         levels += 2 if channel == FORCE else len(phases)
     every = np.concatenate(squares)
     if not len(every):
-        raise RigError(f"{MEASURED[channel]}: every sample is clipped")
+        name = recordings[0].scenario.program.measured[channel]
+        raise RigError(f"{name}: every sample is clipped")
     variance = float(every.mean())
     noise_lsb = _remove_rounding(variance)
     # Each sample enters two differences, and at few levels the variance of rounding deviates from its mean.
