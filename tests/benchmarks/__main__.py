@@ -32,6 +32,7 @@ from . import (
     bench_isolation,
     bench_link,
     bench_live,
+    bench_multipliers,
     bench_onset,
     bench_programs,
     bench_properties,
@@ -49,6 +50,7 @@ RESULTS = Path("build/bench.json")
 
 BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "engine": bench_engine.figures,
+    "multipliers": bench_multipliers.figures,
     "link": bench_link.figures,
     "live": bench_live.figures,
     "adapters": bench_adapters.figures,

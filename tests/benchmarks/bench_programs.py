@@ -63,7 +63,7 @@ absolute values, minima, quotients, roots, curves. Each is excited by the square
 Ideal parts: the largest difference at any channel from the equations of the file, solved by scipy's
 DOP853 to 1e-9. Dividers and roots have {_IDEAL_LOOP:g} of their loop capacitors, which stabilise real amplifiers
 and make them late by up to a microsecond. Real parts: the largest difference at any amplifier from
-ngspice, in the tightest setting with which it reaches the end, of the deck that `analogrig netlist` writes. The parts are those of the rig
+ngspice, in the tightest setting with which it reaches the end. The parts are those of the rig
 `emulator-real`: drawn resistors, capacitors that leak, TL07x, AD633. Absorption is left out, for it
 would exceed the 64 states of the engine. Programs whose real parts have more than the engine's 256
 nodes and branches have nominal parts and drawn offsets. Required are {MOST_LSB:g} LSB of 12 bits.

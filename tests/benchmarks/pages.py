@@ -11,6 +11,7 @@ from . import (
     bench_certificates,
     bench_detectors,
     bench_live,
+    bench_multipliers,
     bench_programs,
     bench_reality,
     bench_silverbox,
@@ -21,6 +22,7 @@ FOLDER = Path("harness/docs/evidence")
 
 TITLES: Mapping[str, str] = {
     "engine": "Speed of the engine, beside ngspice",
+    "multipliers": "Speed of programs with multipliers, beside ngspice",
     "link": "Speed of the links",
     "live": "The live bench in real time, and under hostile clients",
     "adapters": "Speed of the adapters",
@@ -51,6 +53,7 @@ NOTES: Mapping[str, str] = {
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
     "live": bench_live.NOTE,
+    "multipliers": bench_multipliers.NOTE,
     "programs": bench_programs.NOTE,
     "reality": bench_reality.NOTE,
     "silverbox": bench_silverbox.NOTE,
