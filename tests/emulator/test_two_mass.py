@@ -74,9 +74,9 @@ def stepped(values: Mapping[str, float], state: Volts, force_n: float) -> Volts:
     m2, b2, k2, m1, b1, k1 = (values[name] for name in ("M2", "B2", "K2", "M1", "B1", "K1"))
     a = np.zeros((5, 5))
     a[:4] = [
-        [0, 1, 0, 0, 0],
+        [0.0, 1.0, 0.0, 0.0, 0.0],
         [-k2 / m2, -b2 / m2, k2 / m2, b2 / m2, force_n / m2],
-        [0, 0, 0, 1, 0],
+        [0.0, 0.0, 0.0, 1.0, 0.0],
         [k2 / m1, b2 / m1, -(k1 + k2) / m1, -(b1 + b2) / m1, 0],
     ]
     step: Volts = expm(a * TIME_SCALE / RATE_HZ)
