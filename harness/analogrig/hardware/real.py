@@ -243,7 +243,7 @@ class RealRig(Rig):
             self._is_locked = True
         if self._instrument is None:
             self._instrument = self._connect(self._address, description.timeout_s)
-            self._instrument.patch(description.plant)
+            self._instrument.patch(description.program)
         if self._pots is None:
             own = description.pots.exact
             self._pots = self._instrument.find_pots(description.pot_names) if own else description.pots.open()
