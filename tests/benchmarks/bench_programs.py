@@ -57,17 +57,20 @@ ACCURACIES = (Accuracy(), Accuracy(reltol=1e-6), Accuracy(reltol=1e-6, trtol=1.0
 """Settings of ngspice, the tightest first."""
 
 NOTE = f"""\
-Seeds 0 to 99 draw programs with a stable linear part and random terms: products, cubes, dead zones,
-absolute values, minima, quotients, roots, curves. Each is excited by the square wave of its trial play.
+Each seed draws a program with a stable linear part and random terms: products, cubes, dead zones,
+absolute values, minima, quotients, roots, curves. The square wave of its trial play excites it.
 
 Ideal parts: the largest difference at any channel from the equations of the file, solved by scipy's
-DOP853 to 1e-9. Dividers and roots have {_IDEAL_LOOP:g} of their loop capacitors, which stabilise real amplifiers
-and make them late by up to a microsecond. Real parts: the largest difference at any amplifier from
-ngspice, in the tightest setting with which it reaches the end. The parts are those of the rig
-`emulator-real`: drawn resistors, capacitors that leak, TL07x, AD633. Absorption is left out, for it
-would exceed the 64 states of the engine. Programs whose real parts have more than the engine's 256
-nodes and branches have nominal parts and drawn offsets. Required are {MOST_LSB:g} LSB of 12 bits.
-The slopes of each patch agree with its equations at random places.
+DOP853 to 1e-9. Dividers and roots have {_IDEAL_LOOP:g} of their loop capacitors. These stabilise real
+amplifiers and make them late by up to a microsecond.
+
+Real parts: the largest difference at any amplifier from ngspice, in the tightest setting with which
+it reaches the end. The parts are those of the rig `emulator-real`: drawn resistors, capacitors that
+leak, TL07x, AD633. Absorption is left out, for it would exceed the 64 states of the engine. The
+largest programs have more than the engine's 256 nodes and branches with real parts. They have
+nominal parts and drawn offsets.
+
+Required are {MOST_LSB:g} LSB of 12 bits. Each patch has the slopes of its equations at random places.
 """
 """Paragraphs below the table."""
 
