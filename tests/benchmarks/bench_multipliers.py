@@ -78,8 +78,8 @@ _LINEAR_STATE = "Gstate 0 state inner state {1e-10 * rate}\n"
 NOTE = f"""\
 {SAMPLES} samples of a square wave between the levels of the trial play, nominal TL07x and AD633. The
 grid has {len(SETTINGS)} settings of method, time points, reltol, trtol and longest step. Exported decks are
-those of `analogrig netlist`; knowing ones limit neither op-amps nor multipliers, as if it were known
-that none does. Equal accuracy is {TOLERATED_LSB:g} LSB at the output.
+those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers: they know that none
+leaves its range. Equal accuracy is {TOLERATED_LSB:g} LSB at the output.
 
 The emulator, cold: the first play in a new process, machine and all matrices included. Own offsets:
 each machine has op-amps of its own. Again: the same machine as before, built anew.
