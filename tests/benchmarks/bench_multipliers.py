@@ -78,7 +78,7 @@ _LINEAR_STATE = "Gstate 0 state inner state {1e-10 * rate}\n"
 NOTE = f"""\
 {SAMPLES} samples of a square wave between the levels of the trial play, nominal TL07x and AD633. The
 grid has {len(SETTINGS)} settings of method, time points, reltol, trtol and longest step. Exported decks are
-those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers: they know that none
+those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers, for none
 leaves its range. Equal accuracy is {TOLERATED_LSB:g} LSB at the output.
 
 The emulator, cold: the first play in a new process, machine and all matrices included. Own offsets:
