@@ -107,8 +107,8 @@ metrics: ## figures of structure and documents; ARGS="dea2ac6 HEAD" compares com
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
 
-programs: $(PRODUCTS) ## 100 random programs against their equations; ARGS="COUNT FIRST_SEED" draws others
-	@$(BIN)/python -m tests.benchmarks.soak_programs $(or $(ARGS),100)
+programs: $(PRODUCTS) ## 100 random programs, ideal parts beside scipy and real ones beside ngspice; ARGS="COUNT FIRST_SEED" draws others
+	@$(BIN)/python -m tests.benchmarks programs $(ARGS)
 
 packages: $(PRODUCTS) ## the manifests of the C estimator under PlatformIO, ESP-IDF and kconfiglib; downloads 60 MB
 	@$(BIN)/python -m tests.estimator_c.ecosystems

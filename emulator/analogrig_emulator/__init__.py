@@ -66,14 +66,12 @@ from analogrig_emulator.machine.program import (
     Scales,
 )
 from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
-from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, BumpStop, SuspensionParts, SuspensionProgram
+from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
-from analogrig_emulator.machine.two_mass import TWO_MASS, TwoMassParts, TwoMassPlant, TwoMassProgram
 
 __all__ = [
     "ABSOLUTE_ZERO_C",
-    "BUMP_STOP",
     "CARDS",
     "CHANNELS",
     "COMPONENTS",
@@ -91,9 +89,7 @@ __all__ = [
     "SHOCK",
     "SOURCE",
     "TICKS_PER_SAMPLE",
-    "TWO_MASS",
     "AnalogComputer",
-    "BumpStop",
     "Capacitor",
     "Card",
     "Circuit",
@@ -154,9 +150,6 @@ __all__ = [
     "SuspensionParts",
     "SuspensionProgram",
     "Switch",
-    "TwoMassParts",
-    "TwoMassPlant",
-    "TwoMassProgram",
     "VoltageSource",
     "WideProgram",
     "Wired",

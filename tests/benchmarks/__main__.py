@@ -32,7 +32,9 @@ from . import (
     bench_isolation,
     bench_link,
     bench_live,
+    bench_multipliers,
     bench_onset,
+    bench_programs,
     bench_properties,
     bench_reality,
     bench_self_test,
@@ -48,6 +50,7 @@ RESULTS = Path("build/bench.json")
 
 BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "engine": bench_engine.figures,
+    "multipliers": bench_multipliers.figures,
     "link": bench_link.figures,
     "live": bench_live.figures,
     "adapters": bench_adapters.figures,
@@ -66,9 +69,10 @@ BENCHES: Mapping[str, Callable[..., Iterator[Figure]]] = {
     "detectors": bench_detectors.figures,
     "reality": bench_reality.figures_of,
     "silverbox": bench_silverbox.figures,
+    "programs": bench_programs.figures,
 }
 
-OPTIONED = {"campaign", "live", "reality", "statistics"}
+OPTIONED = {"campaign", "live", "programs", "reality", "statistics"}
 """Benchmarks that take options."""
 
 

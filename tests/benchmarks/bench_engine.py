@@ -271,6 +271,12 @@ def deck(setting: Setting, samples: int, tweaks: Sequence[PotTurn]) -> str:
         nodes=["u5"],
         accuracy=Accuracy(reltol=setting.reltol, vntol_v=1e-6, trtol=setting.trtol, max_step_s=setting.max_step_s),
     )
+    text = in_setting(text, setting, "U[2-5]")
+    return text if setting.pots == "turned" else _with_altered_pots(text, computer, tweaks)
+
+
+def in_setting(text: str, setting: Setting, linear: str) -> str:
+    """The deck in a setting, but for its tolerances. linear: expression of the op-amps without limits."""
     options = f".options method={setting.method}" + (" klu" if setting.solver == "klu" else "")
     text = _replaced(r"^(\.options reltol=.*)$", rf"\g<1>\n{options}", text)
     if setting.points == "start":
@@ -281,9 +287,9 @@ def deck(setting: Setting, samples: int, tweaks: Sequence[PotTurn]) -> str:
     if setting.op_amps == "knowing":
         text = _replaced(r"^(\* analogue computer)$", rf"\g<1>\n{LINEAR}", text)
         text = re.sub(
-            r"^(X_U[2-5] .*) opamp avol=(\S+) gbw=(\S+) .* rout=(\S+) .*$", LINEAR_CALL, text, flags=re.MULTILINE
+            rf"^(X_{linear} .*) opamp avol=(\S+) gbw=(\S+) .* rout=(\S+) .*$", LINEAR_CALL, text, flags=re.MULTILINE
         )
-    return text if setting.pots == "turned" else _with_altered_pots(text, computer, tweaks)
+    return text
 
 
 def _with_altered_pots(text: str, computer: SuspensionComputer, tweaks: Sequence[PotTurn]) -> str:
@@ -339,8 +345,8 @@ class Simulated:
     error_lsb: float
 
 
-def simulate(text: str, exact_v: NDArray[np.float64]) -> Simulated:
-    """Run a deck. Between time points the better of a straight line and a smooth curve counts."""
+def simulate(text: str, exact_v: NDArray[np.float64], node: str = "u5") -> Simulated:
+    """Run a deck and compare a node. Between time points the better of a straight line and a smooth curve counts."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "deck.cir").write_text(text)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -350,7 +356,7 @@ def simulate(text: str, exact_v: NDArray[np.float64]) -> Simulated:
         names, table = _read_raw(Path(folder, "out.raw"))
     spent_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     t_s, first = np.unique(table[:, 0], return_index=True)
-    volts = table[first, names.index("v(u5)")]
+    volts = table[first, names.index(f"v({node})")]
     at_s = np.clip(np.arange(exact_v.size) / RATE_HZ, t_s[0], t_s[-1])
     errors_v = [
         np.abs(curve - exact_v).max()

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analogrig_emulator import CARDS, COMPONENTS, NOMINAL, OP_AMP_GRADES, Card, Components, drawn_levels
+from tests.emulator.programs import program_of
 
 from .disturbances import backlash, drift, hum, impulses, missing, popcorn, proportional_noise, rising_noise, warming
 from .emulated import Emulated
@@ -103,6 +104,8 @@ def _ranged(low_v: float, high_v: float) -> Card:
 
 
 SQUARE = square()
+
+TWO_MASS, BUMP_STOP = program_of("two-mass"), program_of("bump-stop")
 
 SLOW = ("slow-plant",)
 
@@ -201,7 +204,12 @@ OWN: Sequence[Condition] = (
         ("edges",),
     ),
     Condition("warming", "K falls by 2 % in 10,000 samples", Emulated(SQUARE, wander=warming(-0.02)), ("drift",)),
-    Condition("two-mass", "suspension on its tyre, four poles", Emulated(SQUARE, program="two-mass"), ("nonlinear",)),
+    Condition(
+        "two-mass",
+        "suspension on its tyre, four poles",
+        Emulated(SQUARE, program=TWO_MASS),
+        ("nonlinear",),
+    ),
     Condition(
         "loop-100",
         "ground loop of 2 LSB at 100 Hz on both channels",
@@ -223,7 +231,7 @@ OWN: Sequence[Condition] = (
     Condition(
         "wander", "displacement wanders by 50 LSB at 1 Hz", Emulated(SQUARE, disturb=hum(50.0, 1.0)), ("drift", "hum")
     ),
-    Condition("bump-stop", "bump stop within reach", Emulated(SQUARE, program="bump-stop"), ("nonlinear",)),
+    Condition("bump-stop", "bump stop within reach", Emulated(SQUARE, program=BUMP_STOP), ("nonlinear",)),
     Condition("backlash", "backlash of 3 LSB of the sensor", Emulated(SQUARE, disturb=backlash(3.0)), ("nonlinear",)),
     Condition(
         "rising", "noise that rises from 1 to 3 LSB", Emulated(SQUARE, disturb=rising_noise(0.0, 2.83)), ("noise",)

@@ -11,6 +11,8 @@ from . import (
     bench_certificates,
     bench_detectors,
     bench_live,
+    bench_multipliers,
+    bench_programs,
     bench_reality,
     bench_silverbox,
     bench_two_mass,
@@ -20,6 +22,7 @@ FOLDER = Path("harness/docs/evidence")
 
 TITLES: Mapping[str, str] = {
     "engine": "Speed of the engine, beside ngspice",
+    "multipliers": "Speed of programs with multipliers, beside ngspice",
     "link": "Speed of the links",
     "live": "The live bench in real time, and under hostile clients",
     "adapters": "Speed of the adapters",
@@ -37,6 +40,7 @@ TITLES: Mapping[str, str] = {
     "properties": "False failures of the shipped properties",
     "detectors": "Detectors at the same measured ARL0",
     "reality": "The shipped device under the conditions that users meet",
+    "programs": "Random programs, beside scipy and ngspice",
     "silverbox": "Twin of the Silverbox",
 }
 """Page titles by the name of the benchmark."""
@@ -49,6 +53,8 @@ NOTES: Mapping[str, str] = {
     "certificates": bench_certificates.NOTE,
     "detectors": bench_detectors.NOTE,
     "live": bench_live.NOTE,
+    "multipliers": bench_multipliers.NOTE,
+    "programs": bench_programs.NOTE,
     "reality": bench_reality.NOTE,
     "silverbox": bench_silverbox.NOTE,
     "two-mass": bench_two_mass.NOTE,

@@ -1,37 +1,24 @@
-"""The suspension with a bump stop, against its equation and against ngspice."""
+"""The suspension with a bump stop, against its equation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from analogrig_emulator import (
-    TICKS_PER_SAMPLE,
-    BumpStop,
-    CircuitError,
-    Deck,
-    Excitation,
-    OpAmp,
-    PotTurn,
-    SuspensionComputer,
-)
-
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
+from analogrig_emulator import Excitation, SuspensionComputer
+from tests.emulator.programs import program_of
 
 LSB_V = 10.0 / 4096
 RATE_HZ = 20e3
 TIME_SCALE = 200.0
-STOP = BumpStop()
+PROGRAM = program_of("bump-stop")
+STOP_M, STOP_N_PER_M = PROGRAM.values["x_stop"], PROGRAM.values["K_stop"]
 
 
-def deck_of(computer: SuspensionComputer, excitation: Excitation, samples: int, **dials: float) -> Deck:
-    edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)
-    turns = [PotTurn(samples // 2, dials)] if dials else []
-    return Deck(computer.circuit, samples, RATE_HZ, {"F": edges}, turns, title="bump stop")
+def played(opamp: str, samples: int) -> NDArray[np.float64]:
+    """Channels in V under a step of the force."""
+    return np.concatenate(list(SuspensionComputer(PROGRAM, opamp=opamp).play(Excitation(frequency_hz=1.0), samples)))
 
 
 def by_equation(force_n: float, samples: int) -> NDArray[np.float64]:
@@ -39,7 +26,7 @@ def by_equation(force_n: float, samples: int) -> NDArray[np.float64]:
 
     def slope(_: float, state: NDArray[np.float64]) -> list[float]:
         x, v = state
-        spring_n = 24500.0 * x + STOP.stiffness_n_per_m * max(0.0, x - STOP.stop_m)
+        spring_n = 24500.0 * x + STOP_N_PER_M * max(0.0, x - STOP_M)
         return [v, (force_n - 3021.0 * v - spring_n) / 115.0]
 
     instants_s = np.arange(samples) * TIME_SCALE / RATE_HZ
@@ -51,31 +38,13 @@ def by_equation(force_n: float, samples: int) -> NDArray[np.float64]:
 
 
 def test_with_ideal_amplifiers_it_solves_its_equation() -> None:
-    computer = SuspensionComputer("bump-stop", opamp="ideal")
-    volts = deck_of(computer, Excitation(frequency_hz=1.0), 60).volts(["u5", "u2"])
-    expected = by_equation(2940.0, 60) * [computer.scales.volts("displacement"), computer.scales.volts("velocity")]
-    # 1.5 N/m of the limiter's off_ohm are a ppm of its displacement.
-    assert np.abs(volts - expected).max() < 0.2 * LSB_V
-    assert expected[:, 0].max() > STOP.stop_m * computer.scales.volts("displacement")
+    volts = played("ideal", 60)[:, 1:3]
+    expected = by_equation(2940.0, 60) * [PROGRAM.scales.volts("displacement"), PROGRAM.scales.volts("velocity")]
+    assert np.abs(volts - expected).max() < 0.05 * LSB_V
+    assert expected[:, 0].max() > STOP_M * PROGRAM.scales.volts("displacement")
 
 
 def test_at_rest_on_the_stop_both_springs_carry_the_force() -> None:
-    computer = SuspensionComputer("bump-stop")
-    volts = deck_of(computer, Excitation(frequency_hz=1.0), 100).volts(["u5"])
-    expected_m = (2940.0 + STOP.stiffness_n_per_m * STOP.stop_m) / (24500.0 + STOP.stiffness_n_per_m)
-    assert volts[-1, 0] / computer.scales.volts("displacement") == pytest.approx(expected_m, rel=2e-4)
-
-
-def test_every_amplifier_agrees_with_ngspice_at_every_sample(ngspice: NgSpice) -> None:
-    computer = SuspensionComputer("bump-stop", rng=np.random.default_rng(3), offset_v=3e-3)
-    excitation = Excitation(low_v=-3.0, clock="free", phase=0.637)
-    deck = deck_of(computer, excitation, 300, **computer.dials_for(K=18000.0))
-    outputs = [amp.out for amp in deck.circuit.of(OpAmp)]
-    reference = ngspice(deck.text(outputs), outputs, 300)
-    error = np.abs(deck.volts(outputs) - reference)
-    assert error.max() < 0.05 * LSB_V
-
-
-def test_a_stop_that_cannot_be_is_refused() -> None:
-    with pytest.raises(CircuitError, match="bump stop: stiffness_n_per_m must be positive"):
-        BumpStop(stiffness_n_per_m=-1.0)
+    expected_m = (2940.0 + STOP_N_PER_M * STOP_M) / (24500.0 + STOP_N_PER_M)
+    found_m = played("tl07x", 100)[-1, 1] / PROGRAM.scales.volts("displacement")
+    np.testing.assert_allclose(found_m, expected_m, rtol=2e-4)

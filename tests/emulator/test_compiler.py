@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from analogrig_emulator import (
-    BUMP_STOP,
+    PROGRAMS,
     TICKS_PER_SAMPLE,
-    BumpStop,
     Deck,
     Excitation,
     OpAmp,
@@ -27,17 +24,15 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.pot import dial_for
 from analogrig_emulator.errors import ProgramError
-from analogrig_emulator.machine.compiler import INPUT_OHM, MACHINE_V, PatchedProgram, compile_program, load_program
+from analogrig_emulator.machine.compiler import INPUT_OHM, MACHINE_V, PatchedProgram, compile_program
 from analogrig_emulator.machine.program_file import parse_program
 from analogrig_emulator.machine.trial import settings
 from tests.emulator.ideal_patch import IdealPatch
+from tests.emulator.programs import FILES, program_of
 from tests.emulator.random_programs import random_program
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]
-
-FOLDER = Path(__file__).parents[2] / "fixtures" / "programs"
-PROGRAMS = sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 LSB_V = 10.0 / 4096
 RATE_HZ = 20e3
@@ -45,14 +40,10 @@ SAMPLES = 300
 SEEDS = 6
 
 
-def program_of(name: str) -> PatchedProgram:
-    return load_program(FOLDER / f"{name}.toml")
-
-
 # ---- any program, at one instant
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", FILES)
 def test_netlist_has_the_slopes_of_the_equations(name: str) -> None:
     assert_slopes(program_of(name), np.random.default_rng(1))
 
@@ -119,22 +110,22 @@ def dials_of(program: PatchedProgram, values: dict[str, float]) -> dict[str, flo
 # ---- linear programs, played
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", FILES)
 def test_ideal_parts_play_the_equations(name: str) -> None:
     program = program_of(name)
-    assert_play(program, changes_of(program))
+    assert off_equations_lsb(program, changes_of(program)) < 0.05
 
 
-def assert_play(program: PatchedProgram, changes: Sequence[PotTurn] = (), within_lsb: float = 0.05) -> None:
-    """Assert that ideal parts play the equations, as scipy solves them, within so many LSB at every channel."""
+def off_equations_lsb(program: PatchedProgram, changes: Sequence[PotTurn] = ()) -> float:
+    """Largest difference of ideal parts from the equations, as scipy solves them, at any channel, in LSB."""
     low_v, high_v = levels_v(program)
     excitation = Excitation(low_v=low_v, high_v=high_v)
     computer = SuspensionComputer(program, opamp="ideal")
     volts = np.concatenate(list(computer.play(excitation, SAMPLES, changes)))
-    assert np.abs(volts - by_scipy(program, excitation, changes)).max() < within_lsb * LSB_V
+    return float(np.abs(volts - by_scipy(program, excitation, changes)).max() / LSB_V)
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", FILES)
 def test_every_amplifier_agrees_with_ngspice(ngspice: NgSpice, name: str) -> None:
     program = program_of(name)
     computer = SuspensionComputer(program, rng=np.random.default_rng(3))
@@ -153,16 +144,11 @@ def test_every_amplifier_agrees_with_ngspice(ngspice: NgSpice, name: str) -> Non
     assert np.abs(deck.volts(outputs) - ngspice(deck.text(outputs), outputs, samples)).max() < 0.05 * LSB_V
 
 
-TODAY = ("front", "shock", "bump-stop", "two-mass")
-
-
-@pytest.mark.parametrize("name", TODAY)
-def test_file_of_a_shipped_program_plays_the_program(name: str) -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_file_of_a_program_wired_by_hand_plays_the_program(name: str) -> None:
     program = program_of(name)
     changes = [turn for turn in changes_of(program) if set(turn.values) <= set(SuspensionComputer(name).program.values)]
-    # Today's bump stop leaks 5 nA below its threshold, 0.2 LSB of net force.
-    today = replace(BUMP_STOP, stop=BumpStop(off_ohm=1e12)) if name == "bump-stop" else name
-    one, other = SuspensionComputer(program, opamp="ideal"), SuspensionComputer(today, opamp="ideal")
+    one, other = SuspensionComputer(program, opamp="ideal"), SuspensionComputer(name, opamp="ideal")
     volts = [np.concatenate(list(computer.play(Excitation(), SAMPLES, changes))) for computer in (one, other)]
     assert np.abs(volts[0] - volts[1]).max() < 0.05 * LSB_V
     for quantity in program.channels:
@@ -258,7 +244,7 @@ def test_parameter_without_pot_cannot_be_set() -> None:
         SuspensionComputer(program_of("rc-battery")).set(leak=100.0)
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", FILES)
 def test_pots_reach_the_ends_of_every_range(name: str) -> None:
     program = program_of(name)
     for values in settings(program.equations):

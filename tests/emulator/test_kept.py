@@ -32,6 +32,7 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.nodal import Nodal, analyse
 from analogrig_emulator.engine import engine as engine_module
+from tests.emulator.programs import circuit_of
 
 Volts = NDArray[np.float64]
 
@@ -89,8 +90,8 @@ def test_equal_machines_share_nothing_that_changes() -> None:
 @pytest.mark.parametrize("program", ["front", "bump-stop", "two-mass"])
 @pytest.mark.parametrize("opamp", ["tl07x", "ideal"])
 def test_a_machine_with_other_offsets_is_that_of_a_netlist_with_them(program: str, opamp: str) -> None:
-    circuit = SuspensionComputer(program, opamp=opamp, rng=np.random.default_rng(5)).circuit
-    nominal = SuspensionComputer(program, opamp=opamp).circuit
+    circuit = SuspensionComputer(circuit_of(program), opamp=opamp, rng=np.random.default_rng(5)).circuit
+    nominal = SuspensionComputer(circuit_of(program), opamp=opamp).circuit
     trimmed = nominal.with_offsets({amp.name: amp.model.vos_v for amp in circuit.of(OpAmp)})
     alone = Circuit(circuit.elements)
     assert trimmed.elements == alone.elements
@@ -151,7 +152,7 @@ def test_return_to_an_earlier_circuit_is_that_circuit(others: int) -> None:
 @pytest.mark.parametrize("program", ["front", "bump-stop", "two-mass"])
 def test_other_offsets_have_the_bits_of_a_new_engine(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference gets no engine that was used before, and builds every mode."""
-    computer = SuspensionComputer(program)
+    computer = SuspensionComputer(circuit_of(program))
     jumps = [PotTurn(150, {f"{next(iter(computer.dials))}_dial": 0.3})]
     repeated = RepeatedPlay(computer, 300, jumps)
     for number, seed in enumerate((1, 2, 1)):

@@ -46,6 +46,7 @@ from analogrig_emulator import (
 from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.circuit.pot import coefficient_under_load
 from analogrig_emulator.machine.machine import RelaySwitch
+from tests.emulator.programs import circuit_of
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]
@@ -224,7 +225,7 @@ def test_a_pot_into_a_limiter_is_read_and_set_as_the_engine_plays_it() -> None:
 
 
 def test_a_machine_that_charges_at_once_begins_where_its_limiters_leave_it() -> None:
-    computer = SuspensionComputer("bump-stop").machine
+    computer = SuspensionComputer(circuit_of("limited")).machine
     charged = AnalogComputer(computer.circuit, ["u1", "u3"], initial_v={"U2": 0.0, "U3": -8.0}, ic_ohm=None)
     volts = charged.run(50)
     assert volts[0, 0] == pytest.approx(13.364, abs=1e-3)

@@ -40,10 +40,8 @@ def test_nothing_overloads_at_the_programs_own_values(program: str) -> None:
     [
         ("front", {"step_v": 13.5}, {"step_v": 16.0}, ("U1",)),
         ("shock", {"step_v": 16.0}, {"step_v": 20.0}, ("U2", "U4")),
-        ("two-mass", {"step_v": 13.0}, {"step_v": 14.0}, ("U1",)),
         ("front", {"K": 9.8e3}, {"K": 8.6e3}, ("U3",)),
         ("shock", {"K": 6e3}, {"K": 4.9e3}, ("U3",)),
-        ("two-mass", {"K2": 12e3}, {"K2": 9.8e3}, ("U11",)),
         ("shock", {"B": 540.0}, {"B": 450.0}, ("U2", "U4")),
         ("front", {"B": 150.0}, QUIET, ()),
         ("front", {"M": 29.5}, QUIET, ()),
@@ -92,13 +90,6 @@ def test_the_ends_of_the_pots(program: str, limits: dict[str, tuple[float, float
     [
         ("front", 5, {1e-9: 1, 1e-8: 1}, 3, {100e3: 3, 49.9e3: 2, 10e3: 4, 33.2e3: 1}),
         ("shock", 5, {1e-9: 1, 1e-8: 1}, 3, {100e3: 2, 49.9e3: 2, 10e3: 5, 33.2e3: 1}),
-        (
-            "two-mass",
-            11,
-            {1e-9: 2, 1e-8: 2},
-            6,
-            {100e3: 11, 49.9e3: 2, 10e3: 4} | dict.fromkeys((11e3, 16.9e3, 20e3, 63.4e3, 66.5e3, 200e3, 499e3), 1),
-        ),
     ],
 )
 def test_the_list_of_components(

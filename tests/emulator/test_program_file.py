@@ -124,6 +124,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "input without full scale": (swapped("full = 24.0, ", ""), "inputs.u: full is missing; give the value that 10 V"),
     "trial beyond the full scale": (swapped("20.0]", "30.0]"), r"inputs.u.trial: \[0, 30\] exceeds the full scale 24"),
+    "trial without a step": (swapped("[0.0, 20.0]", "[1, 1]"), r"inputs.u.trial: \[1, 1\] excites nothing; write a"),
     "unknown channel": (swapped('"omega",', '"omga",'), "channels: unknown quantity 'omga'; did you mean 'omega'"),
     "channel twice": (swapped('"omega",', '"u",'), "channels: 'u' stands there twice"),
     "unknown name": (equation("omega' = (torque - d*omga) / J"), "line 3: unknown name 'omga'; did you mean 'omega'"),

@@ -25,6 +25,7 @@ from analogrig_emulator import (
     preset,
 )
 from analogrig_emulator.circuit.opamp import PRESETS
+from tests.emulator.programs import circuit_of
 
 OFFSET_V, SAMPLES = 3e-3, 400
 JUMPS = [
@@ -37,7 +38,7 @@ NO_SLEW = replace(preset("tl07x"), slew_v_per_s=float("inf"))
 
 
 def fresh(model: OpAmpModel, program: str, seed: int) -> SuspensionComputer:
-    return SuspensionComputer(program, opamp=model, rng=np.random.default_rng(seed), offset_v=OFFSET_V)
+    return SuspensionComputer(circuit_of(program), opamp=model, rng=np.random.default_rng(seed), offset_v=OFFSET_V)
 
 
 def offsets_v(model: OpAmpModel, computer: SuspensionComputer, seed: int) -> np.ndarray:

@@ -37,7 +37,6 @@ from analogrig.hardware.calibration.fit import (
     _late_displacement,
     calibrate,
 )
-from analogrig.hardware.instrument import MEASURED
 from analogrig.plant import Plant
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
@@ -88,7 +87,7 @@ def test_pots_set_by_dials_are_identified_with_their_tracks() -> None:
 
 def recording_of(codes: np.ndarray, *, clipped: np.ndarray | None = None, scenario_n: int = 0) -> SquareWaveRecording:
     """A recording of a scenario of the plan (half a period: 50 samples), of these codes on both channels."""
-    channels = {name: Channel(-10.0, LSB_V, "V", 1.0, 0.0) for name in MEASURED}
+    channels = {name: Channel(-10.0, LSB_V, "V", 1.0, 0.0) for name in CHANNELS[:2]}
     both = np.stack([codes, codes], axis=1)
     hidden = np.zeros(both.shape, np.bool_) if clipped is None else np.stack([clipped, clipped], axis=1)
     return SquareWaveRecording(scenarios("front")[scenario_n], 50e-6, channels, both.astype(np.uint16), hidden)
@@ -208,7 +207,7 @@ class FaultyRig(Rig):
 
     def perform(self, scenario: Any, seed: int) -> Performance:
         del scenario, seed
-        channels = {name: Channel(-10.0, LSB_V, "V", 1.0, 0.0) for name in MEASURED}
+        channels = {name: Channel(-10.0, LSB_V, "V", 1.0, 0.0) for name in CHANNELS[:2]}
         return Performance(50e-6, 200.0, channels, self._blocks(), lambda: self._hindsight)
 
     def _blocks(self) -> Iterator[Block]:

@@ -342,9 +342,12 @@ WRONG = {
     "input = 2": ("input = 1", "force and displacement cannot both be at input 1"),
     'range = "HV" }\npots': ('range = "XV" }\npots', "inputs.displacement: range must be 'LV' or 'HV', not 'XV'"),
     "input = 1": ("input = 3", "inputs.force: input must be 1 and 2, not 3"),
-    "inputs.displacement": ("inputs.velocity", "inputs must be force and displacement, not force, velocity"),
+    "inputs.displacement": (
+        "inputs.velocity",
+        "inputs must be force and displacement, input and output of the program front, not force, velocity",
+    ),
     "generator.gain = 10.0": ("generator.gain = 0.0", "gain must be within"),
-    "gain = 10.0": ("gain = 10.0\ngenerator.offset_v = 50.0", "limits.force_v"),
+    "gain = 10.0": ("gain = 10.0\ngenerator.offset_v = 50.0", "limits.input_v"),
     "redpitaya://": ("picoscope://", "give it as redpitaya://HOST[:PORT] or nidaqmx://CARD"),
     "timeout_s": ("time_out_s", "unknown key 'time_out_s'"),
     'pots.kind = "instrument"\n': (
@@ -353,7 +356,7 @@ WRONG = {
     ),
     'pots.kind = "instrument"': ('pots.kind = "magic"', "pots"),
     "timeout_s = 60.0": ("timeout_s = 60.0\nlimits.dials.MASS = [0.1, 0.9]", "limits.dials: there is no pot 'MASS'"),
-    "10.0": ("10.0\ngenerator.offset_v = 15.0", "when it is off, the force input stands at offset_v, 15 V"),
+    "10.0": ("10.0\ngenerator.offset_v = 15.0", "when it is off, the computer's input stands at offset_v, 15 V"),
     '2, range = "HV"': (
         '2, range = "HV", least_v = 900.0',
         "inputs.displacement: 0 V at the computer must be within the measured",
@@ -375,9 +378,9 @@ def test_contradictory_description_is_one_line_with_file_and_key(right: str, tmp
 
 
 def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_path: Path) -> None:
-    name = described(tmp_path, lambda text: text + "limits.force_v = [0.0, 8.0]\nlimits.dials.M = [0.0, 0.5]\n")
+    name = described(tmp_path, lambda text: text + "limits.input_v = [0.0, 8.0]\nlimits.dials.M = [0.0, 0.5]\n")
     with open_allowed(name) as rig:  # there is no instrument: nothing is sent
-        with pytest.raises(ConfigurationError, match=r"force of 0.1 V to 9.9 V exceeds limits.force_v"):
+        with pytest.raises(ConfigurationError, match=r"excitation of 0.1 V to 9.9 V exceeds limits.input_v"):
             rig.perform(THESIS, 1)
         mild = dataclasses.replace(THESIS, excitation=dataclasses.replace(THESIS.excitation, high_v=7.0))
         with pytest.raises(ConfigurationError, match=r"tweaks\[3\] at sample 1600: pot M would stand at"):
@@ -406,7 +409,7 @@ def test_scenario_that_the_rig_cannot_play_is_refused(scenario: Scenario, said: 
 
 
 def test_rig_is_found_by_name_in_the_rigs_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    both = RIG + RIG.replace("rig.bench", "rig.shock").replace("pots", 'plant = "shock"\npots')
+    both = RIG + RIG.replace("rig.bench", "rig.shock").replace("pots", 'program = "shock"\npots')
     file = tmp_path / "rigs.toml"
     file.write_text(both.format(address="127.0.0.1:1", self_test="false"))
     monkeypatch.delenv("ANALOGRIG_RIGS", raising=False)
@@ -414,7 +417,7 @@ def test_rig_is_found_by_name_in_the_rigs_file(tmp_path: Path, monkeypatch: pyte
     with open_allowed("bench") as rig:
         assert rig.description()["name"] == "bench"
     with open_allowed(f"{file}:shock") as rig:
-        assert rig.description()["plant"] == "shock"
+        assert rig.description()["program"] == "shock"
     with open_rig("emulator") as rig:
         assert rig.description()["kind"] == "emulator"
     with pytest.raises(ConfigurationError, match=r"holds 2 rigs: name one as .*:NAME; there are bench, shock"):
@@ -458,6 +461,60 @@ def test_rig_with_drawn_components_is_judged_after_a_good_self_test(tmp_path: Pa
     with serving_in_thread(rig="emulator-real") as instrument:
         run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
     assert judge(run).outcome == "passed", judge(run).reasons
+
+
+# ---- other programs
+
+MOTOR = (
+    RIG.replace("inputs.force", "inputs.u").replace("inputs.displacement", "inputs.omega") + 'program = "dc-motor"\n'
+)
+
+
+def test_motor_is_tested_and_judged_as_on_the_emulated_rig(tmp_path: Path) -> None:
+    scenario = Scenario.load("dc-motor")
+    with serving_in_thread(program="dc-motor") as instrument:
+        file = instrument.rigs_file(tmp_path, self_test=True, template=MOTOR)
+        with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
+            verdict = judge(Bench(rig, dut).play(scenario, 1))
+    assert verdict.outcome == "passed", verdict.reasons
+    assert [change.latency_n for change in verdict.tweaks] == pytest.approx(
+        [change.latency_n for change in judge(played("emulator", scenario, 1)).tweaks], abs=3
+    )
+
+
+def test_program_of_a_rig_is_a_file_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "motor.toml").write_text((ROOT / "fixtures/programs/dc-motor.toml").read_text())
+    name = described(
+        tmp_path, lambda _: MOTOR.format(address="127.0.0.1:1", self_test="false").replace("dc-motor", "motor.toml")
+    )
+    description = describe(name)
+    assert isinstance(description, RealDescription)
+    assert description.patched == Program.load("dc-motor")
+    with open_allowed(name) as rig, pytest.raises(ConfigurationError, match="has 'dc-motor' patched"):
+        rig.perform(THESIS, 1)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('program = "nosuch"', "no program is called 'nosuch'"),
+        ('program = "two-tanks"', "inputs must be inflow and level1, input and output of the program two-tanks, not u"),
+        ("scaling.full.force = 3.0", "scaling.full: there is no channel 'force': there are u and omega"),
+        ("limits.dials.M = [0.0, 1.0]", "limits.dials: there is no pot 'M': there are "),
+    ],
+)
+def test_other_program_than_its_wiring_is_one_line(line: str, said: str, tmp_path: Path) -> None:
+    text = MOTOR.replace('program = "dc-motor"\n', "") if "program" in line else MOTOR
+    name = described(tmp_path, lambda _: text.format(address="127.0.0.1:1", self_test="false") + line + "\n")
+    with pytest.raises(ConfigurationError, match=said):
+        open_allowed(name)
+
+
+def test_changes_by_hand_of_a_program_that_cannot_be_dated_are_refused(tmp_path: Path) -> None:
+    by_hand = MOTOR.replace('pots.kind = "instrument"', 'pots.kind = "operator"')
+    name = described(tmp_path, lambda _: by_hand.format(address="127.0.0.1:1", self_test="false"))
+    with open_allowed(name) as rig, pytest.raises(ConfigurationError, match="estimated from the samples, .* dc-motor"):
+        rig.perform(Scenario.load("dc-motor"), 1)
 
 
 # ---- the shipped tests

@@ -11,6 +11,7 @@ import pytest
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
+from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
@@ -247,9 +248,6 @@ def test_noise_can_be_given_channel_by_channel(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("computer", "message"),
     [
-        ("values = { deviation = { R99 = 0.1 } }", "values: deviation: unknown key 'R99'"),
-        ("values = { deviation = { U1 = 0.1 } }", "values: deviation: unknown key 'U1'"),
-        ("values = { offset_v = { RF = 0.1 } }", r"values: offset_v: unknown key 'RF' \(known: U1, U2"),
         ("values = { offsets = { U1 = 0.1 } }", "values: unknown key 'offsets'"),
         ("values = { deviation = { RF = -1.0 } }", r"values: deviation.RF must be within \+-0.9, not -1"),
         ("values = { slew = { U1 = nan } }", "values: slew.U1: must be a number"),
@@ -260,6 +258,33 @@ def test_noise_can_be_given_channel_by_channel(tmp_path: Path) -> None:
 def test_wrong_measured_values_are_refused_by_name(tmp_path: Path, computer: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=f"own.toml: computer.*{message}"):
         open_rig(own(tmp_path, computer))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ("deviation = { R99 = 0.1 }", "values: deviation: unknown key 'R99' \\(known: RF, "),
+        ("deviation = { U1 = 0.1 }", "values: deviation: unknown key 'U1'"),
+        ("offset_v = { RF = 0.1 }", r"values: offset_v: unknown key 'RF' \(known: U1, U2"),
+        ("slew = { U6 = 0.1 }", r"values: slew: unknown key 'U6' \(known: U1, .*U5\)"),
+    ],
+)
+def test_measured_values_of_elements_that_a_program_lacks_are_refused(
+    tmp_path: Path, values: str, message: str
+) -> None:
+    with (
+        open_rig(own(tmp_path, f"values = {{ {values} }}")) as rig,
+        pytest.raises(ConfigurationError, match=message),
+    ):
+        rig.perform(Scenario.load("healthy"), 1)
+
+
+def test_measured_values_name_elements_of_any_program(tmp_path: Path) -> None:
+    scenario = Scenario.of_program(Program.load("dc-motor"))
+    with open_rig(own(tmp_path, "values = { deviation = { J = 0.2 }, offset_v = { U5 = 1e-3 } }")) as rig:
+        altered = next(rig.perform(scenario, 1).blocks).volts
+    with open_rig(own(tmp_path, "values = { }")) as rig:
+        assert not np.array_equal(next(rig.perform(scenario, 1).blocks).volts, altered)
 
 
 @pytest.mark.parametrize(("pots", "at_start", "after"), [("coefficient", 0.83, 0.6098), ("dial", 0.8199, 0.5966)])

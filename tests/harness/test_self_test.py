@@ -110,7 +110,7 @@ def test_machines_within_tolerance_are_well() -> None:
 
 
 def swap(codes: Codes) -> Codes:
-    return codes[:, [1, 0, 2, 3]]
+    return codes[:, [1, 0, *range(2, codes.shape[1])]]
 
 
 def invert_channel(channel: str) -> Callable[[Codes], Codes]:
@@ -452,9 +452,38 @@ def test_recording_cannot_be_tested(recorded_thesis: Path) -> None:
         self_test(rig, 3)
 
 
-def test_other_programs_cannot_be_tested() -> None:
-    with pytest.raises(SelfTestError, match="two-mass"):
-        self_test(emulate(), 1, "two-mass")
+@pytest.mark.parametrize("rig", ["emulator", "emulator-real"])
+def test_motor_is_tested_like_a_suspension(rig: str) -> None:
+    with open_rig(rig) as opened:
+        findings = self_test(opened, 1, "dc-motor")
+    assert findings.reasons == () and not findings.untested
+    assert value(findings, "shape of omega").state == "well"
+
+
+MOTOR_FAULTS: Mapping[str, tuple[dict[str, Any], Callable[[Codes], Codes]]] = {
+    "identity": ({}, swap),
+    "polarity of u": ({}, invert_channel("force")),
+    "polarity of omega": ({}, invert_channel("displacement")),
+    "gain of omega": ({"gain_error": [0.0, 0.1, 0, 0]}, lambda codes: codes),
+    "skew": ({"skew_s": [0.0, 1e-5, 0, 0]}, lambda codes: codes),
+}
+
+
+@pytest.mark.parametrize("title", MOTOR_FAULTS)
+def test_faults_of_a_motor_are_found_by_its_channels(title: str) -> None:
+    faults, alter = MOTOR_FAULTS[title]
+    assert wrong_titles(Altered(emulate(ranges=BIPOLAR, **faults), alter), "dc-motor") == [title]
+
+
+@pytest.mark.parametrize(
+    ("program", "why"), [("two-mass", "is not linear with two states"), ("pendulum", "is not linear with two states")]
+)
+def test_input_alone_is_tested_on_other_programs(program: str, why: str) -> None:
+    findings = self_test(emulate(ranges=BIPOLAR), 1, program)
+    assert findings.reasons == () and findings.untested == f"program {program} {why}"
+    assert wrong_titles(emulate(ranges=BIPOLAR, gain_error=[0.03, 0, 0, 0]), program)[:1] == [
+        f"gain of {findings.checks[-3].channel}"
+    ]
 
 
 RIG_FILE = """

@@ -753,7 +753,7 @@ def test_every_kind_of_device_and_pots_states_its_things() -> None:
     pots = {cls.__name__ for cls in get_args(PotsDescription) if not isinstance(cls.__dict__.get("things"), property)}
     assert pots == {"OperatorPots", "NoPots", "InstrumentPots"}
     inputs = {"force": Input(input=1, range="HV"), "displacement": Input(input=2, range="HV")}
-    things = {"redpitaya://bench": "bench:5000", "nidaqmx://Dev1": "nidaqmx://Dev1"}
+    things = {"redpitaya://bench": "bench:5000", "nidaqmx://Dev1": "nidaqmx://Dev1", "lucidac://box": "box:5732"}
     assert {url.partition(":")[0] for url in things} == set(DRIVERS)
     for url, name in things.items():
         assert RealDescription("real", url, inputs, InstrumentPots("instrument")).things[0].name == name

@@ -105,7 +105,7 @@ REAL_RIG: dict[str, Any] = {
         "displacement": {"input": 2, "range": "HV"},
     },
     "pots": {"kind": "instrument"},
-    "limits": {"force_v": [-1.0, 11.0], "dials": {"K": [0.0, 1.0]}},
+    "limits": {"input_v": [-1.0, 11.0], "dials": {"K": [0.0, 1.0]}},
     "scaling": {"time": 200.0, "force_n": 2940.0, "displacement_m": 0.2},
 }
 

@@ -54,10 +54,10 @@ class Served:
     def address(self) -> str:
         return str(self.said["address"])
 
-    def rigs_file(self, folder: Path, *, self_test: bool = False) -> Path:
+    def rigs_file(self, folder: Path, *, self_test: bool = False, template: str = RIG) -> Path:
         """Rigs file with the rig ``bench``: this instrument, correctly wired."""
         path = folder / "rigs.toml"
-        path.write_text(RIG.format(address=self.address, self_test=str(self_test).lower()))
+        path.write_text(template.format(address=self.address, self_test=str(self_test).lower()))
         return path
 
     def lucidac_file(self, folder: Path) -> str:
@@ -140,9 +140,9 @@ def ended(served: ServedByProcess, statuses: Sequence[int] = (0,)) -> str:
 
 
 @contextmanager
-def serving_in_thread(*defects: str, rig: str = "emulator") -> Iterator[Served]:
+def serving_in_thread(*defects: str, rig: str = "emulator", program: str = "front") -> Iterator[Served]:
     """Serve a rig with defects in a thread of this process until the end of the block: sooner than another process."""
-    server = Server(ServedDescription.load(rig, defects).set_up(Program.load("front"), DEFAULT_SEED))
+    server = Server(ServedDescription.load(rig, defects).set_up(Program.load(program), DEFAULT_SEED))
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()

@@ -253,6 +253,7 @@ class _Reader:
             raise ProgramError("states: there is none; name every quantity that has a derivative")
         if not self.inputs:
             raise ProgramError("inputs: there is none; name the quantity that the generator drives")
+        self._check_drive(*next(iter(self.inputs.items())))
         lines = list(self._lines())
         definitions = [line for line, primed in lines if not primed]
         self._complete_signals(definitions)
@@ -279,6 +280,14 @@ class _Reader:
             diagram=_text("diagram", self._table.get("diagram", "")),
             estimates=self._estimates(),
         )
+
+    @staticmethod
+    def _check_drive(name: str, driven: Quantity) -> None:
+        low, high = driven.trial
+        if not low < high:
+            raise ProgramError(
+                f"inputs.{name}.trial: [{low:g}, {high:g}] excites nothing; write a lower and a higher level"
+            )
 
     # ---- tables
 

@@ -1,4 +1,4 @@
-"""The programs front, shock and bump-stop: a quarter-car suspension, M x'' + B x' + K x = F, perhaps with a stop.
+"""The diagrams front and shock: a quarter-car suspension, M x'' + B x' + K x = F, wired by hand.
 
     U1 summer        -> -e_N = -(e_F - beta e_v - kappa e_x)
     pot M, U2        -> +e_v     integrator, R1 C1
@@ -14,13 +14,11 @@ The documentation draws the circuit.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from analogrig_emulator.circuit.circuit import (
     Capacitor,
-    DiodeLimiter,
     Element,
     OpAmp,
     Pot,
@@ -29,7 +27,6 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
-from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, ProgramCircuit, Scale, Scales
 
 
@@ -59,36 +56,10 @@ class SuspensionParts:
 
 
 @dataclass(frozen=True)
-class BumpStop:
-    """Second spring K_stop max(0, x - x_stop) of a suspension: a diode limiter from the summer's input to -e_x.
-
-    Beyond its threshold it draws (e_x - e_stop) / R_on, like one more input of the summer. off_ohm: its resistance
-    below the threshold. The defaults suit the front suspension: 60 kN/m beyond 0.1 m, or 24.55k beyond 5.01 V.
-    Raises CircuitError for values that are not positive and finite.
-    """
-
-    stop_m: float = 0.1
-    stiffness_n_per_m: float = 60e3
-    off_ohm: float = 1e9
-
-    def __post_init__(self) -> None:
-        for name in ("stop_m", "stiffness_n_per_m", "off_ohm"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise CircuitError(f"bump stop: {name} must be positive and finite, got {value!r}")
-
-    def limiter(self, scales: Scales, feedback_ohm: float) -> DiodeLimiter:
-        """Diode limiter for a suspension on these scales, with feedback_ohm across its summer."""
-        spring_at_feedback_n_per_m = scales.full("force") / scales.full("displacement")
-        on_ohm = feedback_ohm * spring_at_feedback_n_per_m / self.stiffness_n_per_m
-        return DiodeLimiter("STOP", "s1", "u3", self.stop_m * scales.volts("displacement"), on_ohm, self.off_ohm)
-
-
-@dataclass(frozen=True)
 class SuspensionProgram(ProgramCircuit):
     """Parameters with suitable scaling and nominal parts.
 
-    force_n, velocity_m_per_s: full scale, 10 V; the displacement's is time velocity R2 C2. stop: optional bump stop.
+    force_n, velocity_m_per_s: full scale, 10 V; the displacement's is time velocity R2 C2.
     """
 
     name: str
@@ -99,7 +70,6 @@ class SuspensionProgram(ProgramCircuit):
     parts: SuspensionParts = SuspensionParts()
     velocity_m_per_s: float = 2.0
     time: float = 200.0
-    stop: BumpStop | None = None
 
     @functools.cached_property
     def scales(self) -> Scales:
@@ -136,8 +106,7 @@ class SuspensionProgram(ProgramCircuit):
         return "U2", "U3"
 
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
-        elements = _netlist(self.parts, models)
-        return elements if self.stop is None else [*elements, self.stop.limiter(self.scales, self.parts.rfb_ohm)]
+        return _netlist(self.parts, models)
 
 
 FRONT = SuspensionProgram("front", 115.0, 3021.0, 24500.0, force_n=2940.0)
@@ -145,9 +114,6 @@ FRONT = SuspensionProgram("front", 115.0, 3021.0, 24500.0, force_n=2940.0)
 
 SHOCK = SuspensionProgram("shock", 2.0, 900.0, 12250.0, force_n=1470.0, parts=SuspensionParts(r1_ohm=10e3))
 """The shock absorber of the thesis; its mass pot feeds the integrator's gain-of-ten input."""
-
-BUMP_STOP = SuspensionProgram("bump-stop", 115.0, 3021.0, 24500.0, force_n=2940.0, stop=BumpStop())
-"""The front suspension with a bump stop."""
 
 
 def _netlist(parts: SuspensionParts, models: Sequence[OpAmpModel]) -> list[Element]:

@@ -22,13 +22,10 @@ from analogrig_emulator.engine.system import Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
 from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
-from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK
-from analogrig_emulator.machine.two_mass import TWO_MASS
+from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 
-PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType(
-    {program.name: program for program in (FRONT, SHOCK, BUMP_STOP, TWO_MASS)}
-)
-"""Programs by name."""
+PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
+"""Programs wired by hand, by name. Others are compiled from files."""
 
 BLOCK_SAMPLES = 32768
 """Default block, 1 MB: in smaller blocks the calls cost more than a quiet stretch."""
@@ -317,7 +314,7 @@ def _program(program: str | ProgramCircuit) -> ProgramCircuit:
     if isinstance(program, ProgramCircuit):
         return program
     if program not in PROGRAMS:
-        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}")
+        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_program(file)")
     return PROGRAMS[program]
 
 

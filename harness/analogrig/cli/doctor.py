@@ -6,7 +6,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trust_of
+from analogrig.cli.options import PROGRAM, add_command, add_json, add_rig, add_seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, show_work
 
 if TYPE_CHECKING:
@@ -20,13 +20,13 @@ def add(commands: Any) -> None:
         "test a rig: leads, ranges, gains, skew, noise, clocks",
         "doctor --rig emulator",
         "doctor --rig emulator-skewed --json",
-        "doctor --rig bench --program shock",
+        "doctor --rig bench --program dc-motor",
     )
     add_rig(command)
     command.add_argument(
         "--program",
-        choices=("front", "shock"),
-        help="program of the computer (default: that of the rig, or front)",
+        metavar=PROGRAM,
+        help="program of the computer: shipped name or .toml file (default: that of the rig, or front)",
     )
     add_seed(command)
     add_json(command)
@@ -37,9 +37,10 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import RigError
     from analogrig.hardware.self_test import self_test
     from analogrig.rigs.description import open_rig
+    from analogrig.scenario import DEFAULT_PROGRAM
 
     with open_rig(arguments.rig, self_test=False, allow=trust_of(arguments)) as rig:
-        program = arguments.program or str(rig.description().get("plant", "front"))
+        program = arguments.program or str(rig.description().get("program", DEFAULT_PROGRAM))
         try:
             with show_work(f"self-test of {arguments.rig}"):
                 findings = self_test(rig, arguments.seed, program)
@@ -62,6 +63,8 @@ def _text(findings: Findings) -> str:
         lines.append(_line(check))
         if check.state != "well":
             lines.append(f"{'':16}{check.remedy}")
+    if findings.untested:
+        lines.append(f"  the response of the output is not tested: {findings.untested}")
     return "\n".join(lines)
 
 
@@ -82,5 +85,6 @@ def _as_json(findings: Findings, seed: int) -> dict[str, Any]:
         "seed": seed,
         "well": findings.well,
         "checks": checks,
+        "untested": findings.untested,
         "reasons": list(findings.reasons),
     }

@@ -19,10 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordIncomplete, RigError
-from analogrig_emulator import CHANNELS, Excitation
-
-MEASURED = CHANNELS[:2]
-"""Channels of a rig that are wired to the instrument: force and displacement of a suspension."""
+from analogrig_emulator import Excitation
 
 _ROUNDING_V = 1e-9
 EARLY_N = 1e-4

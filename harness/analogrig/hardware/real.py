@@ -1,6 +1,6 @@
 """Rig of a real analogue computer on an instrument: the same scenarios, the same blocks of codes.
 
-    generator -> stage -> force input of the computer        force, displacement -> stages -> inputs of the instrument
+    generator -> stage -> input of the computer        its input and output -> stages -> inputs of the instrument
 
 The instrument's records are not gap-free. A scenario longer than one record is played in several, each from rest, and
 the device restarts with each.
@@ -19,14 +19,13 @@ from typing import Any
 
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
 from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
-from analogrig.hardware.dating.two_filter import Signals
-from analogrig.hardware.instrument import MEASURED, DialChange, InputRecord, Instrument, Pots, find_driver
+from analogrig.hardware.dating.two_filter import Signals, can_date
+from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
 from analogrig.hardware.lock import lock_instrument
 from analogrig.hardware.self_test import self_test
 from analogrig.hardware.wiring import RealDescription, check_wiring
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant, Segment
-from analogrig.program import Program
 from analogrig.rigs.emulator import Stream, emulator_errors
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
 from analogrig.scenario import Scenario
@@ -109,16 +108,16 @@ class RealRig(Rig):
     def _plan(self, scenario: Scenario, seed: int) -> PlayPlan:
         """:raises ConfigurationError: the rig cannot play the scenario, or it would exceed the limits."""
         description, where = self._description, f"scenario {scenario.name}: "
-        if scenario.program != Program.load(description.plant):
+        if scenario.program != description.patched:
             raise ConfigurationError(
                 f"{where}wants the program {scenario.program.name!r}; {description.name or 'the rig'} has"
-                f" {description.plant!r} patched"
+                f" {description.patched.name!r} patched"
             )
         computer = SuspensionComputer(scenario.program.circuit)
         with emulator_errors(where):
             computer.set(**scenario.set)
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
-        self._check_force(excitation, where)
+        self._check_levels(excitation, where)
         description.check_dials(computer.dials, where)
         changes: list[PlannedChange] = []
         plant = scenario.plant
@@ -126,6 +125,11 @@ class RealRig(Rig):
             place = f"{where}tweaks[{i}] at sample {tweak.sample}: "
             if not description.pots.changeable:
                 raise ConfigurationError(f'{place}the pots of this rig cannot be changed: they have kind = "none"')
+            if not description.pots.exact and not can_date(scenario.program):
+                raise ConfigurationError(
+                    f"{place}the instant of a change by these pots is estimated from the samples, and that needs a"
+                    f" linear program of two states and three parameters, not {scenario.program.name}"
+                )
             if tweak.ramp_n:
                 raise ConfigurationError(f"{place}the pots of this rig jump, they do not turn evenly: leave out ramp_n")
             with emulator_errors(place):
@@ -136,12 +140,13 @@ class RealRig(Rig):
         dated = None if description.pots.exact else [Segment(0, scenario.plant)]
         return PlayPlan(computer, excitation, tuple(changes), [], dated)
 
-    def _check_force(self, excitation: Excitation, where: str) -> None:
-        low_v, high_v = self._description.limits.force_v
+    def _check_levels(self, excitation: Excitation, where: str) -> None:
+        low_v, high_v = self._description.limits.input_v
         least_v, most_v = excitation.range_v
         if least_v < low_v or most_v > high_v:
             raise ConfigurationError(
-                f"{where}the force of {least_v:g} V to {most_v:g} V exceeds limits.force_v, {low_v:g} V to {high_v:g} V"
+                f"{where}the excitation of {least_v:g} V to {most_v:g} V exceeds limits.input_v, {low_v:g} V to"
+                f" {high_v:g} V"
             )
         try:
             self._description.driver.check(self._description.at_generator(excitation))
@@ -154,7 +159,7 @@ class RealRig(Rig):
         if self._caveats is None:
             self._test()
         instrument, pots = self._open()
-        inputs = [self._description.inputs[name] for name in MEASURED]
+        inputs = [self._description.inputs[name] for name in self._description.patched.measured]
         instrument.set_inputs([(each.input, each.range) for each in inputs])
         instrument.set_excitation(self._description.at_generator(plan.excitation))
         channels = self._description.channels(plan.computer, self._noise_lsb)
@@ -175,7 +180,7 @@ class RealRig(Rig):
             measured = Signals.of(codes, clipped, channels, period_s)
             if plan.dated is not None:
                 plan.dated.extend(by_hand.date(measured, start))
-            else:
+            elif can_date(scenario.program):
                 plan.contradictions.extend(contradictions(measured, changes, start))
             for first in range(0, len(codes), BLOCK_SAMPLES):
                 part = slice(first, first + BLOCK_SAMPLES)
@@ -242,7 +247,7 @@ class RealRig(Rig):
             self._is_locked = True
         if self._instrument is None:
             self._instrument = self._connect(self._address, description.timeout_s)
-            self._instrument.patch(description.plant)
+            self._instrument.patch(description.program)
         if self._pots is None:
             own = description.pots.exact
             self._pots = self._instrument.find_pots(description.pot_names) if own else description.pots.open()
@@ -255,7 +260,7 @@ class RealRig(Rig):
         """
         self._caveats = ()  # plays of the self-test itself are not tested
         try:
-            findings = self_test(self, SELF_TEST_SEED, self._description.plant)
+            findings = self_test(self, SELF_TEST_SEED, self._description.program)
         except (SelfTestError, ConfigurationError) as error:
             self._caveats = (f"the rig's self-test could not be made: {error}",)
             return

@@ -1,14 +1,15 @@
 """Self-test: finds the faults of a rig before any device is judged on it.
 
-It plays one square wave, and estimates all quantities of the rig from force and displacement:
+It plays one square wave, and estimates all quantities of the rig from input and output of the plant:
 
-    levels of the force              polarity, gain, offset, noise, range use, clipping
-    edges of the force               bounds of each instant
-    response of the displacement     polarity, gain, offset, mass, damping, noise, and timing of the edges
-    both                             identity, skew; with the commanded frequency: clock ratio
+    levels of the input         polarity, gain, offset, noise, range use, clipping
+    edges of the input          bounds of each instant
+    response of the output      polarity, gain, offset, mass, damping, noise, and timing of the edges
+    both                        identity, skew; with the commanded frequency: clock ratio
 
-The displacement is compared with the force as measured and as commanded; the closer match is used. So an error of the
-generator, or of the force's input, is not reported twice.
+The output is compared with the input as measured and as commanded; the closer match is used. So an error of the
+generator, or of the channel of the input, is not reported twice. The response is that of a linear plant of second order
+without zeros; on other programs it is not tested.
 
 The limits admit every machine of 1 % resistors, 5 % capacitors and amplifiers with 3 mV of offset, and nothing within
 them affects a verdict. harness/docs/background/self-test.md gives the reasons.
@@ -26,14 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import SelfTestError
-from analogrig.hardware.instrument import MEASURED
 from analogrig.hardware.square_wave import Response, SquareWave, Uncertain
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig.rigs.rig import Rig
 from analogrig.run import Channel
-from analogrig.scenario import Scenario
+from analogrig.scenario import DEFAULT_PROGRAM, Scenario
 from analogrig_emulator import Excitation
 
 State = Literal["well", "wrong", "not measured"]
@@ -49,11 +49,11 @@ limit is then found with a probability of at least 0.9987."""
 LEAST_SHARPER = 0.3
 MOST_CLIPPED = 1e-3
 LEAST_CODES = 1000.0
-MOST_FORCE_GAIN, MOST_GAIN = 0.01, 0.05
+MOST_INPUT_GAIN, MOST_GAIN = 0.01, 0.05
 MOST_OFFSET_V = 0.06
 MOST_NOISE = 2e-3
 MOST_SKEW_N, MOST_SKEW_S = 0.1, 5e-6
-"""The larger counts; both are the same at 20 kHz. The effect of skew on the displacement depends on time: 5 to 6 LSB of
+"""The larger counts; both are the same at 20 kHz. The effect of skew on the output depends on time: 5 to 6 LSB of
 12 bits per microsecond. At high rates a tenth of a sample would limit the delay of the amplifiers, which two channels
 cannot separate from that of the card."""
 MOST_CLOCK_PPM = 50.0
@@ -61,7 +61,7 @@ MOST_MASS, MOST_DAMPING = 0.3, 0.15
 MOST_SHAPE, LEAST_SHAPE_LSB = 3e-4, 0.5
 
 AMPLIFIERS_S = Uncertain(0.625e-6, 0.5e-6)
-"""Delay of the displacement by the computer's amplifiers: 0.62 us with TL07x, 1.2 us with polyester capacitors too, 0
+"""Delay of the output by the computer's amplifiers: 0.62 us with TL07x, 1.2 us with polyester capacitors too, 0
 with ideal ones. The 9.5 us of a 741 are reported as skew."""
 
 LEAST_SWING_V = 0.25
@@ -70,18 +70,26 @@ LEAST_SWING_V = 0.25
 SAMPLES = 16_384
 """Samples that an instrument of the class of a Red Pitaya takes without a gap."""
 
-LOW_V, HIGH_V = 0.5, 9.5
-"""Levels at the computer's input. No signal of a healthy computer comes near its limits, or falls below 0 V."""
+LEVEL_PARTS = 0.05, 0.95
+"""Levels at the computer's input, as parts of the range of the program's trial play. No signal of a healthy computer
+comes near its limits. Levels that are negatives of each other would hide an inversion: the lower is at most half the
+upper."""
 
-FREQUENCY_HZ = 823 * 125e6 / 2**30
-"""95.81 Hz: half periods of 104 samples, after which all signals have settled. It is a multiple of the resolution of a
-Red Pitaya's generator (30 bits). At 20 kHz the edges of 0.8 s sample all parts of a sample period, at most 0.017
-apart."""
+GENERATOR_HZ = 125e6 / 2**30
+"""Resolution of a Red Pitaya's generator (30 bits)."""
+
+FREQUENCY_HZ = 823 * GENERATOR_HZ
+"""95.81 Hz: half periods of 104 samples. At 20 kHz the edges of 0.8 s sample all parts of a sample period, at most
+0.017 apart."""
+
+SETTLING_TIMES = 11.5
+"""Least half period, in time constants of the slowest pole: after it a signal has settled to 1e-5."""
 
 LEAST_PERIODS = 13
 """Fewest periods in the record that determine the timing of the edges and the noise."""
 
-PROGRAMS = ("front", "shock")
+SLOWEST_HZ = LEAST_PERIODS * 20e3 / SAMPLES
+"""Least frequency of the square wave at 20 kHz."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +150,8 @@ class Findings:
     rig: str
     program: str
     checks: tuple[Check, ...]
+    untested: str = ""
+    """Reason why the response of the output is not tested; empty if it is."""
 
     def in_state(self, state: State) -> tuple[Check, ...]:
         """Checks that are in ``state``."""
@@ -158,21 +168,24 @@ class Findings:
         return tuple(check.sentence for check in (*self.in_state("wrong"), *self.in_state("not measured")))
 
 
-def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
+def self_test(rig: Rig, seed: int, name: str = DEFAULT_PROGRAM) -> Findings:
     """Play the self-test on a rig and return its findings.
 
-    :param program: program wired on the computer: front or shock.
+    :param name: program wired on the computer: a shipped name or a .toml file.
     :raises ConfigurationError: the rig cannot play it.
-    :raises SelfTestError: it is not possible: no signal, a drop-out, a rig too fast, an unsupported program.
+    :raises SelfTestError: it is not possible: no signal, a drop-out, a rig too fast.
     :raises RigError: the rig failed.
     """
-    if program not in PROGRAMS:
-        raise SelfTestError(f"the self-test supports the programs {', '.join(PROGRAMS)}, not {program}")
-    excitation = Excitation(low_v=LOW_V, high_v=HIGH_V, frequency_hz=FREQUENCY_HZ, clock="free")
-    scenario = Scenario(SAMPLES, excitation, Program.load(program), random_phase=True, name="self-test")
+    program = Program.load(name)
+    plant = Plant.of(program)
+    untested = _why_untested(plant)
+    frequency_hz = FREQUENCY_HZ if untested else _frequency_hz(plant)
+    low_v, high_v = _levels_v(program)
+    excitation = Excitation(low_v=low_v, high_v=high_v, frequency_hz=frequency_hz, clock="free")
+    scenario = Scenario(SAMPLES, excitation, program, random_phase=True, name="self-test")
     performance = rig.perform(scenario, seed)
-    if performance.sample_period_s * SAMPLES * FREQUENCY_HZ < LEAST_PERIODS:
-        most_hz = SAMPLES * FREQUENCY_HZ / LEAST_PERIODS
+    if performance.sample_period_s * SAMPLES * frequency_hz < LEAST_PERIODS:
+        most_hz = SAMPLES * frequency_hz / LEAST_PERIODS
         rate_hz = 1.0 / performance.sample_period_s
         raise SelfTestError(f"the self-test goes up to {most_hz:.0f} samples/s, and the rig takes {rate_hz:.0f}")
     blocks = list(performance.blocks)
@@ -181,13 +194,46 @@ def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
         raise SelfTestError(f"the rig gave {len(codes)} of {SAMPLES} samples")
     if len({block.record for block in blocks}) > 1:
         raise SelfTestError(f"the rig does not take {SAMPLES} samples without a gap")
-    half_period_n = 0.5 / (FREQUENCY_HZ * performance.sample_period_s)
-    force, displacement = (
+    half_period_n = 0.5 / (frequency_hz * performance.sample_period_s)
+    driven, answer = (
         _Signal(name, performance.channels[name], codes[:, i], clipped[:, i], half_period_n)
-        for i, name in enumerate(MEASURED)
+        for i, name in enumerate(program.measured)
     )
-    analysis = _Analysis(force, displacement, scenario.plant, performance.sample_period_s, performance.time_scale)
-    return Findings(str(rig.description().get("name", "")), program, analysis.checks())
+    analysis = _Analysis(driven, answer, plant, (low_v, high_v), performance.sample_period_s, performance.time_scale)
+    checks = analysis.checks_of_input() if untested else analysis.checks()
+    return Findings(str(rig.description().get("name", "")), program.name, checks, untested)
+
+
+def _levels_v(program: Program) -> tuple[float, float]:
+    """Levels of the square wave at the computer's input."""
+    driven = program.channels[0]
+    volts = program.circuit.scales.volts(driven)
+    low_v, high_v = (level * volts for level in program.equations.inputs[driven].trial)
+    low_v, high_v = (low_v + part * (high_v - low_v) for part in LEVEL_PARTS)
+    return max(low_v, -0.5 * high_v) if high_v > 0.0 else low_v, high_v
+
+
+def _why_untested(plant: Plant) -> str:
+    """Reason why the response of the plant cannot be tested; empty if it can."""
+    program = plant.program
+    if not program.is_linear or len(program.equations.states) != 2:
+        return f"program {program.name} is not linear with two states"
+    step = program.generators(np.array([plant.values]))[0]
+    output, rates, driven = step[-1, :-1], step[:-1, :-1], step[:-1, -1]
+    if abs(output @ driven) > 1e-9 * np.linalg.norm(output) * np.linalg.norm(driven):
+        return f"the input of program {program.name} reaches the rate of its output at once"
+    if not np.linalg.eigvals(rates).real.max() < 0.0:
+        return f"program {program.name} does not come to rest"
+    if _frequency_hz(plant) < SLOWEST_HZ:
+        return f"program {program.name} settles too slowly"
+    return ""
+
+
+def _frequency_hz(plant: Plant) -> float:
+    """Frequency of the square wave, in machine time, whose half periods the signals settle in."""
+    slowest = -np.linalg.eigvals(plant.program.generators(np.array([plant.values]))[0][:-1, :-1]).real.max()
+    most_hz = float(slowest) * plant.program.equations.speed / (2.0 * SETTLING_TIMES)
+    return min(FREQUENCY_HZ, (most_hz // GENERATOR_HZ) * GENERATOR_HZ)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,9 +309,13 @@ class _Signal:
 class _Analysis:
     """Checks of a record."""
 
-    force: _Signal
-    displacement: _Signal
+    driven: _Signal
+    """Signal of the program's input."""
+    answer: _Signal
+    """Signal of its output."""
     plant: Plant
+    commanded_v: tuple[float, float]
+    """Levels of the square wave."""
     sample_period_s: float
     time_scale: float
 
@@ -274,15 +324,8 @@ class _Analysis:
 
         :raises SelfTestError: the record has no signal, or a drop-out.
         """
-        signals = (self.force, self.displacement)
-        still = [each for each in signals if each.swing_v <= LEAST_SWING_V]
-        if off_scale := tuple(each.clipping() for each in still if each.clipped.mean() > 0.5):
+        if off_scale := self._off_scale():
             return off_scale
-        if still:
-            raise SelfTestError(
-                f"no signal on {still[0].name}, which moves by {still[0].swing_v:.2g} V: check the generator, the"
-                " computer's operation, and the lead"
-            )
         identity = self._identity()
         if identity.state == "wrong":
             return (identity,)
@@ -291,81 +334,137 @@ class _Analysis:
             return leads
         return (
             *leads,
-            *(each.clipping() for each in signals),
-            *(each.range_use() for each in signals),
-            *self._force(),
-            self.force.noise(self._force_noise),
+            *self._range_checks(),
+            *self._input_checks(self._gains, self._offsets),
+            self.driven.noise(self._input_noise),
             *self._response_checks(),
         )
+
+    def checks_of_input(self) -> tuple[Check, ...]:
+        """Checks that need no model of the plant; only the first fault if it makes the others meaningless.
+
+        :raises SelfTestError: as ``checks``.
+        """
+        if off_scale := self._off_scale():
+            return off_scale
+        polarity = self.driven.polarity(self._input_sign)
+        if polarity.state == "wrong":
+            return (polarity,)
+        noise = self.driven.noise(self._input_noise)
+        return (polarity, *self._range_checks(), *self._input_checks(None, None), noise)
+
+    @property
+    def _signals(self) -> tuple[_Signal, _Signal]:
+        return self.driven, self.answer
+
+    def _off_scale(self) -> tuple[Check, ...]:
+        """Clipping of signals that stand at an end of the range.
+
+        :raises SelfTestError: a signal stands within it.
+        """
+        still = [each for each in self._signals if each.swing_v <= LEAST_SWING_V]
+        if off_scale := tuple(each.clipping() for each in still if each.clipped.mean() > 0.5):
+            return off_scale
+        if still:
+            raise SelfTestError(
+                f"no signal on {still[0].name}, which moves by {still[0].swing_v:.2g} V: check the generator, the"
+                " computer's operation, and the lead"
+            )
+        return ()
+
+    def _range_checks(self) -> Iterator[Check]:
+        yield from (each.clipping() for each in self._signals)
+        yield from (each.range_use() for each in self._signals)
 
     # ---- leads
 
     def _identity(self) -> Check:
-        sharper = self.force.sharpness - self.displacement.sharpness
-        swapped = "the leads of force and displacement are swapped: exchange them"
+        sharper = self.driven.sharpness - self.answer.sharpness
+        swapped = f"the leads of {self.driven.name} and {self.answer.name} are swapped: exchange them"
         both = "both inputs see much the same signal: one of the leads is in the wrong jack"
         advice = swapped if sharper < -LEAST_SHARPER else both
         return Check("identity", "", sharper, 0.0, LEAST_SHARPER, 1.0, "of the swing", advice)
 
     def _polarity(self) -> tuple[Check, Check]:
-        """Polarity of both channels; the force is inverted if its levels match the negated commands better."""
-        low_v, high_v = self._levels_v
-        upright, inverted = abs(low_v - LOW_V) + abs(high_v - HIGH_V), abs(low_v + HIGH_V) + abs(high_v + LOW_V)
+        """Polarity of both channels; an inverting plant answers a high input with a low output."""
         state = self._wave.state
-        settled = state == np.roll(state, int(0.5 * self.force.half_period_n))
-        high, low = (np.median(self.displacement.volts[settled & (state == level)]) for level in (1, 0))
-        answer, force = 1.0 if high > low else -1.0, 1.0 if upright < inverted else -1.0
-        return self.force.polarity(force), self.displacement.polarity(max(answer, answer * force))
+        settled = state == np.roll(state, int(0.5 * self.driven.half_period_n))
+        high, low = (np.median(self.answer.volts[settled & (state == level)]) for level in (1, 0))
+        answer = math.copysign(1.0, (high - low) * self.plant.response()["gain"])
+        driven = self._input_sign
+        return self.driven.polarity(driven), self.answer.polarity(max(answer, answer * driven))
 
-    # ---- force
+    @property
+    def _input_sign(self) -> float:
+        """Sign of the input: -1 if its levels match the negated commands better."""
+        (low_v, high_v), (low, high) = self._levels_v, self.commanded_v
+        upright, inverted = abs(low_v - low) + abs(high_v - high), abs(low_v + high) + abs(high_v + low)
+        return 1.0 if upright < inverted else -1.0
+
+    # ---- input
 
     @cached_property
     def _wave(self) -> SquareWave:
-        return SquareWave.of(self.force.codes, self.force.half_period_n)
+        return SquareWave.of(self.driven.codes, self.driven.half_period_n)
 
     @cached_property
     def _levels_v(self) -> tuple[float, float]:
-        low, high = (float(self.force.volts[self._wave.state == level].mean()) for level in (0, 1))
+        low, high = (float(self.driven.volts[self._wave.state == level].mean()) for level in (0, 1))
         return low, high
 
     @cached_property
     def _is_clipped(self) -> bool:
-        """True if the levels of the force are clipped."""
-        return float(self.force.clipped.mean()) > MOST_CLIPPED
+        """True if the levels of the input are clipped."""
+        return float(self.driven.clipped.mean()) > MOST_CLIPPED
 
     @cached_property
-    def _force_noise(self) -> Uncertain:
+    def _input_noise(self) -> Uncertain:
         return self._wave.noise()
 
     @cached_property
-    def _force_gain(self) -> Uncertain:
-        """Deviation of the force's swing from the commanded one."""
+    def _input_gain(self) -> Uncertain:
+        """Deviation of the input's swing from the commanded one."""
         low_v, high_v = self._levels_v
-        span_v = HIGH_V - LOW_V
+        span_v = self.commanded_v[1] - self.commanded_v[0]
         return Uncertain((high_v - low_v) / span_v - 1.0, math.sqrt(2.0) * self._level_error_v / span_v)
 
     @cached_property
-    def _force_offset(self) -> Uncertain:
-        """Force at a command of 0, V."""
-        return Uncertain(self._levels_v[0] - (1.0 + self._force_gain.value) * LOW_V, 1.1 * self._level_error_v)
+    def _input_offset(self) -> Uncertain:
+        """Input at a command of 0, V."""
+        return Uncertain(
+            self._levels_v[0] - (1.0 + self._input_gain.value) * self.commanded_v[0], 1.1 * self._level_error_v
+        )
 
     @property
     def _level_error_v(self) -> float:
         """Standard error of a level: noise, and quantisation as far as noise does not smooth it (Widrow)."""
-        rms_lsb = self._force_noise.value
+        rms_lsb = self._input_noise.value
         smoothed = math.exp(-2.0 * (math.pi * _remove_quantisation(rms_lsb)) ** 2) / (math.sqrt(2.0) * math.pi)
-        return math.hypot(rms_lsb / math.sqrt(0.4 * SAMPLES), smoothed) * self.force.channel.lsb_v
+        return math.hypot(rms_lsb / math.sqrt(0.4 * SAMPLES), smoothed) * self.driven.channel.lsb_v
 
-    def _force(self) -> tuple[Check, Check]:
+    def _input_checks(
+        self, gains: tuple[float, float] | None, offsets: tuple[float, float] | None
+    ) -> tuple[Check, Check]:
+        """Checks of gain and offset; both are those of the output's ``_gains`` and ``_offsets``, None if unknown."""
+        name = self.driven.name
         if self._is_clipped:
-            why = "the levels of the force are clipped"
-            return _not_measured("gain", "force", why), _not_measured("offset", "force", why)
+            why = f"the levels of the {name} are clipped"
+            return _not_measured("gain", name, why), _not_measured("offset", name, why)
         return (
-            self.force.gain(self._force_gain, MOST_FORCE_GAIN, _force_hint(*self._gains)),
-            self.force.offset(self._force_offset, _force_hint(*self._offsets)),
+            self.driven.gain(self._input_gain, MOST_INPUT_GAIN, self._input_hint(gains)),
+            self.driven.offset(self._input_offset, self._input_hint(offsets)),
         )
 
-    # ---- response of the displacement
+    def _input_hint(self, deviations: tuple[float, float] | None) -> str:
+        """Place of an error of the input, from the output's deviations by the measured and the commanded input."""
+        driven, answer = self.driven.name, self.answer.name
+        if deviations is None:
+            return f": check the generator and its amplifier, and range and amplifier of the {driven}'s input"
+        if abs(deviations[0]) < abs(deviations[1]):
+            return f", and the {answer} follows it: check the generator and its amplifier"
+        return f", and the {answer} does not follow it: check the range and the amplifier of the {driven}'s input"
+
+    # ---- response of the output
 
     @cached_property
     def _nominal(self) -> tuple[float, float]:
@@ -376,43 +475,43 @@ class _Analysis:
 
     @cached_property
     def _response(self) -> Response:
-        """Response in volts after the second edge, to the force as measured, or as commanded if that was clipped."""
-        used = ~self.displacement.clipped
+        """Response in volts after the second edge, to the input as measured, or as commanded if that was clipped."""
+        used = ~self.answer.clipped
         used[: self._wave.after[1]] = False
-        levels = (LOW_V, HIGH_V) if self._is_clipped else self._levels_v
-        return Response.fit(self.displacement.volts, used, self._wave, levels, self._nominal)
+        levels = self.commanded_v if self._is_clipped else self._levels_v
+        return Response.fit(self.answer.volts, used, self._wave, levels, self._nominal)
 
     @cached_property
     def _gains(self) -> tuple[float, float]:
-        """Deviation of the displacement's static gain, by the force as measured and as commanded."""
-        unit_per_v = self.displacement.channel.unit_per_v / self.force.channel.unit_per_v
+        """Deviation of the output's static gain, by the input as measured and as commanded."""
+        unit_per_v = self.answer.channel.unit_per_v / self.driven.channel.unit_per_v
         measured = self._response.gain.value / self.plant.response()["gain"] * unit_per_v - 1.0
-        return measured, measured if self._is_clipped else (1.0 + measured) * (1.0 + self._force_gain.value) - 1.0
+        return measured, measured if self._is_clipped else (1.0 + measured) * (1.0 + self._input_gain.value) - 1.0
 
     @cached_property
     def _offsets(self) -> tuple[float, float]:
-        """Displacement without force, V, by the force as measured and as commanded."""
+        """Output without input, V, by the input as measured and as commanded."""
         measured = self._response.offset.value
-        return measured, measured + (0.0 if self._is_clipped else self._response.gain.value * self._force_offset.value)
+        return measured, measured + (0.0 if self._is_clipped else self._response.gain.value * self._input_offset.value)
 
     def _response_checks(self) -> tuple[Check, ...]:
         """Checks that are read from the response; most are not measured if its shape is wrong."""
-        response, lsb_v = self._response, self.displacement.channel.lsb_v
-        noise_v = response.noise(self.displacement.half_period_n)
+        response, lsb_v = self._response, self.answer.channel.lsb_v
+        noise_v = response.noise(self.answer.half_period_n)
         shape = self._shape(Uncertain(*(each / lsb_v for each in response.unexplained(noise_v.value))))
         if shape.state == "wrong":
-            why = "it is read from the shape of the displacement, which is wrong"
-            names = [(name, "displacement") for name in ("gain", "offset", "noise")]
+            why = f"it is read from the shape of the {self.answer.name}, which is wrong"
+            names = [(name, self.answer.name) for name in ("gain", "offset", "noise")]
             names += [(name, "") for name in ("skew", "mass", "damping")]
             return (self._clock_ratio(), shape, *(_not_measured(name, channel, why) for name, channel in names))
         gain, offset = min(self._gains, key=abs), min(self._offsets, key=abs)
-        gain_error = math.hypot(response.gain.error / abs(response.gain.value), self._force_gain.error)
-        offset_error = math.hypot(response.offset.error, response.gain.value * self._force_offset.error)
-        hint = ": check the range and amplifier of its input, and set the pot of K again"
+        gain_error = math.hypot(response.gain.error / abs(response.gain.value), self._input_gain.error)
+        offset_error = math.hypot(response.offset.error, response.gain.value * self._input_offset.error)
+        hint = f": check the range and amplifier of its input, and set {self._pot_of('stiffness')} again"
         return (
-            self.displacement.gain(Uncertain(gain, gain_error), MOST_GAIN, hint),
-            self.displacement.offset(Uncertain(offset, offset_error), hint),
-            self.displacement.noise(Uncertain(*(each / lsb_v for each in noise_v))),
+            self.answer.gain(Uncertain(gain, gain_error), MOST_GAIN, hint),
+            self.answer.offset(Uncertain(offset, offset_error), hint),
+            self.answer.noise(Uncertain(*(each / lsb_v for each in noise_v))),
             self._skew(),
             self._clock_ratio(),
             *self._machine(),
@@ -421,11 +520,9 @@ class _Analysis:
 
     def _shape(self, lsb: Uncertain) -> Check:
         """Check of ``lsb``, the rms of the residual that noise does not explain."""
-        advice = (
-            "the displacement is not that of a mass, a damper and a spring: check for overload, stuck bits, program"
-        )
-        most = max(MOST_SHAPE * self.displacement.swing_codes, LEAST_SHAPE_LSB)
-        return Check("shape", "displacement", *lsb, 0.0, most, "LSB", advice)
+        advice = f"the {self.answer.name} is not that of the program: check for overload, stuck bits, program"
+        most = max(MOST_SHAPE * self.answer.swing_codes, LEAST_SHAPE_LSB)
+        return Check("shape", self.answer.name, *lsb, 0.0, most, "LSB", advice)
 
     def _skew(self) -> Check:
         drift_n = 3.0 * self._response.period_error_n * float(np.abs(self._wave.turn).max())
@@ -435,14 +532,15 @@ class _Analysis:
         late, slow = ("later", "") if late_n > 0.0 else ("earlier", ", and check the type of the amplifiers")
         by = f"{1e6 * abs(late_n) * self.sample_period_s:.2g} us"
         advice = (
-            f"the displacement is taken {late} than the force by {by}: have the card sample both at one instant{slow}"
+            f"the {self.answer.name} is taken {late} than the {self.driven.name} by {by}: have the card sample both at"
+            f" one instant{slow}"
         )
         most = max(MOST_SKEW_N, MOST_SKEW_S / self.sample_period_s)
         return Check("skew", "", late_n, error_n, -most, most, "samples", advice)
 
     def _clock_ratio(self) -> Check:
         period_n = self._response.times.period_n
-        ppm = 1e6 * (2.0 * self.force.half_period_n / period_n - 1.0)
+        ppm = 1e6 * (2.0 * self.driven.half_period_n / period_n - 1.0)
         advice = (
             f"the generator is {abs(ppm):.0f} ppm {'fast' if ppm > 0.0 else 'slow'} by the card's clock: give both one"
             f" clock, or set the frequency to {1.0 - 1e-6 * ppm:.6f} of the desired one"
@@ -450,20 +548,24 @@ class _Analysis:
         error = 1e6 * self._response.period_error_n / period_n
         return Check("clock ratio", "", ppm, error, -MOST_CLOCK_PPM, MOST_CLOCK_PPM, "ppm", advice)
 
+    def _pot_of(self, diagnosis: str) -> str:
+        """Pot of the parameter that diagnoses give this name, or all pots."""
+        name = self.plant.program.diagnosed.get(diagnosis)
+        return f"the pot of {name}" if name else "the pots"
+
     def _machine(self) -> Iterator[Check]:
-        """Checks of mass and damping."""
+        """Checks of mass and damping, those of a spring that gives the same response."""
         fitted = (self._response.mass_n2, self._response.damping_n)
-        for name, found, nominal, most, pot, parts in zip(
+        for name, found, nominal, most, parts in zip(
             ("mass", "damping"),
             fitted,
             self._nominal,
             (MOST_MASS, MOST_DAMPING),
-            "MB",
-            ("C1 and C2", "C2"),
+            ("the capacitors of both integrators", "that of the second one"),
             strict=True,
         ):
             off = found.value / nominal - 1.0
-            advice = f"{pot} is {off:+.0%} relative to K: set the pot of {pot} again, and check {parts}"
+            advice = f"it is {off:+.0%} relative to the spring: set {self._pot_of(name)} again, and check {parts}"
             yield Check(name, "", off, found.error / nominal, -most, most, "off nominal", advice)
 
 
@@ -474,10 +576,3 @@ def _remove_quantisation(rms_lsb: float) -> float:
 
 def _not_measured(name: str, channel: str, why: str) -> Check:
     return Check(name, channel, math.nan, math.nan, -math.inf, math.inf, "", why)
-
-
-def _force_hint(by_measured: float, by_commanded: float) -> str:
-    """Place of an error of the force, from the displacement's deviations by the measured and the commanded force."""
-    if abs(by_measured) < abs(by_commanded):
-        return ", and the displacement follows it: check the generator and its amplifier"
-    return ", and the displacement does not follow it: check the range and the amplifier of the force's input"

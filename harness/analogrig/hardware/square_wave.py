@@ -250,7 +250,7 @@ class Response:
         scale = np.array([0.1, 0.1, 0.1, 0.1, 1e-3, 0.1, 0.1])
         found = least_squares(residual, min(starts)[1], method="lm", x_scale=scale, diff_step=1e-7)
         if not found.success or not np.isfinite(found.x).all():
-            raise SelfTestError("the displacement does not respond to the force as a mass, a damper and a spring do")
+            raise SelfTestError("the output does not respond to the input as a plant of second order does")
         variance = float(np.square(found.fun).sum()) / (len(samples) - len(scale))
         errors = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac))).tolist()
         offset, gain, log_mass, log_damping, *times = found.x.tolist()

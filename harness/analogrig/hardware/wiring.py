@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,15 +15,16 @@ from numpy.typing import NDArray
 
 from analogrig.config import check_range
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import MEASURED, InputRecord, Instrument, InstrumentDatasheet, find_driver
+from analogrig.hardware.instrument import InputRecord, Instrument, InstrumentDatasheet, find_driver
 from analogrig.hardware.pots import PotsDescription
+from analogrig.program import Program
 from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.run import Channel
-from analogrig.trust import Thing
-from analogrig_emulator import CHANNELS, Excitation, SuspensionComputer
+from analogrig.scenario import DEFAULT_PROGRAM
+from analogrig.trust import Thing, absolute_path
+from analogrig_emulator import Excitation, SuspensionComputer
 
 _MOST_CODE = 0xFFFF
-_UNITS = {"force": "N", "displacement": "m"}
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 
 
@@ -71,15 +73,15 @@ class Input(Stage):
 class Limits:
     """Limits that no scenario may exceed."""
 
-    force_v: tuple[float, float] = (-1.0, 11.0)
-    """Lowest and highest voltage at the computer's force input."""
+    input_v: tuple[float, float] = (-1.0, 11.0)
+    """Lowest and highest voltage at the input of the computer that the generator drives."""
     dials: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Least and greatest position by pot, within 0 to 1; the default is the whole range."""
 
     def __post_init__(self) -> None:
-        low_v, high_v = self.force_v
+        low_v, high_v = self.input_v
         if not -_MOST_VOLTS <= low_v < high_v <= _MOST_VOLTS:
-            raise ValueError(f"force_v must be (low, high), not ({low_v:g}, {high_v:g})")
+            raise ValueError(f"input_v must be (low, high), not ({low_v:g}, {high_v:g})")
         for pot, (least, most) in self.dials.items():
             if not 0.0 <= least <= most <= 1.0:
                 raise ValueError(f"dials.{pot} must be (least, most) within 0 to 1, not ({least:g}, {most:g})")
@@ -91,13 +93,12 @@ class Scaling:
 
     time: float | None = None
     """Speed of the machine relative to the system that it models."""
-    force_n: float | None = None
-    """Force at 10 V."""
-    displacement_m: float | None = None
-    """Displacement at 10 V."""
+    full: Mapping[str, float] = field(default_factory=dict)
+    """Value at 10 V by channel, in the channel's unit."""
 
     def __post_init__(self) -> None:
-        for name, value in dataclasses.asdict(self).items():
+        named = {f"full.{channel}": value for channel, value in self.full.items()}
+        for name, value in {"time": self.time, **named}.items():
             if value is not None and not 1e-9 < value < 1e9:
                 raise ValueError(f"{name} must be more than 0, not {value:g}")
 
@@ -110,11 +111,11 @@ class RealDescription(RigDescription):
     instrument: str
     """URL: ``redpitaya://HOST``."""
     inputs: Mapping[str, Input]
-    """Inputs of the channels ``force`` and ``displacement``."""
+    """Inputs by channel: those of the program's input and output, ``force`` and ``displacement`` of ``front``."""
     pots: PotsDescription
     generator: Stage = field(default_factory=Stage)
-    plant: Literal["front", "shock"] = "front"
-    """Program that is patched on the computer."""
+    program: str = DEFAULT_PROGRAM
+    """Program that is patched on the computer: a shipped name or a .toml file."""
     limits: Limits = field(default_factory=Limits)
     scaling: Scaling = field(default_factory=Scaling)
     settle_s: float = 0.1
@@ -126,11 +127,9 @@ class RealDescription(RigDescription):
     name: str = ""
 
     def __post_init__(self) -> None:
-        if set(self.inputs) != set(MEASURED):
-            raise ValueError(f"inputs must be {' and '.join(MEASURED)}, not {', '.join(self.inputs) or 'none'}")
         numbers = [wired.input for wired in self.inputs.values()]
         if len(set(numbers)) < len(numbers):
-            raise ValueError(f"inputs: force and displacement cannot both be at input {numbers[0]}")
+            raise ValueError(f"inputs: {' and '.join(self.inputs)} cannot both be at input {numbers[0]}")
         check_range(self, "settle_s", 0.0, 10.0)
         check_range(self, "timeout_s", 0.01, 3600.0)
 
@@ -146,10 +145,18 @@ class RealDescription(RigDescription):
     def only_one(self) -> str:
         return self.instrument
 
+    @functools.cached_property
+    def patched(self) -> Program:
+        """Program that is patched on the computer.
+
+        :raises ConfigurationError: it is absent, or not a program.
+        """
+        return Program.load(self.program)
+
     @property
     def pot_names(self) -> tuple[str, ...]:
         """Names of the pots of the program."""
-        return tuple(SuspensionComputer(self.plant).dials)
+        return tuple(self.patched.circuit.pots)
 
     @property
     def things(self) -> tuple[Thing, ...]:
@@ -162,7 +169,8 @@ class RealDescription(RigDescription):
 
     def placed(self, folder: Path) -> Self:
         """The same with absolute paths, where its own are relative to ``folder``."""
-        return dataclasses.replace(self, pots=self.pots.placed(folder))
+        program = absolute_path(self.program, folder) if self.program.endswith(".toml") else self.program
+        return dataclasses.replace(self, pots=self.pots.placed(folder), program=program)
 
     def check(self) -> None:
         self.pots.check()
@@ -203,18 +211,17 @@ class RealDescription(RigDescription):
 
         :param noise_lsb: measured noise by channel; for others that of the description is used.
         """
-        scaling, datasheet = self.scaling, self.driver.datasheet
-        full = {"force": scaling.force_n, "displacement": scaling.displacement_m}
+        datasheet = self.driver.datasheet
         out = {}
-        for name in MEASURED:
+        for name in self.patched.measured:
             wired = self.inputs[name]
             ends_v = wired.ends_v(datasheet)
             low_v, lsb_v = max(ends_v[0], wired.least_v), (ends_v[1] - ends_v[0]) / (1 << datasheet.bits)
             out[name] = Channel(
                 low_v=low_v,
                 lsb_v=lsb_v,
-                unit=_UNITS[name],
-                unit_per_v=(full[name] or computer.scales.full(name)) / 10.0,
+                unit=self.patched.unit(name),
+                unit_per_v=self.scaling.full.get(name, computer.scales.full(name)) / 10.0,
                 noise_lsb=noise_lsb.get(name, wired.noise_lsb),
                 codes=math.ceil((ends_v[1] - low_v) / lsb_v),
             )
@@ -227,17 +234,17 @@ class RealDescription(RigDescription):
     def convert(
         self, taken: InputRecord, channels: Mapping[str, Channel]
     ) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.bool_]]:
-        """Volts at the computer, codes and clipping of a record, each (n, 4)."""
-        n = len(taken.volts)
-        volts = np.full((n, len(CHANNELS)), np.nan)
-        codes = np.zeros((n, len(CHANNELS)), np.uint16)
-        clipped = np.zeros((n, len(CHANNELS)), np.bool_)
-        for column, name in enumerate(MEASURED):
-            wired, channel, at = self.inputs[name], channels[name], CHANNELS.index(name)
-            volts[:, at] = (taken.volts[:, column] - wired.offset_v) / wired.gain
+        """Volts at the computer, codes and clipping of a record, each (n, channels of the program)."""
+        shape = len(taken.volts), len(self.patched.channels)
+        volts = np.full(shape, np.nan)
+        codes = np.zeros(shape, np.uint16)
+        clipped = np.zeros(shape, np.bool_)
+        for at, name in enumerate(self.patched.measured):
+            wired, channel = self.inputs[name], channels[name]
+            volts[:, at] = (taken.volts[:, at] - wired.offset_v) / wired.gain
             exact = np.rint((volts[:, at] - channel.low_v) / channel.lsb_v)
             codes[:, at] = np.clip(exact, 0.0, _MOST_CODE)
-            clipped[:, at] = taken.clipped[:, column] | (exact < 0.0) | (exact > _MOST_CODE)
+            clipped[:, at] = taken.clipped[:, at] | (exact < 0.0) | (exact > _MOST_CODE)
         return volts, codes, clipped
 
 
@@ -247,6 +254,7 @@ def check_wiring(description: RealDescription) -> None:
     :raises ConfigurationError: they contradict each other; the message names the key.
     """
     instrument = description.driver.datasheet
+    _check_channels(description)
     for name, wired in description.inputs.items():
         if wired.input not in instrument.inputs:
             has = " and ".join(map(str, instrument.inputs))
@@ -266,15 +274,30 @@ def check_wiring(description: RealDescription) -> None:
         if unknown := sorted(set(table) - set(pots)):
             raise ConfigurationError(f"{key}: there is no pot {unknown[0]!r}: there are {', '.join(pots)}")
     stage = description.generator
-    if not description.limits.force_v[0] <= stage.offset_v <= description.limits.force_v[1]:
+    if not description.limits.input_v[0] <= stage.offset_v <= description.limits.input_v[1]:
         raise ConfigurationError(
-            f"generator: when it is off, the force input stands at offset_v, {stage.offset_v:g} V, and limits.force_v"
-            f" allow {description.limits.force_v[0]:g} V to {description.limits.force_v[1]:g} V"
+            f"generator: when it is off, the computer's input stands at offset_v, {stage.offset_v:g} V, and"
+            f" limits.input_v allow {description.limits.input_v[0]:g} V to {description.limits.input_v[1]:g} V"
         )
     ends_v = sorted(stage.gain * volts + stage.offset_v for volts in instrument.output_v)
-    low_v, high_v = description.limits.force_v
+    low_v, high_v = description.limits.input_v
     if ends_v[0] >= high_v or ends_v[1] <= low_v:
         raise ConfigurationError(
-            f"generator: with gain and offset it gives {ends_v[0]:g} V to {ends_v[1]:g} V, and limits.force_v allow"
+            f"generator: with gain and offset it gives {ends_v[0]:g} V to {ends_v[1]:g} V, and limits.input_v allow"
             f" {low_v:g} V to {high_v:g} V"
+        )
+
+
+def _check_channels(description: RealDescription) -> None:
+    """:raises ConfigurationError: inputs or scales are not those of the program's input and output."""
+    measured = description.patched.measured
+    if set(description.inputs) != set(measured):
+        given = ", ".join(description.inputs) or "none"
+        raise ConfigurationError(
+            f"inputs must be {' and '.join(measured)}, input and output of the program {description.patched.name},"
+            f" not {given}"
+        )
+    if unknown := sorted(set(description.scaling.full) - set(measured)):
+        raise ConfigurationError(
+            f"scaling.full: there is no channel {unknown[0]!r}: there are {' and '.join(measured)}"
         )

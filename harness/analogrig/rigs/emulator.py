@@ -27,9 +27,9 @@ from analogrig_emulator import (
     COMPONENTS,
     FINE_OP_AMP_GRADES,
     OP_AMP_GRADES,
-    PROGRAMS,
     Capacitor,
     Card,
+    CircuitError,
     Components,
     Courses,
     EmulatorError,
@@ -85,18 +85,20 @@ class MeasuredValues:
     """Relative deviation of an amplifier's slew rate from the model's."""
 
     def __post_init__(self) -> None:
-        parts, amplifiers = _element_names()
-        for table, known, most in (
-            ("deviation", parts, MOST_DEVIATION),
-            ("offset_v", amplifiers, MOST_OFFSET_V),
-            ("bandwidth", amplifiers, MOST_DEVIATION),
-            ("slew", amplifiers, MOST_DEVIATION),
-        ):
+        for table in ("deviation", "offset_v", "bandwidth", "slew"):
+            most = MOST_OFFSET_V if table == "offset_v" else MOST_DEVIATION
             for name, value in getattr(self, table).items():
-                if name not in known:
-                    raise ValueError(f"{table}: unknown key {name!r} (known: {', '.join(known)})")
                 if not abs(value) <= most:
                     raise ValueError(f"{table}.{name} must be within +-{most:g}, not {value:g}")
+
+    def check_names(self, program: ProgramCircuit) -> None:
+        """:raises CircuitError: a value is that of no element of the program."""
+        for table in ("deviation", "offset_v", "bandwidth", "slew"):
+            if given := getattr(self, table):
+                kinds = (Resistor, Capacitor, Pot) if table == "deviation" else (OpAmp,)
+                known = program.element_names(*kinds)
+                if unknown := [name for name in given if name not in known]:
+                    raise CircuitError(f"values: {table}: unknown key {unknown[0]!r} (known: {', '.join(known)})")
 
     def put_in(self, stock: Components) -> Components:
         """Components of the machine: the stock's, overridden by the measured values."""
@@ -104,15 +106,6 @@ class MeasuredValues:
         return dataclasses.replace(
             stock.without_draws(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew
         )
-
-
-@functools.cache
-def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the resistors, capacitors and pots, and names of the amplifiers, of all diagrams, in their order."""
-    programs = PROGRAMS.values()
-    parts = [name for program in programs for name in program.element_names(Resistor, Capacitor, Pot)]
-    amplifiers = [name for program in programs for name in program.element_names(OpAmp)]
-    return tuple(dict.fromkeys(parts)), tuple(dict.fromkeys(amplifiers))
 
 
 @dataclass(frozen=True)
@@ -173,6 +166,8 @@ class ComputerDescription:
         :raises EmulatorError: it cannot be.
         """
         specimen = seed if self.specimen is None else self.specimen
+        if self.values is not None:
+            self.values.check_names(program)
         return SuspensionComputer(
             program,
             opamp=preset(self.op_amp),

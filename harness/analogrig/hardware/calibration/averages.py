@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.instrument import MEASURED
 from analogrig.program import Program
 from analogrig.rigs.rig import Rig
 from analogrig.run import INPUT, OUTPUT, Channel
@@ -31,7 +30,7 @@ RATE_HZ = 20e3
 """Sample rate of the card. The periods below are whole numbers of its samples."""
 
 FORCE, DISPLACEMENT = range(2)
-"""Columns of a recording, as in MEASURED."""
+"""Columns of a recording: input and output of the program."""
 
 _COLUMNS = [INPUT, OUTPUT]
 _GRID = ("low_v", "lsb_v")
@@ -128,7 +127,7 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
         obstacles.append("the samples have a gap")
     if obstacles:
         raise RigError(f"scenario {scenario.name}: {obstacles[0]}: nothing can be fitted")
-    channels = {name: performance.channels[name] for name in MEASURED}
+    channels = {name: performance.channels[name] for name in scenario.program.measured}
     codes = np.concatenate([block.codes[:, _COLUMNS] for block in blocks]).astype(np.float64)
     if not rig.computes_circuit:  # whose volts are without noise
         low_v, lsb_v = (np.array([getattr(channel, name) for channel in channels.values()]) for name in _GRID)
@@ -182,7 +181,8 @@ def estimate_noise(recordings: Sequence[SquareWaveRecording], channel: int) -> t
         levels += 2 if channel == FORCE else len(phases)
     every = np.concatenate(squares)
     if not len(every):
-        raise RigError(f"{MEASURED[channel]}: every sample is clipped")
+        name = recordings[0].scenario.program.measured[channel]
+        raise RigError(f"{name}: every sample is clipped")
     variance = float(every.mean())
     noise_lsb = _remove_rounding(variance)
     # Each sample enters two differences, and at few levels the variance of rounding deviates from its mean.

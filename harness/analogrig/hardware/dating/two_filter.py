@@ -21,12 +21,15 @@ from numpy.typing import NDArray
 
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant, discretise
+from analogrig.program import Program
 from analogrig.run import INPUT, OUTPUT, Channel, missing_samples
 
 Array = NDArray[np.float64]
 
 COMMON, OWN = 2, 4
 """Number of unknowns that both plants share, and of each. A filter has 1 + COMMON + OWN columns; the first is known."""
+
+_STATES = 2
 
 _EDGE = 30.0
 """Smallest step of the force that counts as an edge, in rms of its noise."""
@@ -79,6 +82,17 @@ class Signals:
         """(n,) newtons: step of the force in the period after each sample; 0 where it is no edge."""
         steps = np.append(np.diff(self.force_n), 0.0)
         return np.where(np.abs(steps) < _EDGE * self.noise_n, 0.0, steps)
+
+
+def can_date(program: Program) -> bool:
+    """True if the filters know plants of this program: linear, two states, the first of which is the output."""
+    states = tuple(program.equations.states)
+    return (
+        program.is_linear
+        and len(states) == _STATES
+        and states[0] == program.channels[OUTPUT]
+        and len(program.parameters) == OWN - 1
+    )
 
 
 class EdgePlace(NamedTuple):

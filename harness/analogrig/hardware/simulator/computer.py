@@ -1,6 +1,6 @@
 """Analogue computer of the simulator, with its generator, pots, and two leads to the instrument.
 
-    generator -> stage -> force input of the computer        force, displacement -> stages -> IN1, IN2 of the instrument
+    generator -> stage -> input of the computer        its input and output -> stages -> IN1, IN2 of the instrument
 
 Time is machine time, which passes only when the instrument runs the computer. A slow client gets the same records.
 """
@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.config import check_range
-from analogrig.hardware.instrument import MEASURED, DialChange
-from analogrig_emulator import CHANNELS, SOURCE, TICKS_PER_SAMPLE, Edges, Excitation, Mode, SuspensionComputer
+from analogrig.hardware.instrument import DialChange
+from analogrig.run import INPUT, OUTPUT
+from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Edges, Excitation, Mode, SuspensionComputer
 
-MEASURED_AT = tuple(CHANNELS.index(name) for name in MEASURED)
+MEASURED_AT = (INPUT, OUTPUT)
 
 FIRST_RATE_HZ = 160e3
 CHUNK_N = 1 << 16
@@ -60,7 +61,7 @@ class Wiring:
     """Table ``[instrument.wiring]``: the leads between instrument and computer."""
 
     generator: Booster = field(default_factory=Booster)
-    """Stage to the force input."""
+    """Stage to the input of the computer."""
     force: Amplifier = field(default_factory=Amplifier)
     """Stage to IN1."""
     displacement: Amplifier = field(default_factory=Amplifier)

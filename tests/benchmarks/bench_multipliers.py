@@ -1,0 +1,198 @@
+"""Speed of programs with multipliers in the loop, beside ngspice on the same circuit.
+
+python -m tests.benchmarks multipliers
+
+The grid is that of bench_engine with tighter tolerances, each setting run once: looser ones are off by LSBs. A deck
+that knows the circuit limits neither op-amps nor multipliers. The fastest FINALISTS within TOLERATED_LSB of each deck
+run again; the best run counts. Times are of the processor. build/ngspice-NAME.csv has the whole grid.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.config import fixtures
+from analogrig_emulator import (
+    MULTIPLIERS,
+    TICKS_PER_SAMPLE,
+    Deck,
+    Excitation,
+    Multiplier,
+    PatchedProgram,
+    SuspensionComputer,
+    load_program,
+)
+from analogrig_emulator.circuit.spice import Accuracy
+from tests.emulator.test_compiler import levels_v
+
+from .bench_engine import (
+    FINALISTS,
+    RATE_HZ,
+    REPEATS,
+    TOLERATED_LSB,
+    Setting,
+    Simulated,
+    best_s,
+    fastest,
+    in_setting,
+    simulate,
+)
+from .figure import Figure
+
+PROGRAMS = ("duffing", "van-der-pol")
+SAMPLES = 800
+OP_AMPS = ("exported", "knowing")
+SETTINGS = tuple(
+    itertools.starmap(
+        Setting,
+        itertools.product(
+            ("trap", "gear"),
+            OP_AMPS,
+            ("every sample", "start"),
+            (1e-4, 1e-6, 1e-7),
+            (7.0, 1.0, 0.1),
+            (50e-6, 12e-6, 4e-6),
+        ),
+    )
+)
+"""The searched grid."""
+WARM_PLAYS = 10
+
+_LIMITS = """\
+Bstate 0 state I = 1e-10 * (max(-{slew}, min({slew}, {rate} * (v(inner) - v(state))))
++ - 1000000000.0 * (max(0, v(state) - {swing_high}) + min(0, v(state) - {swing_low})))
+"""
+"""Law of the multiplier's state in the exported deck."""
+_LINEAR_STATE = "Gstate 0 state inner state {1e-10 * rate}\n"
+
+NOTE = f"""\
+{SAMPLES} samples of a square wave between the levels of the trial play, nominal TL07x and AD633. The
+grid has {len(SETTINGS)} settings of method, time points, reltol, trtol and longest step. Exported decks are
+those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers, for none
+leaves its range. Equal accuracy is {TOLERATED_LSB:g} LSB at the output.
+
+The emulator, cold: the first play in a new process, machine and all matrices included. Own offsets:
+each machine has op-amps of its own. Again: the same machine as before, built anew.
+"""
+"""Paragraphs below the table."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """A program under its square wave."""
+
+    program: PatchedProgram
+
+    @cached_property
+    def excitation(self) -> Excitation:
+        low_v, high_v = levels_v(self.program)
+        return Excitation(low_v=low_v, high_v=high_v)
+
+    @cached_property
+    def node(self) -> str:
+        """Node of the output."""
+        return self.program.scales.quantities[self.program.channels[1]].node
+
+    @classmethod
+    def of(cls, name: str) -> Played:
+        """A shipped program with AD633 multipliers."""
+        program = load_program(fixtures() / "programs" / f"{name}.toml")
+        model = MULTIPLIERS["ad633"]
+        elements = (replace(each, model=model) if isinstance(each, Multiplier) else each for each in program.elements)
+        return cls(replace(program, elements=tuple(elements)))
+
+    def play(self, computer: SuspensionComputer) -> NDArray[np.float64]:
+        return np.concatenate(list(computer.play(self.excitation, SAMPLES)))
+
+    @cached_property
+    def exact_v(self) -> NDArray[np.float64]:
+        """Output at its node, by the emulator."""
+        sign = self.program.scales.quantities[self.program.channels[1]].sign
+        return sign * self.play(SuspensionComputer(self.program))[:, 1]
+
+    def deck(self, setting: Setting) -> str:
+        edges = self.excitation.edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
+        deck = Deck(SuspensionComputer(self.program).circuit, SAMPLES, RATE_HZ, {"F": edges})
+        accuracy = Accuracy(reltol=setting.reltol, vntol_v=1e-6, trtol=setting.trtol, max_step_s=setting.max_step_s)
+        text = in_setting(deck.text([self.node], accuracy), setting, r"U\d+")
+        return text.replace(_LIMITS, _LINEAR_STATE) if setting.op_amps == "knowing" else text
+
+    def simulate(self, setting: Setting) -> Simulated:
+        try:
+            return simulate(self.deck(setting), self.exact_v, self.node)
+        except (subprocess.CalledProcessError, OSError):
+            return Simulated(math.inf, math.inf)
+
+
+def figures() -> Iterator[Figure]:
+    """Times of ngspice at its best for each kind of deck, and the emulator beside the fastest of them."""
+    for name in PROGRAMS:
+        played = Played.of(name)
+        best = dict(_best(name, played))
+        for op_amps, (setting, run) in best.items():
+            label = f"{setting}; {run.error_lsb:.3f} LSB"
+            yield Figure(f"ngspice, {name}: {op_amps} op-amps", 1e3 * run.spent_s, "ms", label)
+        setting, run = min(best.values(), key=lambda each: each[1].spent_s)
+        for what, spent_s in (("cold", _cold_s(name)), ("own offsets", _own_s(played)), ("again", _warm_s(played))):
+            ratio = run.spent_s / spent_s
+            yield Figure(f"emulator, {name}, {what}", 1e3 * spent_s, "ms", f"ngspice: {setting.op_amps}", ratio)
+
+
+def _best(name: str, played: Played) -> Iterator[tuple[str, tuple[Setting, Simulated]]]:
+    """The fastest accurate setting of each kind of op-amps, with its best run."""
+    found = {setting: played.simulate(setting) for setting in SETTINGS}
+    rows = [f"{1e3 * run.spent_s:.1f},{run.error_lsb:.3f},{setting}" for setting, run in found.items()]
+    Path(f"build/ngspice-{name}.csv").write_text("\n".join(["CPU ms,error LSB,setting", *rows, ""]))
+    for op_amps in OP_AMPS:
+        order = fastest({setting: run for setting, run in found.items() if setting.op_amps == op_amps})[:FINALISTS]
+        finalists = [replace(each, solver=solver) for each in order for solver in ("sparse", "klu")]
+        runs = [(each, played.simulate(each)) for each, _ in itertools.product(finalists, range(REPEATS))]
+        accurate = [each for each in runs if each[1].error_lsb <= TOLERATED_LSB]
+        if accurate:
+            yield op_amps, min(accurate, key=lambda each: each[1].spent_s)
+
+
+def _warm_s(played: Played) -> float:
+    return best_s(lambda: [played.play(SuspensionComputer(played.program)) for _ in range(WARM_PLAYS)]) / WARM_PLAYS
+
+
+def _own_s(played: Played) -> float:
+    """CPU time of a play whose machine has offsets of its own."""
+    seeds = itertools.count()
+
+    def run() -> None:
+        for seed in itertools.islice(seeds, WARM_PLAYS):
+            played.play(SuspensionComputer(played.program, rng=np.random.default_rng(seed)))
+
+    return best_s(run) / WARM_PLAYS
+
+
+_COLD = """\
+import sys, time
+from tests.benchmarks.bench_multipliers import Played, SuspensionComputer
+played = Played.of(sys.argv[1])
+played.excitation
+next(SuspensionComputer("front").play(played.excitation, 1))
+start_s = time.process_time()
+played.play(SuspensionComputer(played.program))
+print(time.process_time() - start_s)
+"""
+"""The engine itself is loaded by another circuit."""
+
+
+def _cold_s(name: str) -> float:
+    """CPU time of the first play in a process."""
+    command = [sys.executable, "-c", _COLD, name]
+    return min(
+        float(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(REPEATS)
+    )
