@@ -403,9 +403,9 @@ def _run_of_block(conditions: Conditions, block: Block, answers: Answers) -> Run
         conditions=conditions,
         codes=block.codes,
         clipped=block.clipped,
-        theta=np.array(np.empty((n, 0)) if answers.theta is None else answers.theta, np.float32),
-        innovation=np.array(np.zeros(n) if answers.innovation is None else answers.innovation, np.float32),
-        statistic=np.array(np.zeros(n) if answers.statistic is None else answers.statistic, np.float32),
+        theta=np.empty((n, 0), np.float32) if answers.theta is None else answers.theta,
+        innovation=np.zeros(n, np.float32) if answers.innovation is None else answers.innovation,
+        statistic=np.zeros(n, np.float32) if answers.statistic is None else answers.statistic,
         flags=answers.flags,
         **_reports(answers.alarms, answers.diagnoses, answers.misfits),
     )

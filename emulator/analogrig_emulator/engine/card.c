@@ -75,7 +75,8 @@ static inline double see(int64_t       samples,
     return excess;
 }
 
-int engine_see(int64_t       samples,
+int engine_see(int64_t       plays,
+               int64_t       samples,
                int           channels,
                const double* card,
                double        residual,
@@ -83,9 +84,14 @@ int engine_see(int64_t       samples,
                const double* normal,
                double*       held,
                double*       seen) {
-    const double excess = channels == 4 && held == NULL
-                              ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
-                              : see(samples, channels, card, residual, volts, normal, held, seen);
+    const int64_t count  = samples * channels;
+    double        excess = 0.0;
+    for (int64_t i = 0; i < plays; i++, volts += count, normal += count, seen += count) {
+        excess += channels == 4 && held == NULL
+                      ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
+                      : see(samples, channels, card, residual, volts, normal, held, seen);
+        held = held == NULL ? NULL : held + channels;
+    }
     return isnan(excess) ? 0 : 1;
 }
 

@@ -59,7 +59,7 @@ class SuspensionComputer:
         self.program = _program(program)
         self.sample_rate_hz = sample_rate_hz
         model, count = _model(opamp, offset_v), self.program.amplifiers
-        offsets_v = None if rng is None else drawn_offsets_v(model, count, rng, offset_v).tolist()
+        offsets_v = None if rng is None else drawn_offsets_v(model, rng.random(count), offset_v).tolist()
         if components.is_perfect and isinstance(self.program, Hashable):
             circuit, self._pots = _nominal(self.program, model)
             if offsets_v is not None:
@@ -327,6 +327,6 @@ def _model(opamp: str | OpAmpModel, offset_v: float) -> OpAmpModel:
     return preset(opamp) if isinstance(opamp, str) else opamp
 
 
-def drawn_offsets_v(model: OpAmpModel, count: int, rng: np.random.Generator, offset_v: float) -> NDArray[np.float64]:
-    """Input offsets of op-amps from U1 on: the model's plus one uniform within +-offset_v; (count,) V."""
-    return np.asarray(model.vos_v + rng.uniform(-offset_v, offset_v, count))
+def drawn_offsets_v(model: OpAmpModel, uniforms: NDArray[np.float64], offset_v: float) -> NDArray[np.float64]:
+    """Input offsets of op-amps for uniform numbers from 0 to 1 of any shape: the model's, plus one within +-offset_v."""
+    return np.asarray(model.vos_v + (-offset_v + 2.0 * offset_v * uniforms))
