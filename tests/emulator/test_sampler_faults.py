@@ -166,6 +166,18 @@ def test_acquisition_leaves_its_part_of_each_step() -> None:
     assert np.array_equal(np.concatenate(parts), whole.sample(volts)[0])
 
 
+@pytest.mark.parametrize("monotonic", [True, False])
+def test_many_inputs_have_the_codes_of_each_alone(monotonic: bool) -> None:
+    """Many inputs to a converter with rising levels are found from a guess, a single one bit by bit."""
+    levels_lsb = drawn_levels(8, np.random.default_rng(4), inl_lsb=2.0, monotonic=monotonic)
+    card = replace(ONE, levels_lsb=levels_lsb, missing_codes=(7, 8, 200))
+    seen = np.concatenate((np.random.default_rng(5).uniform(-3.0, 258.0, 700), levels_lsb))[:, None]
+    together, clipped = Sampler(card, np.random.default_rng(1)).sample(seen, np.zeros(seen.shape))
+    alone = [Sampler(card, np.random.default_rng(1)).sample(each[None], np.zeros((1, 1))) for each in seen]
+    assert together.tolist() == [code.tolist()[0] for code, _ in alone]
+    assert clipped.tolist() == [flag.tolist()[0] for _, flag in alone]
+
+
 @pytest.mark.parametrize("card", [replace(ONE, acquisition=2.0, noise_lsb=(0.7,)), ONE], ids=["slow", "whole"])
 def test_plays_taken_together_are_those_of_a_card_each(card: Card) -> None:
     rng = np.random.default_rng(3)

@@ -104,6 +104,25 @@ static unsigned approximate(int bits, const double* levels, double seen) {
     return code;
 }
 
+static bool are_rising(unsigned codes, const double* levels) {
+    bool rising = true;
+    for (unsigned code = 2; code < codes; code++) {
+        rising = rising && levels[code] >= levels[code - 1U];
+    }
+    return rising;
+}
+
+/// The same code from a guess, for rising levels.
+static unsigned correct(unsigned code, unsigned last, const double* levels, double seen) {
+    while (code < last && seen >= levels[code + 1U]) {
+        code++;
+    }
+    while (code > 0 && seen < levels[code]) {
+        code--;
+    }
+    return code;
+}
+
 void engine_convert(int64_t       count,
                     int           bits,
                     const double* levels,
@@ -112,13 +131,18 @@ void engine_convert(int64_t       count,
                     const double* seen,
                     uint16_t*     codes,
                     uint8_t*      clipped) {
-    const double end = (double)(1U << bits), last = end - 1.0;
+    const unsigned last = (1U << bits) - 1U;
+    // To check the levels takes as long as to convert a part of as many inputs.
+    const bool rising = levels != NULL && count > last && are_rising(last + 1U, levels);
     for (int64_t k = 0; k < count; k++) {
-        const double   above   = seen[k] + 0.5;
-        const double   limited = above < 0.0 ? 0.0 : above > last ? last : above;
-        const unsigned code    = levels == NULL ? (unsigned)(int)limited : approximate(bits, levels, seen[k]);
-        codes[k]               = (uint16_t)((code | stuck_high) & ~stuck_low);
-        clipped[k]             = (uint8_t)(above < 0.0) | (uint8_t)(above >= end);
+        const double above   = seen[k] + 0.5;
+        const double limited = above < 0.0 ? 0.0 : above > last ? last : above;
+        unsigned     code    = (unsigned)(int)limited;
+        if (levels != NULL) {
+            code = rising ? correct(code, last, levels, seen[k]) : approximate(bits, levels, seen[k]);
+        }
+        codes[k]   = (uint16_t)((code | stuck_high) & ~stuck_low);
+        clipped[k] = (uint8_t)(above < 0.0) | (uint8_t)(above >= last + 1.0);
     }
 }
 
