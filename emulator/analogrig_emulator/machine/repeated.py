@@ -57,7 +57,7 @@ class RepeatedPlay:
         self._schedule = CircuitSchedule(systems, nodes, last_samples, patience_ticks, trim.rows)
         self._engine = Engine(systems[0], nodes, computer.sample_rate_hz)
         self._kinks = systems[0].kinks
-        self._signs = computer.program.channel_signs
+        self._program = computer.program
         self._rate_hz = computer.sample_rate_hz
         self._amplifiers = trim.amps
         self._numbers = np.array([int(name.removeprefix("U")) - 1 for name in trim.amps])
@@ -83,5 +83,5 @@ class RepeatedPlay:
         edges = excitation.edges_at(phases, 0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
         plays = self._engine.play_all(self._schedule, constants, {SOURCE: edges})
         volts = plays.volts
-        volts *= self._signs
+        self._program.orient(volts)
         return volts, [lamp_samples(self._amplifiers, self._kinks, ticks) for ticks in plays.overdue_ticks]

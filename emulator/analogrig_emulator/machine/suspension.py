@@ -67,7 +67,6 @@ class SuspensionComputer:
         else:
             models = [replace(model, vos_v=vos_v) for vos_v in offsets_v or [model.vos_v] * count]
             circuit, self._pots = _wired(self.program, models, components)
-        self._signs = self.program.channel_signs
         self.machine = AnalogComputer(
             circuit,
             self.program.channel_nodes,
@@ -232,10 +231,10 @@ class SuspensionComputer:
         trains = {SOURCE: edges.within(*self.machine.window(samples))} if edges.ticks.size else {}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
-        channels = len(self._signs)
+        channels = len(self.program.channels)
         readings = self.machine.readings
         by_instant = volts.reshape(samples, volts.shape[1] // readings, readings)
-        by_instant[..., :channels] *= self._signs
+        self.program.orient(by_instant[..., :channels])
         if readings == channels:
             return volts
         self.probed = by_instant[:, 0, channels:]
