@@ -167,7 +167,7 @@ def test_acquisition_leaves_its_part_of_each_step() -> None:
 
 
 @pytest.mark.parametrize("monotonic", [True, False])
-def test_many_inputs_have_the_codes_of_each_alone(monotonic: bool) -> None:
+def test_many_inputs_have_the_codes_of_each_alone(*, monotonic: bool) -> None:
     """Many inputs to a converter with rising levels are found from a guess, a single one bit by bit."""
     levels_lsb = drawn_levels(8, np.random.default_rng(4), inl_lsb=2.0, monotonic=monotonic)
     card = replace(ONE, levels_lsb=levels_lsb, missing_codes=(7, 8, 200))

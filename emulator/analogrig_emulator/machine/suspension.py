@@ -327,5 +327,5 @@ def _model(opamp: str | OpAmpModel, offset_v: float) -> OpAmpModel:
 
 
 def drawn_offsets_v(model: OpAmpModel, uniforms: NDArray[np.float64], offset_v: float) -> NDArray[np.float64]:
-    """Input offsets of op-amps for uniform numbers from 0 to 1 of any shape: the model's, plus one within +-offset_v."""
+    """Input offsets of op-amps, in V, from uniform numbers from 0 to 1: the model's plus one within +-offset_v."""
     return np.asarray(model.vos_v + (-offset_v + 2.0 * offset_v * uniforms))
