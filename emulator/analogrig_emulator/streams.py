@@ -25,8 +25,12 @@ def normals(seeds: Sequence[int], stream: int, shape: tuple[int, ...]) -> NDArra
     bits, out = np.random.PCG64(0), np.empty((len(seeds), *shape))
     generator = np.random.Generator(bits)
     for row, (high, low, increment_high, increment_low) in zip(out, _states(seeds, stream).tolist(), strict=True):
-        state = {"state": high << 64 | low, "inc": increment_high << 64 | increment_low}
-        bits.state = {"bit_generator": "PCG64", "state": state, "has_uint32": 0, "uinteger": 0}
+        bits.state = {
+            "bit_generator": "PCG64",
+            "state": {"state": high << 64 | low, "inc": increment_high << 64 | increment_low},
+            "has_uint32": 0,
+            "uinteger": 0,
+        }
         generator.standard_normal(out=row)
     return out
 

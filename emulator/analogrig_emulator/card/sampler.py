@@ -212,7 +212,7 @@ class Sampler:
             raise SamplerError(f"the card has {self.card.channels} channels, got volts of shape {volts.shape}")
         normals = self._rng.standard_normal(volts.shape) if normals is None else normals
         seen_lsb, self._held_v = _see(self.card, volts[None], normals, self._held_v)
-        return seen_lsb[0]
+        return seen_lsb.reshape(volts.shape)
 
     def convert(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Codes and clipping flags, as from sample(), of converter inputs (n, channels) in LSB."""
@@ -246,9 +246,7 @@ def _see(
     converted = (card.analogue.ctypes.data, residual, volts.ctypes.data, normals.ctypes.data, held)
     if not library.load().engine_see(*volts.shape, *converted, seen_lsb.ctypes.data):
         at = tuple(np.argwhere(~np.isfinite(volts))[0])
-        raise SamplerError(
-            f"sample {at[1]} of the block, channel {at[2]}: the voltage must be finite, got {volts[at]}"
-        )
+        raise SamplerError(f"sample {at[1]} of the block, channel {at[2]}: the voltage must be finite, got {volts[at]}")
     return seen_lsb, held_v
 
 

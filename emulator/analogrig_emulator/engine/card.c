@@ -52,14 +52,14 @@ void engine_edges(int64_t       plays,
 }
 
 /// engine_see() of one play, for a number of channels that the compiler may know.
-static inline double see(int64_t                samples,
-                         int                    channels,
+static inline double see(int64_t samples,
+                         int     channels,
                          const double* restrict card,
-                         double                 residual,
+                         double residual,
                          const double* restrict volts,
                          const double* restrict normal,
-                         double* restrict       held,
-                         double* restrict       seen) {
+                         double* restrict held,
+                         double* restrict seen) {
     const double *gain = card, *droop = &gain[channels], *low = &droop[channels], *lsb = &low[channels];
     const double *noise = &lsb[channels], *offset = &noise[channels];
     double        excess[4] = { 0.0 };
@@ -88,9 +88,8 @@ int engine_see(int64_t       plays,
     const int64_t count  = samples * channels;
     double        excess = 0.0;
     for (int64_t i = 0; i < plays; i++, volts += count, normal += count, seen += count) {
-        excess += channels == 4 && held == NULL
-                      ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
-                      : see(samples, channels, card, residual, volts, normal, held, seen);
+        excess += channels == 4 && held == NULL ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
+                                                : see(samples, channels, card, residual, volts, normal, held, seen);
         held = held == NULL ? NULL : held + channels;
     }
     return isnan(excess) ? 0 : 1;
