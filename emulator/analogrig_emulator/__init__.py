@@ -6,7 +6,7 @@ Start with SuspensionComputer, Excitation and Sampler.
 from analogrig_emulator.card.acquisition import acquired, ahead_ticks, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.recorded import RecordedExcitation
-from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
+from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels, sample_plays
 from analogrig_emulator.circuit.circuit import (
     Capacitor,
     Circuit,
@@ -69,6 +69,7 @@ from analogrig_emulator.machine.program_file import Equations, ProgramParameter,
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
+from analogrig_emulator.streams import normals, uniforms
 
 __all__ = [
     "ABSOLUTE_ZERO_C",
@@ -160,9 +161,12 @@ __all__ = [
     "equations_of",
     "is_repeatable",
     "load_program",
+    "normals",
     "piecewise_linear",
     "preset",
     "probes_per_sample",
+    "sample_plays",
     "to_spice",
+    "uniforms",
     "wired",
 ]

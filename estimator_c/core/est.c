@@ -787,16 +787,13 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
 }
 
-/// Enter the equation with code specialised for the two usual shapes. Omitted where the shape is fixed or room is
-/// scarce.
+/// Enter the equation with code specialised for the two usual shapes.
 static void dispatch_equation(est_t* const self, const float y, est_step_t* const step) {
     const est_shape_t shape = est_shape_of(self->config);
-#if !defined(EST_FIXED_NA) && !EST_FOR_SIZE && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) && (EST_NK_MAX >= 1U) &&       \
-    (EST_THETA_MAX >= 6U)
-    const est_shape_t locked       = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
-    const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = 1U };
-    if (same_shape(shape, free_running)) {
-        enter_equation(self, free_running, y, step);
+#if EST_SPECIALISED
+    const est_shape_t locked = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
+    if (same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
+        enter_equation(self, EST_SHAPE_FREE_RUNNING, y, step);
         return;  // MISRA D4
     }
     if (same_shape(shape, locked)) {
@@ -870,8 +867,13 @@ float est_theta(const est_t* const self, const uint8_t index) {
 void est_copy_theta(const est_t* const self, float* const out) {
     EST_ASSERT((self != NULL) && (out != NULL));
 #if EST_WITH_ROBUSTNESS
-    float plain[EST_THETA_MAX + 1U];
-    compute_plain(self, est_shape_of(self->config), plain);
+    const est_shape_t shape = est_shape_of(self->config);
+    float             plain[EST_THETA_MAX + 1U];
+    if (EST_SPECIALISED && same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
+        compute_plain(self, EST_SHAPE_FREE_RUNNING, plain);
+    } else {
+        compute_plain(self, shape, plain);
+    }
     (void)append(out, &plain[1], EST_THETA_MAX);
 #else
     (void)append(out, self->theta, EST_THETA_MAX);

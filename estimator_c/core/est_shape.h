@@ -46,6 +46,14 @@
 #define EST_UNROLL
 #endif
 
+/// True in a build that has code specialised for the two usual shapes: the shape is not fixed, and there is room.
+#if !defined(EST_FIXED_NA) && !EST_FOR_SIZE && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) && (EST_NK_MAX >= 1U) &&       \
+    (EST_THETA_MAX >= 6U)
+#define EST_SPECIALISED 1
+#else
+#define EST_SPECIALISED 0
+#endif
+
 /// True iff some feature of the build observes the edges of u.
 #define EST_KNOWS_EDGES (EST_WITH_EDGES || EST_WITH_ADAPTATION || EST_WITH_WATCH)
 
@@ -108,6 +116,9 @@ typedef struct {
     uint8_t nc;
     uint8_t offset;  ///< 1 if the offset is estimated, else 0
 } est_shape_t;
+
+/// The shape of most plants on a rig whose generator is free-running.
+#define EST_SHAPE_FREE_RUNNING ((est_shape_t){ .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = 1U })
 
 /// Orders of the configuration, or those that the build fixes with -DEST_FIXED_NA=2U, _NB, _NK, _NC and _OFFSET.
 EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {

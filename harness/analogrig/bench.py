@@ -406,9 +406,9 @@ def _run_of_block(conditions: Conditions, block: Block, answers: Answers) -> Run
         conditions=conditions,
         codes=block.codes,
         clipped=block.clipped,
-        theta=np.array(np.empty((n, 0)) if answers.theta is None else answers.theta, np.float32),
-        innovation=np.array(np.zeros(n) if answers.innovation is None else answers.innovation, np.float32),
-        statistic=np.array(np.zeros(n) if answers.statistic is None else answers.statistic, np.float32),
+        theta=np.empty((n, 0), np.float32) if answers.theta is None else answers.theta,
+        innovation=np.zeros(n, np.float32) if answers.innovation is None else answers.innovation,
+        statistic=np.zeros(n, np.float32) if answers.statistic is None else answers.statistic,
         flags=answers.flags,
         **_reports(answers.alarms, answers.diagnoses, answers.misfits),
     )
@@ -424,7 +424,7 @@ def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bo
 
     If ``can_be_direct``, the runs are those over the line to the bit, without what needs messages.
 
-    :param alarms_only: omit the estimates, which take half of the time: theta of the runs has no columns.
+    :param alarms_only: omit the estimates, which take a fifth of the time: theta of the runs has no columns.
     :raises ConfigurationError: the estimator refuses its configuration.
     :raises LinkError: the library of the device was not built.
     """

@@ -239,7 +239,7 @@ class Run:
         """Data sheet of the device."""
         return _datasheet_of(self.conditions.dut)
 
-    @property
+    @functools.cached_property
     def missing(self) -> NDArray[np.bool_]:
         """(n,): samples sent to the device as missing."""
         return missing_samples(self.clipped)

@@ -205,12 +205,7 @@ class Scenario:
 
     def draw_excitation(self, rng: np.random.Generator) -> Excitation:
         """Excitation of one run, with a random phase if ``random_phase`` is set."""
-        phase = self.draw_phase(rng)
-        return self.excitation if phase == self.excitation.phase else dataclasses.replace(self.excitation, phase=phase)
-
-    def draw_phase(self, rng: np.random.Generator) -> float:
-        """Phase of the excitation of one run: its own, or a random one if ``random_phase`` is set."""
-        return float(rng.uniform()) if self.random_phase else self.excitation.phase
+        return dataclasses.replace(self.excitation, phase=rng.random()) if self.random_phase else self.excitation
 
     @classmethod
     def of_program(cls, program: Program) -> Scenario:

@@ -42,7 +42,7 @@ def fresh(model: OpAmpModel, program: str, seed: int) -> SuspensionComputer:
 
 
 def offsets_v(model: OpAmpModel, computer: SuspensionComputer, seed: int) -> np.ndarray:
-    return drawn_offsets_v(model, computer.program.amplifiers, np.random.default_rng(seed), OFFSET_V)
+    return drawn_offsets_v(model, np.random.default_rng(seed).random(computer.program.amplifiers), OFFSET_V)
 
 
 @pytest.mark.parametrize("model", [preset("tl07x"), preset("741"), NO_SLEW], ids=["tl07x", "741", "no slew"])

@@ -24,6 +24,7 @@ from analogrig_emulator import (
     acquired,
     drawn_levels,
     probes_per_sample,
+    sample_plays,
 )
 
 Volts = NDArray[np.float64]
@@ -163,6 +164,28 @@ def test_acquisition_leaves_its_part_of_each_step() -> None:
     whole, cut = Sampler(card, np.random.default_rng(1)), Sampler(card, np.random.default_rng(1))
     parts = [cut.sample(part)[0] for part in np.split(volts, [0, 1, 20])]
     assert np.array_equal(np.concatenate(parts), whole.sample(volts)[0])
+
+
+@pytest.mark.parametrize("monotonic", [True, False])
+def test_many_inputs_have_the_codes_of_each_alone(*, monotonic: bool) -> None:
+    """Many inputs to a converter with rising levels are found from a guess, a single one bit by bit."""
+    levels_lsb = drawn_levels(8, np.random.default_rng(4), inl_lsb=2.0, monotonic=monotonic)
+    card = replace(ONE, levels_lsb=levels_lsb, missing_codes=(7, 8, 200))
+    seen = np.concatenate((np.random.default_rng(5).uniform(-3.0, 258.0, 700), levels_lsb))[:, None]
+    together, clipped = Sampler(card, np.random.default_rng(1)).sample(seen, np.zeros(seen.shape))
+    alone = [Sampler(card, np.random.default_rng(1)).sample(each[None], np.zeros((1, 1))) for each in seen]
+    assert together.tolist() == [code.tolist()[0] for code, _ in alone]
+    assert clipped.tolist() == [flag.tolist()[0] for _, flag in alone]
+
+
+@pytest.mark.parametrize("card", [replace(ONE, acquisition=2.0, noise_lsb=(0.7,)), ONE], ids=["slow", "whole"])
+def test_plays_taken_together_are_those_of_a_card_each(card: Card) -> None:
+    rng = np.random.default_rng(3)
+    volts, normals = rng.uniform(-5, 260, (4, 30, 1)), rng.standard_normal((4, 30, 1))
+    codes_of_all, clipped_of_all = sample_plays(card, volts, normals)
+    for i in range(4):
+        own_codes, own_clipped = Sampler(card, rng).sample(volts[i], normals[i])
+        assert np.array_equal(codes_of_all[i], own_codes) and np.array_equal(clipped_of_all[i], own_clipped)
 
 
 def test_a_held_voltage_droops_while_it_waits() -> None:

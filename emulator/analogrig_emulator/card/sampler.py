@@ -189,7 +189,6 @@ class Sampler:
     def __init__(self, card: Card, rng: np.random.Generator) -> None:
         self.card = card
         self._rng = rng
-        self._residual = math.exp(-card.acquisition)
         self._held_v: NDArray[np.float64] | None = None
 
     def sample(
@@ -209,38 +208,57 @@ class Sampler:
 
         Raises SamplerError for a voltage that is not finite, or another shape.
         """
-        if volts.ndim != 2 or volts.shape[1] != self.card.channels:
+        if volts.ndim != 2:
             raise SamplerError(f"the card has {self.card.channels} channels, got volts of shape {volts.shape}")
-        volts = np.ascontiguousarray(volts, np.float64)
-        normals = self._rng.standard_normal(volts.shape) if normals is None else np.ascontiguousarray(normals)
-        seen_lsb, held_v = np.empty_like(volts), self._held_before(volts)
-        held = None if held_v is None else held_v.ctypes.data
-        converted = (self.card.analogue.ctypes.data, self._residual, volts.ctypes.data, normals.ctypes.data, held)
-        if not library.load().engine_see(*volts.shape, *converted, seen_lsb.ctypes.data):
-            sample, channel = np.argwhere(~np.isfinite(volts))[0]
-            volt = volts[sample, channel]
-            raise SamplerError(
-                f"sample {sample} of the block, channel {channel}: the voltage must be finite, got {volt}"
-            )
-        self._held_v = held_v
-        return seen_lsb
+        normals = self._rng.standard_normal(volts.shape) if normals is None else normals
+        seen_lsb, self._held_v = _see(self.card, volts[None], normals, self._held_v)
+        return seen_lsb.reshape(volts.shape)
 
     def convert(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Codes and clipping flags, as from sample(), of converter inputs (n, channels) in LSB."""
-        seen_lsb = np.ascontiguousarray(seen_lsb, np.float64)
-        codes, clipped = np.empty(seen_lsb.shape, np.uint16), np.empty(seen_lsb.shape, np.bool_)
-        card = self.card
-        levels = None if card.levels is None else card.levels.ctypes.data
-        converter = (card.bits, levels, card.stuck_high, card.stuck_low)
-        addresses = [array.ctypes.data for array in (seen_lsb, codes, clipped)]
-        library.load().engine_convert(seen_lsb.size, *converter, *addresses)
-        return codes, clipped
+        return _convert(self.card, seen_lsb)
 
-    def _held_before(self, volts: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Copy of the held voltages (channels,), from which each step lacks exp(-acquisition); None if it is whole."""
-        if self._residual == 0.0 or not len(volts):
-            return self._held_v
-        return (volts[0] if self._held_v is None else self._held_v).copy()
+
+def sample_plays(
+    card: Card, volts: NDArray[np.float64], normals: NDArray[np.float64]
+) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Codes and clipping flags (plays, n, channels), as from the Sampler.sample() of a new card for each play.
+
+    volts, normals: likewise. Raises SamplerError.
+    """
+    return _convert(card, _see(card, volts, normals, None)[0])
+
+
+def _see(
+    card: Card, volts: NDArray[np.float64], normals: NDArray[np.float64], held_v: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Converter inputs (plays, n, channels), and the voltages held afterwards (plays, channels).
+
+    held_v: those held before; None at the start. Where each step is whole, the card holds none.
+    """
+    volts, normals = np.ascontiguousarray(volts, np.float64), np.ascontiguousarray(normals, np.float64)
+    if volts.shape[-1] != card.channels:
+        raise SamplerError(f"the card has {card.channels} channels, got volts of shape {volts.shape[1:]}")
+    residual = math.exp(-card.acquisition)
+    if residual != 0.0 and volts.shape[1]:
+        held_v = (volts[:, 0] if held_v is None else held_v).copy()
+    seen_lsb, held = np.empty_like(volts), None if held_v is None else held_v.ctypes.data
+    converted = (card.analogue.ctypes.data, residual, volts.ctypes.data, normals.ctypes.data, held)
+    if not library.load().engine_see(*volts.shape, *converted, seen_lsb.ctypes.data):
+        at = tuple(np.argwhere(~np.isfinite(volts))[0])
+        raise SamplerError(f"sample {at[1]} of the block, channel {at[2]}: the voltage must be finite, got {volts[at]}")
+    return seen_lsb, held_v
+
+
+def _convert(card: Card, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Codes and clipping flags of converter inputs of any shape."""
+    seen_lsb = np.ascontiguousarray(seen_lsb, np.float64)
+    codes, clipped = np.empty(seen_lsb.shape, np.uint16), np.empty(seen_lsb.shape, np.bool_)
+    levels = None if card.levels is None else card.levels.ctypes.data
+    converter = (card.bits, levels, card.stuck_high, card.stuck_low)
+    addresses = [array.ctypes.data for array in (seen_lsb, codes, clipped)]
+    library.load().engine_convert(seen_lsb.size, *converter, *addresses)
+    return codes, clipped
 
 
 def drawn_levels(bits: int, rng: np.random.Generator, inl_lsb: float, *, monotonic: bool = True) -> tuple[float, ...]:

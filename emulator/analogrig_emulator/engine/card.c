@@ -2,6 +2,7 @@
 
 #include "engine.h"
 
+#include <float.h>
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -50,18 +51,18 @@ void engine_edges(int64_t       plays,
     }
 }
 
-/// engine_see() for a number of channels that the compiler may know.
-static inline double see(int64_t       samples,
-                         int           channels,
-                         const double* card,
-                         double        residual,
-                         const double* volts,
-                         const double* normal,
-                         double*       held,
-                         double*       seen) {
+/// engine_see() of one play, for a number of channels that the compiler may know.
+static inline double see(int64_t samples,
+                         int     channels,
+                         const double* restrict card,
+                         double residual,
+                         const double* restrict volts,
+                         const double* restrict normal,
+                         double* restrict held,
+                         double* restrict seen) {
     const double *gain = card, *droop = &gain[channels], *low = &droop[channels], *lsb = &low[channels];
     const double *noise = &lsb[channels], *offset = &noise[channels];
-    double        excess = 0.0;
+    double        excess[4] = { 0.0 };
     for (int64_t k = 0; k < samples; k++, volts += channels, normal += channels, seen += channels) {
         for (int i = 0; i < channels; i++) {
             const double volt = held == NULL ? volts[i] : volts[i] + residual * (held[i] - volts[i]);
@@ -69,13 +70,14 @@ static inline double see(int64_t       samples,
                 held[i] = volt;
             }
             seen[i] = (volt * gain[i] - droop[i] - low[i]) / lsb[i] + (normal[i] * noise[i] + offset[i]);
-            excess += volts[i] - volts[i];
+            excess[i & 3] += volts[i] - volts[i];
         }
     }
-    return excess;
+    return excess[0] + excess[1] + excess[2] + excess[3];
 }
 
-int engine_see(int64_t       samples,
+int engine_see(int64_t       plays,
+               int64_t       samples,
                int           channels,
                const double* card,
                double        residual,
@@ -83,9 +85,13 @@ int engine_see(int64_t       samples,
                const double* normal,
                double*       held,
                double*       seen) {
-    const double excess = channels == 4 && held == NULL
-                              ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
-                              : see(samples, channels, card, residual, volts, normal, held, seen);
+    const int64_t count  = samples * channels;
+    double        excess = 0.0;
+    for (int64_t i = 0; i < plays; i++, volts += count, normal += count, seen += count) {
+        excess += channels == 4 && held == NULL ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
+                                                : see(samples, channels, card, residual, volts, normal, held, seen);
+        held = held == NULL ? NULL : held + channels;
+    }
     return isnan(excess) ? 0 : 1;
 }
 
@@ -98,6 +104,25 @@ static unsigned approximate(int bits, const double* levels, double seen) {
     return code;
 }
 
+static bool are_rising(unsigned codes, const double* levels) {
+    bool rising = true;
+    for (unsigned code = 2; code < codes; code++) {
+        rising = rising && levels[code] >= levels[code - 1U];
+    }
+    return rising;
+}
+
+/// The same code from a guess, for rising levels.
+static unsigned correct(unsigned code, unsigned last, const double* levels, double seen) {
+    while (code < last && seen >= levels[code + 1U]) {
+        code++;
+    }
+    while (code > 0 && seen < levels[code]) {
+        code--;
+    }
+    return code;
+}
+
 void engine_convert(int64_t       count,
                     int           bits,
                     const double* levels,
@@ -106,13 +131,20 @@ void engine_convert(int64_t       count,
                     const double* seen,
                     uint16_t*     codes,
                     uint8_t*      clipped) {
-    const double end = (double)(1U << bits), last = end - 1.0;
+    const unsigned last = (1U << bits) - 1U;
+    const double   most = (1.0 - 0.5 * DBL_EPSILON) * (last + 1.0);  // the next number below the end
+    // To check the levels takes as long as to convert a part of as many inputs.
+    const bool rising = levels != NULL && count > last && are_rising(last + 1U, levels);
     for (int64_t k = 0; k < count; k++) {
-        const double   above   = seen[k] + 0.5;
-        const double   limited = above < 0.0 ? 0.0 : above > last ? last : above;
-        const unsigned code    = levels == NULL ? (unsigned)(int)limited : approximate(bits, levels, seen[k]);
-        codes[k]               = (uint16_t)((code | stuck_high) & ~stuck_low);
-        clipped[k]             = (uint8_t)(above < 0.0) | (uint8_t)(above >= end);
+        const double above   = seen[k] + 0.5;
+        const double below   = above < most ? above : most;
+        const double limited = below > 0.0 ? below : 0.0;
+        unsigned     code    = (unsigned)(int)limited;
+        if (levels != NULL) {
+            code = rising ? correct(code, last, levels, seen[k]) : approximate(bits, levels, seen[k]);
+        }
+        codes[k]   = (uint16_t)((code | stuck_high) & ~stuck_low);
+        clipped[k] = (uint8_t)(limited < above) | (uint8_t)(limited > above);
     }
 }
 

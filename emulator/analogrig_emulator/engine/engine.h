@@ -250,11 +250,12 @@ void engine_edges(int64_t       plays,
                   int64_t*      tick,
                   int64_t*      edges);
 
-/// Record in seen the input of a card's converter in LSB, for `samples` rows of `channels` voltages. Return 1 iff all are finite.
-/// card: rows of `channels` numbers: gain, droop [V], lower end of the range [V], LSB [V], noise [LSB] and offset [LSB].
-/// normal: standard normal numbers, one for each voltage. held: voltages held before, then those of the last sample: the step
-/// from sample to sample lacks the part `residual`. NULL: it lacks nothing.
-int engine_see(int64_t       samples,
+/// Record in seen the input of a card's converter in LSB, for each play's `samples` rows of `channels` voltages. Return 1 iff all
+/// are finite. card: rows of `channels` numbers: gain, droop [V], lower end of the range [V], LSB [V], noise [LSB] and offset
+/// [LSB]. normal: standard normal numbers, one for each voltage. held: a row of voltages for each play, held before, then those
+/// of the last sample: the step from sample to sample lacks the part `residual`. NULL: it lacks nothing.
+int engine_see(int64_t       plays,
+               int64_t       samples,
                int           channels,
                const double* card,
                double        residual,
@@ -287,5 +288,12 @@ void engine_take(int64_t        samples,
                  const double*  probes,
                  const double*  late,
                  double*        out);
+
+/// Write the states of numpy.random.PCG64 that default_rng([seed[i], stream]) begins with: rows of the high and the low half of the
+/// state, and those of the increment.
+void engine_seed(int64_t count, const uint64_t* seed, uint32_t stream, uint64_t* states);
+
+/// Write the next `count` uniform numbers from 0 to 1 of each of the streams. The states stay as they are.
+void engine_draw(int64_t streams, int64_t count, const uint64_t* states, double* out);
 
 #endif  // ENGINE_H

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from ctypes import POINTER, c_double, c_int, c_int64, c_uint, c_void_p
+from ctypes import POINTER, c_double, c_int, c_int64, c_uint, c_uint32, c_void_p
 from pathlib import Path
 
 from analogrig_emulator.errors import EngineError
@@ -77,7 +77,9 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_noise_add", None, (c_int, c_int, c_int64, POINTER(Noise), *(c_void_p,) * 4)),
     ("engine_take", None, (c_int64, c_int, c_int64, c_void_p, c_double, *(c_void_p,) * 4)),
     ("engine_edges", None, (*(c_int64,) * 5, *(c_void_p,) * 4)),
-    ("engine_see", c_int, (c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),
+    ("engine_see", c_int, (c_int64, c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),
+    ("engine_seed", None, (c_int64, c_void_p, c_uint32, c_void_p)),
+    ("engine_draw", None, (c_int64, c_int64, c_void_p, c_void_p)),
     ("engine_convert", None, (c_int64, c_int, c_void_p, c_uint, c_uint, *(c_void_p,) * 3)),
 )
 

@@ -171,6 +171,11 @@ class ProgramCircuit(ABC):
         """Signs of the channels at their nodes: a card's differential input can be reversed."""
         return np.array([self.scales.quantities[channel].sign for channel in self.channels], dtype=np.float64)
 
+    def orient(self, volts: NDArray[np.float64]) -> None:
+        """Give the volts of the nodes, (..., channels), the signs of the channels, in place."""
+        for channel in np.flatnonzero(self.channel_signs < 0.0).tolist():  # a product by a row takes four times as long
+            np.negative(volts[..., channel], out=volts[..., channel])
+
     def coefficient(self, setting: str, value: float) -> float:
         """Coefficient under load of the pot of a setting, for a value in kg, N s/m or N/m.
 

@@ -57,7 +57,7 @@ class RepeatedPlay:
         self._schedule = CircuitSchedule(systems, nodes, last_samples, patience_ticks, trim.rows)
         self._engine = Engine(systems[0], nodes, computer.sample_rate_hz)
         self._kinks = systems[0].kinks
-        self._signs = computer.program.channel_signs
+        self._program = computer.program
         self._rate_hz = computer.sample_rate_hz
         self._amplifiers = trim.amps
         self._numbers = np.array([int(name.removeprefix("U")) - 1 for name in trim.amps])
@@ -69,21 +69,19 @@ class RepeatedPlay:
 
         Raises ExcitationError and EngineError.
         """
-        return self.play_all(excitation, np.array([excitation.phase]), offsets_v[None])[0]
+        volts, (lamps,) = self.play_all(excitation, np.array([excitation.phase]), offsets_v[None])
+        return Repeat(volts[0], lamps)
 
     def play_all(
         self, excitation: Excitation, phases: NDArray[np.float64], offsets_v: NDArray[np.float64]
-    ) -> list[Repeat]:
-        """Play once with each of these phases of the excitation, (plays,), and offsets, (plays, amplifiers).
+    ) -> tuple[NDArray[np.float64], list[Mapping[str, int | None]]]:
+        """Volts (plays, samples, 4) and lamps with each of these phases, (plays,), and offsets, (plays, amplifiers).
 
-        Their volts are parts of one array. Raises ExcitationError and EngineError, whichever play fails.
+        Raises ExcitationError and EngineError, whichever play fails.
         """
         constants = (self._apart_v + offsets_v[:, None, self._numbers]) * self._gain_rate
         edges = excitation.edges_at(phases, 0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
         plays = self._engine.play_all(self._schedule, constants, {SOURCE: edges})
         volts = plays.volts
-        volts *= self._signs
-        return [
-            Repeat(each, lamp_samples(self._amplifiers, self._kinks, ticks))
-            for each, ticks in zip(volts, plays.overdue_ticks, strict=True)
-        ]
+        self._program.orient(volts)
+        return volts, [lamp_samples(self._amplifiers, self._kinks, ticks) for ticks in plays.overdue_ticks]

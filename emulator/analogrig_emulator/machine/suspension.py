@@ -56,7 +56,7 @@ class SuspensionComputer:
         self.program = _program(program)
         self.sample_rate_hz = sample_rate_hz
         model, count = _model(opamp, offset_v), self.program.amplifiers
-        offsets_v = None if rng is None else drawn_offsets_v(model, count, rng, offset_v).tolist()
+        offsets_v = None if rng is None else drawn_offsets_v(model, rng.random(count), offset_v).tolist()
         if components.is_perfect and isinstance(self.program, Hashable):
             circuit, self._pots = _nominal(self.program, model)
             if offsets_v is not None:
@@ -64,7 +64,6 @@ class SuspensionComputer:
         else:
             models = [replace(model, vos_v=vos_v) for vos_v in offsets_v or [model.vos_v] * count]
             circuit, self._pots = _wired(self.program, models, components)
-        self._signs = self.program.channel_signs
         self.machine = AnalogComputer(
             circuit,
             self.program.channel_nodes,
@@ -229,10 +228,10 @@ class SuspensionComputer:
         trains = {SOURCE: edges.within(*self.machine.window(samples))} if edges.ticks.size else {}
         jumps = [(turn.sample, turn.values) for turn in turns]
         volts = self.machine.run_jumping(samples, jumps, trains) if jumps else self.machine.run(samples, trains)
-        channels = len(self._signs)
+        channels = len(self.program.channels)
         readings = self.machine.readings
         by_instant = volts.reshape(samples, volts.shape[1] // readings, readings)
-        by_instant[..., :channels] *= self._signs
+        self.program.orient(by_instant[..., :channels])
         if readings == channels:
             return volts
         self.probed = by_instant[:, 0, channels:]
@@ -324,6 +323,6 @@ def _model(opamp: str | OpAmpModel, offset_v: float) -> OpAmpModel:
     return preset(opamp) if isinstance(opamp, str) else opamp
 
 
-def drawn_offsets_v(model: OpAmpModel, count: int, rng: np.random.Generator, offset_v: float) -> NDArray[np.float64]:
-    """Input offsets of op-amps from U1 on: the model's plus one uniform within +-offset_v; (count,) V."""
-    return np.asarray(model.vos_v + rng.uniform(-offset_v, offset_v, count))
+def drawn_offsets_v(model: OpAmpModel, uniforms: NDArray[np.float64], offset_v: float) -> NDArray[np.float64]:
+    """Input offsets of op-amps, in V, from uniform numbers from 0 to 1: the model's plus one within +-offset_v."""
+    return np.asarray(model.vos_v + (-offset_v + 2.0 * offset_v * uniforms))

@@ -2,8 +2,6 @@
 
 #include "library.h"
 
-#include <string.h>
-
 size_t library_size(void) { return sizeof(library_t); }
 
 void library_init(library_t* const self) { self->settings = settings_default(); }
@@ -20,7 +18,9 @@ keep(const library_t* const self, const size_t k, const est_step_t* const step, 
         const uint8_t count = est_theta_count(&self->estimator);
         float         theta[EST_THETA_MAX];
         est_copy_theta(&self->estimator, theta);
-        (void)memcpy(&out->theta[k * count], theta, count * sizeof theta[0]);
+        for (uint8_t i = 0U; i < count; i++) {
+            out->theta[(k * count) + i] = theta[i];
+        }
     }
     if (out->innovation != 0) {
         out->innovation[k] = step->innovation;

@@ -73,7 +73,6 @@ def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
     _check(events, confidence, burst)
     if events == 0:
         return 0.0
-    from scipy.optimize import minimize_scalar
 
     def bound(burst: float) -> float:
         return _rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
@@ -81,6 +80,8 @@ def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
     at_most = bound(burst)
     if at_most <= bound(1.0 + 0.95 * (burst - 1.0)):  # it falls with the bursts before it rises
         return at_most
+    from scipy.optimize import minimize_scalar  # it loads slowly
+
     least = minimize_scalar(bound, bounds=(1.0, burst), method="bounded", options={"xatol": 0.05}).fun
     return float(min(bound(1.0), least))
 

@@ -84,11 +84,14 @@ def changes_between(
 
 def advance(course: Trajectory, samples: int) -> NDArray[np.float64]:
     """Displacement of the next samples in LSB, computed in chunks."""
+    if samples <= CHUNK_SAMPLES:
+        return course.advance(samples) if samples else np.empty(0)
     chunks = (min(CHUNK_SAMPLES, samples - first) for first in range(0, samples, CHUNK_SAMPLES))
-    return np.concatenate([np.empty(0), *(course.advance(chunk) for chunk in chunks)])
+    return np.concatenate([course.advance(chunk) for chunk in chunks])
 
 
 def first_at_level(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
     """Smallest n with I(n) >= level, or None."""
-    reached = np.flatnonzero(np.asarray(information) >= level)
-    return int(reached[0]) + 1 if len(reached) else None
+    reached = np.asarray(information) >= level
+    first = int(reached.argmax()) if reached.size else 0
+    return first + 1 if reached.size and reached[first] else None

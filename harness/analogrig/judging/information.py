@@ -146,6 +146,7 @@ def information_of(model: Model, change: PlantChange, weight: NDArray[np.float64
         part = slice(first, min(first + CHUNK_SAMPLES, len(out)))
         difference_lsb = out[part] - unchanged.advance(part.stop - part.start)
         informative = difference_lsb**2 * weight[change.start + 1 :][part]
-        out[part] = np.cumsum(np.append(gathered, informative))[1:]
+        informative[0] += gathered
+        np.cumsum(informative, out=out[part])
         gathered = float(out[part][-1])
     return out

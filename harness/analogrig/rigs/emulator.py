@@ -52,8 +52,11 @@ from analogrig_emulator import (
     ahead_ticks,
     drawn_offsets_v,
     is_repeatable,
+    normals,
     preset,
     probes_per_sample,
+    sample_plays,
+    uniforms,
 )
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V, MOST_HUM_V = 1000.0, 1e-3, 1.0, 10.0
@@ -393,10 +396,11 @@ class EmulatorRig(Rig):
         self, scenario: Scenario, seeds: Sequence[int], computer: SuspensionComputer
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Phases (seeds,) and offsets of the amplifiers (seeds, amplifiers) in volts."""
-        count, offset_v = computer.program.amplifiers, self._description.computer.offset_v
-        generators = (Stream.COMPONENTS.generator(seed) for seed in seeds)
-        offsets_v = np.stack([drawn_offsets_v(self._amplifier, count, rng, offset_v) for rng in generators])
-        return np.array([scenario.draw_phase(Stream.EXCITATION.generator(seed)) for seed in seeds]), offsets_v
+        numbers = uniforms(seeds, Stream.COMPONENTS, computer.program.amplifiers)
+        offsets_v = drawn_offsets_v(self._amplifier, numbers, self._description.computer.offset_v)
+        if scenario.random_phase:
+            return uniforms(seeds, Stream.EXCITATION, 1)[:, 0], offsets_v
+        return np.full(len(seeds), scenario.excitation.phase), offsets_v
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         if repeated := self._repeat(scenario, [seed]):
@@ -515,9 +519,10 @@ class EmulatorRig(Rig):
         """Samples and lit lamps of each seed."""
         phases, offsets_v = self._drawn(scenario, seeds, prepared.computer)
         with emulator_errors(as_error=RigError):
-            for seed, (volts, lamps) in zip(seeds, play.play_all(scenario.excitation, phases, offsets_v), strict=True):
-                codes, clipped = Sampler(prepared.card, Stream.CARD.generator(seed)).sample(volts)
-                yield Block(0, volts, codes, clipped), _lit_lamps(lamps, 1)
+            volts, lamps = play.play_all(scenario.excitation, phases, offsets_v)
+            codes, clipped = sample_plays(prepared.card, volts, normals(seeds, Stream.CARD, volts.shape[1:]))
+        for each, *samples in zip(lamps, volts, codes, clipped, strict=True):
+            yield Block(0, *samples), _lit_lamps(each, 1)
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         card = self.card(scenario.program)
