@@ -26,6 +26,7 @@ from analogrig.hardware.self_test import self_test
 from analogrig.hardware.wiring import RealDescription, check_wiring
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant, Segment
+from analogrig.program import Program
 from analogrig.rigs.emulator import Stream, emulator_errors
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
 from analogrig.scenario import Scenario

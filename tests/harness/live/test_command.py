@@ -41,7 +41,7 @@ def test_served_instrument_is_driven_record_by_record(tmp_path: Path, options: t
             client = Client(socket)
             state = await client.until(lambda state: state["drives"])
             assert not state["generator"]["on"]  # until a hand switches it on
-            assert "force" in await client.ask("generate", high_v=20.0)
+            assert "limits.input_v" in await client.ask("generate", high_v=20.0)
             assert "whole records" in await client.ask("step")
             assert await client.ask("generate", on=True) == ""
             await client.until(lambda state: state["samples"] > 0)
