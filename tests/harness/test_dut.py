@@ -460,7 +460,7 @@ def test_damage_of_an_earlier_run_does_not_explain_a_loss(line: FaultyLink) -> N
         feed(dut, 0, N)
 
 
-@pytest.mark.parametrize(("exchange", "kind", "cost_s"), [("stream", SampleBlock, 0.0), ("sample", Sample, 2.0)])
+@pytest.mark.parametrize(("exchange", "kind", "cost_s"), [("stream", SampleBlock, 0.0), ("sample", Sample, InprocDevice.timeout_s)])
 def test_loss_costs_one_time_out_in_lock_step_and_none_in_a_stream(
     line: FaultyLink, exchange: str, kind: type, cost_s: float
 ) -> None:
@@ -477,7 +477,7 @@ def test_line_that_loses_all_samples_is_given_up(line: FaultyLink) -> None:
     line.to_device = lambda message: [] if isinstance(message, Sample) else [message]
     with pytest.raises(LinkTimeout, match="it is alive, but messages to it were lost 11 times in this run"):
         feed(dut, 0, N)
-    assert line.clock() == pytest.approx(2.0 * 11)
+    assert line.clock() == pytest.approx(InprocDevice.timeout_s * 11)
 
 
 def test_damaged_sample_is_counted_by_the_device(line: FaultyLink) -> None:

@@ -249,10 +249,12 @@ class Response:
 
         scale = np.array([0.1, 0.1, 0.1, 0.1, 1e-3, 0.1, 0.1])
         found = least_squares(residual, min(starts)[1], method="lm", x_scale=scale, diff_step=1e-7)
-        if not found.success or not np.isfinite(found.x).all():
+        determined = np.linalg.matrix_rank(found.jac) == len(scale) if np.isfinite(found.jac).all() else False
+        if not found.success or not np.isfinite(found.x).all() or not determined:
             raise SelfTestError("the output does not respond to the input as a plant of second order does")
         variance = float(np.square(found.fun).sum()) / (len(samples) - len(scale))
-        errors = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac))).tolist()
+        inverse = np.linalg.pinv(found.jac)
+        errors = np.sqrt(variance * np.square(inverse).sum(axis=1)).tolist()
         offset, gain, log_mass, log_damping, *times = found.x.tolist()
         mass, damping = math.exp(log_mass), math.exp(log_damping)
         return cls(
