@@ -460,7 +460,9 @@ def test_damage_of_an_earlier_run_does_not_explain_a_loss(line: FaultyLink) -> N
         feed(dut, 0, N)
 
 
-@pytest.mark.parametrize(("exchange", "kind", "cost_s"), [("stream", SampleBlock, 0.0), ("sample", Sample, InprocDevice.timeout_s)])
+@pytest.mark.parametrize(
+    ("exchange", "kind", "cost_s"), [("stream", SampleBlock, 0.0), ("sample", Sample, InprocDevice.timeout_s)]
+)
 def test_loss_costs_one_time_out_in_lock_step_and_none_in_a_stream(
     line: FaultyLink, exchange: str, kind: type, cost_s: float
 ) -> None:

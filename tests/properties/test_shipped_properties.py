@@ -56,7 +56,7 @@ def test_device_program_has_every_property_that_a_line_has_time_for(tmp_path: Pa
 
 
 def test_device_program_converses_and_faults_of_its_line_do_no_harm(tmp_path: Path) -> None:
-    told = run(tmp_path, "host?exchange=block&timeout_s=2", "-k", "faults_of_the_line or converses")
+    told = run(tmp_path, "host?exchange=block&timeout_s=1", "-k", "faults_of_the_line or converses")
     assert "9 passed" in told
 
 

@@ -254,7 +254,7 @@ class LiveSession:
         except AnalogrigError as error:
             self._stop_after(str(error))
             return
-        if not self.desk.is_stepped and self.ring.end > CHANGE_N:
+        if not self.desk.is_stepped and self.take.is_shown and self.ring.end > CHANGE_N:
             self._end_turns(self._turns, {name: turn.value for name, turn in self._turns.items()})
         self.counters = {**run.conditions.counters, **run.conditions.link_counters}
         if keeps:
@@ -272,20 +272,26 @@ class LiveSession:
         if not self.desk.is_stepped and self._turns:
             tweaks = (PotChange(CHANGE_N, {name: turn.value for name, turn in self._turns.items()}),)
         scenario = dataclasses.replace(scenario, excitation=excitation, tweaks=tweaks, seed=self.seed)
-        self.take_number += 1
         self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
         self._ends_take = False
         self._pace = None
         self._taken = 0
-        self.ring.restart()
-        self.notes.begin(self.take, self.take_number)
-        if tweaks:
-            self._await_turns(CHANGE_N + 1, self._turns.values())
-        self.version += 1
-        for fault in self.injected:
-            self._note_fault(fault)
+        self.take.turned_s = [turn.at_s for turn in self._turns.values() if tweaks and turn.at_s is not None]
+        if self.desk.is_stepped:
+            self._show_take()  # others take a whole record first
         for kind in () if self.device.faulty_line is None else self.device.faulty_line.lasting:
             self.take.add_caveat(f"line fault {kind}: injected by hand before the recording")
+
+    def _show_take(self) -> None:
+        """Show the take instead of the one before."""
+        self.take_number += 1
+        self.ring.restart()
+        self.notes.begin(self.take, self.take_number)
+        self.notes.await_turn(CHANGE_N + 1, self.take.turned_s)
+        self.take.is_shown = True
+        for fault in self.injected:
+            self._note_fault(fault)
+        self.version += 1
 
     @property
     def ordered_values(self) -> dict[str, float]:
@@ -514,6 +520,8 @@ class LiveSession:
     def _watch(self, block: Block, answers: Answers) -> None:
         """Take note of an answered block."""
         now_s = self.clock()
+        if not self.take.is_shown:
+            self._show_take()
         self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
         self.link_counters = dict(self.device.link_counters)
         self.ring.add(block, self.desk.probed(len(block.codes)), answers)

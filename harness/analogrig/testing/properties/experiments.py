@@ -36,7 +36,7 @@ from analogrig.scenario import Scenario
 from analogrig.testing.played import Played, rate_below
 from analogrig.testing.statement import Finding, Inconclusive, Play, experiment
 
-LONGEST_TIMEOUT_S = 0.5
+LONGEST_TIMEOUT_S = 1.0
 """Longest time-out of a line on which faults are tried: some faults cost one time-out, or a few."""
 
 _WITNESS_N = 2000
@@ -387,7 +387,7 @@ def device_with_faults(play: Play) -> CatalogueDescription:
     if not has_our_estimator(device):
         pytest.skip(f"needs a device with faults on its line, not {device.name}")
     if "in-process" not in device.capabilities and device.timeout_s > LONGEST_TIMEOUT_S:
-        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=1")
     return device
 
 
