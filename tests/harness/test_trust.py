@@ -35,8 +35,10 @@ from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.store import Store
 from analogrig.cli import main
+from analogrig.devices.can import CanDevice
 from analogrig.devices.opening import open_dut, reopen_dut
 from analogrig.devices.registry import KINDS, describe, from_table, named_things
+from analogrig.devices.serial import SerialDevice
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.instrument import DRIVERS
 from analogrig.hardware.pots import InstrumentPots, PotsDescription
@@ -516,6 +518,10 @@ def test_rigs_file_of_the_environment_is_a_file(
 def test_device_that_the_command_line_or_the_environment_names_is_opened(
     kind: Callable[..., Bait], through: str, folder: Path, monkeypatch: pytest.MonkeyPatch, library: Path
 ) -> None:
+    for described in (SerialDevice, CanDevice):
+        defaults = described.__init__.__kwdefaults__
+        assert defaults
+        monkeypatch.setitem(defaults, "timeout_s", 0.1)  # nobody answers
     bait = kind(folder, monkeypatch, library)
     name = bait.name.replace("inproc:", "inproc:theirs/")
     if through == "--dut":
