@@ -24,7 +24,7 @@ from analogrig.live.take import MOST_KEPT_CHANGES
 from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import OUTPUT
-from analogrig.scenario import Scenario
+from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import Mode as Relays
 from analogrig_emulator import Moment, SuspensionComputer, probes_per_sample
 from analogrig_emulator.machine.patching import patches
@@ -36,8 +36,6 @@ CHANGE_N = 2000
 
 Lengths = Callable[[], Iterator[int]]
 """Function that yields the length of each next block when it is due; 0: the device answers all blocks before."""
-
-_NO_MACHINE = "this rig plays whole records: it has no modes, no faults to inject and no single step"
 
 
 class Desk(Rig):
@@ -68,9 +66,13 @@ class Desk(Rig):
         """:raises ConfigurationError: the rig cannot play this scenario; nothing moves."""
         self._rig.perform(scenario, self._seed)
 
-    def check_values(self, values: Mapping[str, float]) -> None:
-        """:raises ConfigurationError: the rig's pots cannot show these values."""
-        self.check(self.scenario.with_plant(self.scenario.plant.changed(values)))
+    def check_turn(self, values: Mapping[str, float], turned: Mapping[str, float]) -> None:
+        """Check a turn of pots from some values.
+
+        :raises ConfigurationError: the rig's pots cannot turn so, or cannot show these values.
+        """
+        scenario = self.scenario.with_plant(self.scenario.plant.changed(values))
+        self.check(dataclasses.replace(scenario, tweaks=(PotChange(CHANGE_N, turned),)))
 
     def description(self) -> Mapping[str, Any]:
         return self._rig.description()
@@ -115,26 +117,23 @@ class Desk(Rig):
         """
         return None
 
-    def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:  # noqa: ARG002
-        """Turn pots after the last sample taken, to values of which these parameters have changed.
+    def turn(self, values: Mapping[str, float], names: Iterable[str], sample: int, ramp_n: int) -> None:
+        """Turn pots of a stepped rig after the last sample taken, to values of which these parameters have changed.
 
         :raises ConfigurationError: a pot cannot show a value; none is turned then.
         """
-        raise ConfigurationError(_NO_MACHINE)
+        raise NotImplementedError
 
-    def inject(self, fault: Fault, *, on: bool) -> None:  # noqa: ARG002
-        """Switch a fault on or off, from the next sample on.
+    def inject(self, fault: Fault, *, on: bool) -> None:
+        """Switch one of ``faults`` on or off, from the next sample on."""
+        raise NotImplementedError
 
-        :raises ConfigurationError: the rig has no such fault.
-        """
-        raise ConfigurationError(_NO_MACHINE)
-
-    def switch(self, mode: Mode) -> None:  # noqa: ARG002
-        """Switch the relays, through the modes between.
+    def switch(self, mode: Mode) -> None:
+        """Switch the relays of a stepped rig, through the modes between.
 
         :raises ConfigurationError: the circuit has no solution in that mode.
         """
-        raise ConfigurationError(_NO_MACHINE)
+        raise NotImplementedError
 
     def clear_lamps(self) -> None:
         """Put the overload lamps out."""
@@ -170,9 +169,10 @@ class SteppedDesk(Desk):
         with emulator_errors():
             set_up.excitation.check_rate(self._card.rate_hz)
 
-    def check_values(self, values: Mapping[str, float]) -> None:
+    def check_turn(self, values: Mapping[str, float], turned: Mapping[str, float]) -> None:
+        plant = self.scenario.plant.changed({**values, **turned})
         with emulator_errors():
-            self._computer.dials_for(**self._emulated.pot_settings(self.scenario.plant.changed(values), values))
+            self._computer.dials_for(**self._emulated.pot_settings(plant, plant.parameters()))
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         set_up = self._emulated.set_up(scenario, seed)

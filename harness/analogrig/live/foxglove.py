@@ -44,6 +44,7 @@ _WARNING, _ERROR = 1, 2
 _log = logging.getLogger(__name__)
 
 _NUMBER: Mapping[str, Any] = {"type": "number"}
+_UNKNOWN_OR_NUMBER: Mapping[str, Any] = {"type": ["number", "null"]}
 _TEXT: Mapping[str, Any] = {"type": "string"}
 
 
@@ -71,8 +72,9 @@ class Topic:
 
 def channels_of(session: LiveSession) -> dict[int, Topic]:
     """Channels of a session by number."""
-    signals = dict.fromkeys(signals_of(session), _NUMBER)
-    alarm = {"take": _NUMBER, "sample": _NUMBER, "what": _TEXT, "latency_n": _NUMBER, "bound_n": _NUMBER}
+    signals = dict.fromkeys(signals_of(session), _UNKNOWN_OR_NUMBER)
+    alarm = {"take": _NUMBER, "sample": _NUMBER, "what": _TEXT}
+    alarm |= dict.fromkeys(("latency_n", "bound_n"), _UNKNOWN_OR_NUMBER)
     state = {"mode": _TEXT, "samples": _NUMBER, "speed": _NUMBER, "take": _NUMBER}
     rows = f"{_ROWS} evenly spaced samples every {_PERIOD_S:g} s, at machine time from the start of the take"
     topics = (
@@ -168,7 +170,6 @@ class Viewer:
             turns.append(Turn(name, float(value)))
         self._session.do(*turns)
         if table.get("id") is not None:
-            await asyncio.sleep(2 * _PERIOD_S)  # the pots turn before the next block
             await self._tell_parameters({turn.name for turn in turns}, table["id"])
 
     async def _watch_parameters(self, table: Mapping[str, Any]) -> None:
@@ -185,7 +186,7 @@ class Viewer:
     async def _tell_parameters(self, names: Collection[str], number: Any = None) -> None:
         values = [
             {"name": name, "value": value, "type": "float64"}
-            for name, value in self._session.values.items()
+            for name, value in self._session.ordered_values.items()
             if name in names
         ]
         await self._tell("parameterValues", parameters=values, **({} if number is None else {"id": str(number)}))
@@ -201,10 +202,10 @@ class Viewer:
             while True:
                 await asyncio.sleep(_PERIOD_S)
                 session = self._session
-                if session.take_number != take:
-                    take, end = session.take_number, 0
-                    began_ns = max(time.time_ns(), sent_ns)
-                last, end = end, session.ring.end
+                last = end
+                before, (take, end) = take, session.ring.place
+                if take != before:
+                    last, began_ns = 0, max(time.time_ns(), sent_ns)
                 rows: list[dict[str, Any]] = []
                 if "/signals" in self._topics():
                     async with self._work():
@@ -212,9 +213,8 @@ class Viewer:
                 for row in rows:
                     sent_ns = began_ns + round(1e9 * row["sample"] / session.sample_rate_hz)
                     await self._send("/signals", row, sent_ns)
-                fresh = min(session.notes.alarm_count - sent_alarms, len(session.notes.alarms))
-                sent_alarms = session.notes.alarm_count
-                for alarm in list(session.notes.alarms)[-fresh:] if fresh else ():
+                for alarm in [each for each in list(session.notes.alarms) if each.number > sent_alarms]:
+                    sent_alarms = alarm.number
                     table = {"take": alarm.take, "sample": alarm.sample, "what": alarm.what}
                     await self._send("/alarms", table | {"latency_n": alarm.latency_n, "bound_n": alarm.bound_n})
                 if end != last:
@@ -225,7 +225,7 @@ class Viewer:
                         "take": take,
                     }
                     await self._send("/state", state)
-                changed = {name: value for name, value in session.values.items() if told.get(name) != value}
+                changed = {name: value for name, value in session.ordered_values.items() if told.get(name) != value}
                 told |= changed
                 if self._watched & set(changed):
                     await self._tell_parameters(self._watched & set(changed))

@@ -38,6 +38,8 @@ _MOST_TIMED = 1000
 class NotedAlarm:
     """Alarm of the device, with its latency."""
 
+    number: int
+    """Number in the session, from 1."""
     take: int
     sample: int
     what: str = ""
@@ -66,8 +68,8 @@ class Notes:
         """Data sheet, which a device may suit to the program as a take begins."""
         self._is_new = True
         """True until the first block of a take."""
-        self._take = Take(desk.scenario)
-        self._number = 0
+        self.take = Take(desk.scenario)
+        """Take that the ring holds."""
         self._unfelt: deque[tuple[int, float]] = deque(maxlen=_MOST_TIMED)
         """Samples that feel a turn of a pot, and the times of the turns."""
         self.felt_s: deque[float] = deque(maxlen=_MOST_TIMED)
@@ -81,9 +83,10 @@ class Notes:
         self.missing_n = 0
         """Samples that the device has not got: clipped, or lost on its line."""
 
-    def begin(self, take: Take, number: int) -> None:
-        """Begin a take."""
-        self._take, self._number, self._is_new = take, number, True
+    def begin(self, take: Take) -> None:
+        """Begin a take; its samples follow in the ring."""
+        self.take, self._is_new = take, True
+        self._ring.restart()
         self.forget_turns()
         self.diagnosis, self.misfit = "", ""
         self._disturbed = {}
@@ -119,10 +122,11 @@ class Notes:
         return has_searched or bool(answers.alarms or answers.diagnoses or answers.misfits)
 
     def _note_alarm(self, sample: int) -> None:
-        alarm = NotedAlarm(self._number, sample)
-        earlier = [segment for segment in self._take.segments() if segment.start < sample][-2:]
+        self.alarm_count += 1
+        alarm = NotedAlarm(self.alarm_count, self._ring.place[0], sample)
+        earlier = [segment for segment in self.take.segments() if segment.start < sample][-2:]
         start, ramp_n = earlier[-1].start, earlier[-1].ramp_n
-        seen = [each for each in self.alarms if each.take == self._number and each.change == start]
+        seen = [each for each in self.alarms if each.take == self._ring.place[0] and each.change == start]
         names = ", ".join(earlier[0].plant.changes_to(earlier[-1].plant))
         if names and (sample <= start + ramp_n or not seen):
             alarm.what, alarm.change, alarm.latency_n = names, start, sample - start
@@ -131,13 +135,12 @@ class Notes:
         else:
             alarm.fault = ", ".join(what for what, end in self._disturbed.items() if sample <= end)
         self.alarms.append(alarm)
-        self.alarm_count += 1
 
     def _search_bounds(self, end: int) -> bool:
         """Look for the information bounds of the changes that were detected. Return True if a search was made."""
         has_searched = False
         for alarm in self.alarms:
-            is_open = alarm.take == self._number and alarm.what and alarm.bound_n is None
+            is_open = alarm.take == self._ring.place[0] and alarm.what and alarm.bound_n is None
             if not is_open or alarm.searched >= len(_BOUND_AFTER_N):
                 continue
             if end >= alarm.change + _BOUND_AFTER_N[alarm.searched]:
@@ -152,7 +155,7 @@ class Notes:
         The course starts from the machine's own state at the change; that of a linear plant follows the input of the
         record, which begins at rest.
         """
-        segments, performance = self._take.segments(), self._desk.performance
+        segments, performance = self.take.segments(), self._desk.performance
         number = next((i for i, segment in enumerate(segments) if segment.start == change), 0)
         if not number:  # no longer kept
             return None
@@ -180,7 +183,7 @@ class Notes:
             found = information.information_of(model, PlantChange(0, before, after, moment, course_lsb), weight)
         except (LookupError, ConfigurationError):  # no longer in the ring; or a machine that cannot play so
             return None
-        return first_at_level(found, self._sheet.log_arl0(self._take.scenario.expect.arl0))
+        return first_at_level(found, self._sheet.log_arl0(self.take.scenario.expect.arl0))
 
     def estimated(self, theta: NDArray[np.floating]) -> NDArray[np.float64]:
         """Parameters ``program.estimates`` (n, m) of estimates theta; NaN if they describe no such plant."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, get_args
 
+from analogrig.live.commands import Mode
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.scope import (
     LEAST_COLUMNS,
@@ -27,7 +28,7 @@ def bench_table(session: LiveSession) -> dict[str, Any]:
         "program": desk.program.name,
         "dut": device.name,
         "stepped": desk.is_stepped,
-        "modes": ["POT SET", "INITIAL CONDITION", "HOLD", "OPERATE"] if desk.is_stepped else [],
+        "modes": list(get_args(Mode)) if desk.is_stepped else [],
         "faults": dict(desk.faults),
         "line_faults": {kind: LINE_LABELS[kind] for kind in session.line_faults},
         "knobs": [dataclasses.asdict(knob) for knob in session.knobs.values()],
@@ -91,9 +92,9 @@ def state_table(session: LiveSession) -> dict[str, Any]:
     """State of the bench."""
     truth = session.desk.scenario.plant.changed(session.values).parameters()
     estimates = session.notes.estimates()
-    end = session.ring.end
+    take, end = session.ring.place
     return {
-        "take": session.take_number,
+        "take": take,
         "samples": end,
         "playing": session.is_playing,
         "factor": session.factor,

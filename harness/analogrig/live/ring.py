@@ -28,22 +28,27 @@ class Ring:
             "statistic": np.zeros(RING_N, np.float32),
             "flags": np.zeros(RING_N, np.uint8),
         }
-        self._end = 0
+        self._place = (0, 0)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """Number of the play, from 1, and number of its samples."""
+        return self._place
 
     @property
     def end(self) -> int:
         """Number of samples since the start of the play."""
-        return self._end
+        return self._place[1]
 
     @property
     def start(self) -> int:
         """Oldest sample in the ring."""
-        return max(0, self._end - RING_N)
+        return max(0, self.end - RING_N)
 
     def restart(self) -> None:
-        """Forget all samples: the next one is the first of a play."""
+        """Forget all samples: the next one is the first of the next play."""
         with self._lock:
-            self._end = 0
+            self._place = self._place[0] + 1, 0
 
     def add(self, block: Block, probed: NDArray[np.float64], answers: Answers) -> None:
         """Append the answered samples of a block."""
@@ -62,7 +67,8 @@ class Ring:
                 self._write({k: v[skip : min(n, skip + RING_N)] for k, v in values.items() if v is not None})
 
     def _write(self, values: dict[str, NDArray[np.generic]]) -> None:
-        n, at = len(values["flags"]), self._end % RING_N
+        n, (take, end) = len(values["flags"]), self._place
+        at = end % RING_N
         until_wrap = min(n, RING_N - at)
         for name, value in values.items():
             column = self.columns[name]
@@ -70,7 +76,7 @@ class Ring:
                 column = self.columns[name] = np.zeros((RING_N, *value.shape[1:]), column.dtype)
             column[at : at + until_wrap] = value[:until_wrap]
             column[: n - until_wrap] = value[until_wrap:]
-        self._end += n
+        self._place = take, end + n
 
     def read(self, name: str, first: int, end: int) -> NDArray[np.generic]:
         """Copy of a column for the samples ``first`` <= k < ``end``.
@@ -78,7 +84,7 @@ class Ring:
         :raises LookupError: the ring does not hold them any more, or not yet.
         """
         with self._lock:
-            if not self.start <= first <= end <= self._end:
+            if not self.start <= first <= end <= self.end:
                 raise LookupError(f"samples {first} to {end} are not in the ring")
             at, n = first % RING_N, end - first
             column = self.columns[name]

@@ -154,7 +154,7 @@ class Screen:
         view, ring = self.view, session.ring
         if view is None or (self._held is not None and self._shown is not None):
             return None
-        end, take = ring.end, session.take_number
+        take, end = ring.place
         if view.trigger.mode == "single" and self._armed is None:
             self._armed = take, end
         least = LEAST_WINDOW_N if view.kind == "fft" else 2
@@ -211,10 +211,10 @@ class Screen:
         after = None
         if view.trigger.mode == "single" and self._armed is not None:
             after = self._armed[1] if self._armed[0] == take else 0
-        return _find_trigger(view.trigger, session, end, min(view.samples, end), after)
+        return _crossing(view.trigger, session, end, min(view.samples, end), after)
 
 
-def _find_trigger(trigger: Trigger, session: LiveSession, end: int, samples: int, after: int | None) -> float | None:
+def _crossing(trigger: Trigger, session: LiveSession, end: int, samples: int, after: int | None) -> float | None:
     """Instant of a trigger after which the screen is full, in samples; None if there is none.
 
     :param after: sample from which the first trigger counts; None: the last trigger counts.

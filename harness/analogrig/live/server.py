@@ -288,15 +288,15 @@ class BenchServer:
             if client is self._driver:
                 self._driver = None
                 self.session.make_safe()
-            self._call_all()
+            self._wake_all()
 
     def _appoint(self, client: _PageClient) -> None:
         """Let a client drive if nobody does."""
         if self._driver is None:
             self._driver = client
-        self._call_all()
+        self._wake_all()
 
-    def _call_all(self) -> None:
+    def _wake_all(self) -> None:
         for client in self._clients:
             client.changed.set()
 
@@ -330,7 +330,7 @@ class BenchServer:
             raise ConfigurationError("this page watches: another client drives")
         else:
             self.session.do(command_of(name, table))
-            self._call_all()
+            self._wake_all()
 
     async def _send_all(self, client: _PageClient) -> None:
         """Send the bench, then frames and states as fast as the client takes them."""

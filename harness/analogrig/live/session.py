@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import logging
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -54,7 +53,8 @@ _OFF = Excitation(low_v=0.0, high_v=0.0)
 
 _MOST_NOTED = 50
 
-_log = logging.getLogger(__name__)
+_STEPPED_ONLY = commands.Operate | commands.Step | commands.ClearLamps | commands.Tempo
+"""Commands to rigs that are not played in whole records."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,6 @@ class LiveSession:
         """Wall-clock time per machine time."""
         self.overruns_n = 0
         """Samples by which the session has fallen behind real time."""
-        self.take_number = 0
         self.take = Take(self.desk.scenario)
         self.ring = Ring(len(self.desk.program.channels), len(self.desk.amplifiers), device.datasheet.theta_n)
         self.notes = Notes(self.desk, device, self.ring, seed)
@@ -189,7 +188,8 @@ class LiveSession:
                 if command.name not in self.knobs:
                     raise ConfigurationError(f"no pot shows {command.name!r}: there are {', '.join(self.knobs)}")
                 self.knobs[command.name].check(command.value)
-                self.desk.check_values(self.values | {command.name: command.value})
+                if command.value != self.values[command.name]:
+                    self.desk.check_turn(self.values, {command.name: command.value})
             case commands.Generate():
                 self._refuse_while_recording("the generator")
                 excitation = self._generated(command)
@@ -202,8 +202,8 @@ class LiveSession:
                 raise ConfigurationError("too many faults of the line wait for the next block")
             case commands.Inject() if command.fault not in self.desk.faults:
                 raise ConfigurationError(f"this rig has no fault {command.fault!r} to inject")
-        if not self.desk.is_stepped and isinstance(command, commands.Operate | commands.Step | commands.ClearLamps):
-            raise ConfigurationError("this rig plays whole records: it has no modes and no single step")
+        if not self.desk.is_stepped and isinstance(command, _STEPPED_ONLY):
+            raise ConfigurationError("this rig plays whole records: it has no modes, no tempo and no single step")
 
     def _refuse_while_recording(self, what: str) -> None:
         if self.is_recording:
@@ -216,6 +216,8 @@ class LiveSession:
         """
         wanted = {key: value for key, value in dataclasses.asdict(command).items() if value is not None and key != "on"}
         if wanted.get("shape", self.excitation.shape) != "pulse":
+            if "duty" in wanted:
+                raise ConfigurationError("only pulses have a duty: choose the shape pulse")
             wanted["duty"] = 0.5
         if wanted.get("shape", self.excitation.shape) != self.excitation.shape:
             wanted |= dict.fromkeys(("end_hz", "sweep_s", "harmonics", "samples_v"))
@@ -253,8 +255,10 @@ class LiveSession:
                 self.device.stop()  # it was started, and had no record to end
         except AnalogrigError as error:
             self._stop_after(str(error))
+            if isinstance(error, ConfigurationError):
+                self._end_turns(self._turns, {})  # they would be refused again
             return
-        if not self.desk.is_stepped and self.take.is_shown and self.ring.end > CHANGE_N:
+        if not self.desk.is_stepped and self.notes.take is self.take and self.ring.end > CHANGE_N:
             self._end_turns(self._turns, {name: turn.value for name, turn in self._turns.items()})
         self.counters = {**run.conditions.counters, **run.conditions.link_counters}
         if keeps:
@@ -269,26 +273,24 @@ class LiveSession:
             excitation = _OFF
         scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))
         tweaks: tuple[PotChange, ...] = ()
-        if not self.desk.is_stepped and self._turns:
-            tweaks = (PotChange(CHANGE_N, {name: turn.value for name, turn in self._turns.items()}),)
+        turned = {name: turn.value for name, turn in self._turns.items() if turn.value != self.values[name]}
+        if turned and not self.desk.is_stepped:
+            tweaks = (PotChange(CHANGE_N, turned),)
         scenario = dataclasses.replace(scenario, excitation=excitation, tweaks=tweaks, seed=self.seed)
         self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
         self._ends_take = False
         self._pace = None
         self._taken = 0
-        self.take.turned_s = [turn.at_s for turn in self._turns.values() if tweaks and turn.at_s is not None]
         if self.desk.is_stepped:
-            self._show_take()  # others take a whole record first
+            self._show_take()
         for kind in () if self.device.faulty_line is None else self.device.faulty_line.lasting:
             self.take.add_caveat(f"line fault {kind}: injected by hand before the recording")
 
     def _show_take(self) -> None:
-        """Show the take instead of the one before."""
-        self.take_number += 1
-        self.ring.restart()
-        self.notes.begin(self.take, self.take_number)
-        self.notes.await_turn(CHANGE_N + 1, self.take.turned_s)
-        self.take.is_shown = True
+        """Show the take instead of the one before, which a rig of whole records shows until it has the next one."""
+        self.notes.begin(self.take)
+        if self.take.changes:
+            self._await_turns(CHANGE_N + 1, self._turns.values())
         for fault in self.injected:
             self._note_fault(fault)
         self.version += 1
@@ -520,7 +522,7 @@ class LiveSession:
     def _watch(self, block: Block, answers: Answers) -> None:
         """Take note of an answered block."""
         now_s = self.clock()
-        if not self.take.is_shown:
+        if self.notes.take is not self.take:
             self._show_take()
         self.mode, self.lamps = self.desk.mode, tuple(self.desk.lamps)
         self.link_counters = dict(self.device.link_counters)

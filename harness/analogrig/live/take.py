@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from analogrig.answers import Answers
@@ -36,10 +36,6 @@ class Take:
     scenario: Scenario
     """Scenario at its first sample; older changes of an unrecorded take are part of it."""
     is_recorded: bool = False
-    is_shown: bool = False
-    """True when it is what the bench shows: a rig of whole records shows the last record until the next one comes."""
-    turned_s: Sequence[float] = ()
-    """Times at which the turns of pots were ordered that the take begins with."""
     changes: list[PotChange] = field(default_factory=list)
     caveats: list[str] = field(default_factory=list)
     """Reasons that its recording cannot be judged."""

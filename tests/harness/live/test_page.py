@@ -227,6 +227,17 @@ def test_page_drives_a_served_instrument_in_another_process(browser: Browser, tm
             page.close()
 
 
+def test_page_without_a_connection_operates_nothing(browser: Browser, bench: BenchServer) -> None:
+    watched = Watched(browser, "about:blank")
+    watched.page.route_web_socket("**/live*", lambda socket: socket.close())
+    watched.page.goto(bench.address)
+    expect(watched.page.locator("#role")).to_have_text("The bench is not connected.")
+    expect(watched.page.locator("#record")).to_be_disabled()
+    for control, chosen in (("#kind", "fft"), ("#units", "problem"), ("#slope", "falling")):
+        watched.page.select_option(control, chosen)
+    assert watched.complaints == []
+
+
 def test_cut_line_is_reported_and_mended(browser: Browser, tmp_path: Path) -> None:
     with LiveBench(tmp_path, device=linked) as server:
         watched = opened_at(browser, server)

@@ -37,7 +37,7 @@ from analogrig.live.commands import (
     Turn,
     command_of,
 )
-from analogrig.live.desk import SteppedDesk
+from analogrig.live.desk import RECORD_N, SteppedDesk
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.panel import bench_table, state_table
 from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
@@ -46,6 +46,7 @@ from analogrig.live.take import MOST_KEPT_CHANGES, Take
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.rig import Performance
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import SuspensionComputer
@@ -200,6 +201,64 @@ def test_turn_on_a_rig_of_whole_records_lasts_and_is_timed_in_the_record_that_fe
     assert len(session.notes.felt_s) == 1  # not the turn that has waited for a hand to go on
 
 
+def test_rig_of_whole_records_shows_the_last_one_until_the_next_one_comes(tmp_path: Path) -> None:
+    sessions: list[LiveSession] = []
+    places: list[tuple[int, int]] = []
+
+    def begin(_: Scenario) -> None:
+        (session,) = sessions
+        places.append(session.ring.place)
+        if len(places) == 3:
+            raise RigError("the card is gone")
+        if len(places) == 5:
+            session.make_safe()
+
+    script = ((1.0, sessions.append), (2.0, Generate(on=True)), (9.0, SetPlaying(on=True)))
+    session = scripted_session(script, tmp_path, rig=RecordsRig(begin))
+    assert places == [(0, 0), (1, RECORD_N), (2, RECORD_N), (2, RECORD_N), (3, RECORD_N)]
+    assert session.ring.place == (4, RECORD_N)
+
+
+def test_turn_that_the_rig_cannot_make_is_refused_and_the_rig_plays_on(tmp_path: Path) -> None:
+    refused: list[str] = []
+
+    class FixedPotsRig(RecordsRig):
+        def perform(self, scenario: Scenario, seed: int) -> Performance:
+            if scenario.tweaks:
+                raise ConfigurationError("the pots of this rig cannot be changed")
+            return super().perform(scenario, seed)
+
+    def turn(session: LiveSession) -> None:
+        session.do(Turn("K", session.values["K"]))  # where it is
+        with pytest.raises(ConfigurationError, match="cannot be changed") as error:
+            session.do(Turn("K", 18000.0))
+        refused.append(str(error.value))
+
+    begun: list[Scenario] = []
+
+    def begin(scenario: Scenario) -> None:
+        begun.append(scenario)
+        if len(begun) == 2:
+            sessions[0].make_safe()
+
+    sessions: list[LiveSession] = []
+    script = ((1.0, sessions.append), (1.5, turn), (2.0, Generate(on=True)))
+    session = scripted_session(script, tmp_path, rig=FixedPotsRig(begin))
+    assert refused
+    assert not session.notices
+    assert session.ring.place == (2, RECORD_N)
+
+
+def test_duty_is_refused_but_for_pulses(tmp_path: Path) -> None:
+    def set_duty(session: LiveSession) -> None:
+        with pytest.raises(ConfigurationError, match="only pulses have a duty"):
+            session.do(Generate(duty=0.3))
+        session.do(Generate(shape="pulse", duty=0.3))
+
+    session = scripted_session(((0.1, set_duty), (0.2, SetPlaying(on=False))), tmp_path)
+    assert session.excitation.duty == 0.3
+
+
 def test_single_steps_while_paused_play_exactly_so_many_samples(tmp_path: Path) -> None:
     ends: list[int] = []
 
@@ -299,7 +358,7 @@ def test_generator_plays_a_sine_for_as_long_as_it_is_on(tmp_path: Path) -> None:
     end = session.ring.end
     assert end > 4000
     force_v = session.ring.read("probed", end - 400, end)[:, 0]
-    assert (session.excitation.shape, session.take_number) == ("sine", 2)
+    assert (session.excitation.shape, session.ring.place[0]) == ("sine", 2)
     lines = np.abs(np.fft.rfft(force_v - force_v.mean())) / 200
     assert np.argmax(lines) == 4  # 200 Hz at 20 kHz
     assert np.delete(lines, 4).max() < 0.1 * lines[4]
@@ -312,7 +371,7 @@ def test_commands_of_a_gone_driver_do_not_undo_the_switch_off(tmp_path: Path) ->
         session.make_safe()
 
     session = scripted_session(((0.05, leave), (0.1, SetPlaying(on=False))), tmp_path)
-    assert (session.is_on, session.is_recording, session.take_number) == (False, False, 2)
+    assert (session.is_on, session.is_recording, session.ring.place[0]) == (False, False, 2)
     assert not session.saved
     assert not session.ring.read("codes", 0, session.ring.end).std(axis=0).max() > 2
 
@@ -328,7 +387,7 @@ def test_rig_of_whole_records_plays_only_while_the_generator_is_on(tmp_path: Pat
     script = ((1.0, sessions.append), (2.0, Generate(on=True, high_v=4.0)), (3.0, SetPlaying(on=True)))
     session = scripted_session(script, tmp_path, rig=RecordsRig(note))
     assert levels_v == [4.0]
-    assert session.take_number == 1
+    assert session.ring.place[0] == 1
 
 
 def test_stuck_channel_is_recorded_and_makes_the_recording_inconclusive(tmp_path: Path) -> None:
@@ -367,7 +426,7 @@ def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
 
     session = scripted_session(((0.05, refuse),), tmp_path)
     assert session.values == session.desk.scenario.plant.parameters()
-    assert session.take_number == 1
+    assert session.ring.place[0] == 1
 
 
 def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> None:
@@ -382,7 +441,7 @@ def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> 
 
 def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
     session = scripted_session(((0.05, Turn("K", 18000.0)), (0.1, Restart()), (0.15, ClearLamps())), tmp_path)
-    assert session.take_number == 2
+    assert session.ring.place[0] == 2
     assert session.ring.end < 0.06 * RATE_HZ
     assert session.values["K"] == 18000.0
     assert not session.take.changes
@@ -391,7 +450,7 @@ def test_restart_forgets_the_samples_and_keeps_the_pots(tmp_path: Path) -> None:
 def test_take_that_ends_before_its_first_sample_leaves_the_device_ready(tmp_path: Path) -> None:
     script = ((0.001, Restart()), (0.002, Restart()), (0.1, SetPlaying(on=False)))
     session = scripted_session(script, tmp_path, dut=linked())
-    assert session.take_number == 3
+    assert session.ring.place[0] == 3
     assert not session.notices
     assert session.ring.end > 1000
 
@@ -489,7 +548,7 @@ def test_recording_that_cannot_be_saved_is_named_and_ends_nothing(
     script = ((0.0, SetRecording(on=True)), (0.02, SetRecording(on=False)), (0.05, SetPlaying(on=False)))
     session = scripted_session(script, tmp_path)
     assert "could not be saved: [Errno 24] Too many open files" in session.notices[0][1]
-    assert session.take_number == 3
+    assert session.ring.place[0] == 3
 
 
 def test_cut_line_stops_the_session_until_it_is_mended(tmp_path: Path) -> None:

@@ -39,7 +39,10 @@
   const knobs = new Map();
   const voltages = new Map(); // texts of the patch by amplifier
   const settings = document.querySelectorAll("#generator [data-key]");
-  let operated = []; // what only the page that drives can operate
+  const OPERATED =
+    ".bar button, .bar select, #generator button, #generator [data-key], #modes button, #fault-section button, " +
+    "#fault-section select, #clear-lamps";
+  let operated = document.querySelectorAll(OPERATED); // what only the page that drives can operate
 
   // ---- messages
 
@@ -47,7 +50,7 @@
     const token = new URLSearchParams(location.search).get("token") ?? "";
     socket = new WebSocket(`ws://${location.host}/live?token=${encodeURIComponent(token)}`);
     socket.binaryType = "arraybuffer";
-    socket.onmessage = ({ data }) => (typeof data === "string" ? told(JSON.parse(data)) : drawn(data));
+    socket.onmessage = ({ data }) => (typeof data === "string" ? receive(JSON.parse(data)) : receiveFrame(data));
     socket.onclose = () => {
       document.documentElement.removeAttribute("data-connected");
       leave();
@@ -61,7 +64,7 @@
     return number;
   }
 
-  function told(message) {
+  function receive(message) {
     if (message.bench) {
       views.clear();
       bench = message.bench;
@@ -146,7 +149,6 @@
     shown = shown.filter((id) => bench.signals.some((each) => each.id === id));
     if (!shown.length) shown = bench.signals.slice(0, 2).map(({ id }) => id);
     if (!shown.includes(current)) [current] = shown;
-    if (!$("source").value) level = bench.level;
     const base = $("base").value;
     $("base").replaceChildren();
     for (const seconds of BASES_S) option($("base"), seconds, `${withPrefix(seconds / 10, "s")}/div`);
@@ -154,16 +156,15 @@
     const source = $("source").value;
     $("source").replaceChildren();
     for (const { id, label } of bench.signals) option($("source"), id, label);
-    $("source").value = source || shown[0];
+    const stays = bench.signals.some(({ id }) => id === source);
+    $("source").value = stays ? source : shown[0];
+    if (!stays) level = bench.level;
     buildKnobs();
     buildModes();
     buildFaults();
     buildPatch();
     buildSignals();
-    operated = document.querySelectorAll(
-      ".bar button, .bar select, #generator button, #generator [data-key], #modes button, #fault-section button, " +
-        "#fault-section select, #clear-lamps",
-    );
+    operated = document.querySelectorAll(OPERATED);
   }
 
   function buildKnobs() {
@@ -533,8 +534,8 @@
     rows($("alarms"), alarms, (row, alarm) => {
       cell(row, alarm.take);
       cell(row, alarm.sample, "number");
-      const short = alarm.what || (alarm.again && `${alarm.again} again`) || alarm.fault || "none: false alarm";
-      cell(row, short, alarm.what || alarm.again || alarm.fault ? "text" : "text bad");
+      const text = alarm.what || (alarm.again && `${alarm.again} again`) || alarm.fault || "none: false alarm";
+      cell(row, text, alarm.what || alarm.again || alarm.fault ? "text" : "text bad");
       cell(row, alarm.latency_n ?? "–", "number");
       cell(row, alarm.bound_n ?? "–", "number");
     });
@@ -587,6 +588,7 @@
   // ---- the screen
 
   function look() {
+    if (!bench) return;
     const { limits } = bench;
     const within = (value, [low, high]) => Math.round(Math.min(high, Math.max(low, value)));
     const samples = within(Number($("base").value) * bench.rate, limits.samples);
@@ -603,6 +605,7 @@
     $("arm").hidden = $("mode").value !== "single";
     if (document.activeElement !== $("level")) $("level").value = short(level * factorOf($("source").value), 6);
     $("level-unit").textContent = unitOf($("source").value);
+    $("autoscale").disabled = kind === "fft";
     $("screen").hidden = kind === "xy";
     $("xy").hidden = kind !== "xy";
     $("cursor-panel").hidden = !$("cursors").checked || kind === "xy";
@@ -610,7 +613,7 @@
     views.add(send("view", { signals: shown, samples, columns, kind, trigger, arm }));
   }
 
-  function drawn(buffer) {
+  function receiveFrame(buffer) {
     const length = new DataView(buffer).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
     const values = {};
@@ -627,7 +630,7 @@
   function redraw() {
     isDue = false;
     if (!frame || !frame.signals.every((id) => shown.includes(id))) return;
-    const fresh = frame.signals.filter((id) => !scaleOf(id).per);
+    const fresh = frame.kind === "fft" ? [] : frame.signals.filter((id) => !scaleOf(id).per);
     fresh.forEach(fit);
     if (fresh.length) buildSignals();
     if (frame.kind === "xy") drawXy();
@@ -876,7 +879,7 @@
       look();
     };
     $("units").onchange = () => {
-      buildSignals();
+      if (bench) buildSignals();
       look();
       redraw();
     };
@@ -886,18 +889,19 @@
     };
     $("cursor-a").oninput = $("cursor-b").oninput = redraw;
     $("autoscale").onclick = () => {
-      if (!frame) return;
+      if (!frame || frame.kind === "fft") return;
       for (const id of frame.signals) fit(id);
       buildSignals();
       redraw();
     };
     new ResizeObserver(([{ contentRect: { width, height } }]) => {
       if (width) size = { width, height };
-      if (bench) look();
+      look();
     }).observe($("screen"));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   }
 
   listen();
+  leave();
   connect();
 })();
