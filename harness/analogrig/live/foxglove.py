@@ -36,9 +36,6 @@ _PERIOD_S = 0.02
 _ROWS = 8
 """Samples of the signals that are sent in each period."""
 _MOST_SUBSCRIPTIONS = 64
-_SLOW_S = 10.0
-_PAUSE_S = 0.005
-"""Least time between two messages of a viewer."""
 _WARNING, _ERROR = 1, 2
 
 _log = logging.getLogger(__name__)
@@ -95,16 +92,21 @@ class Viewer:
         *,
         may_set: Callable[[], bool],
         work: Callable[[], AbstractAsyncContextManager[None]],
+        slow_s: float,
+        pause_s: float,
     ) -> None:
         """Prepare; nothing is sent before ``serve``.
 
         :param may_set: true while this viewer may set parameters.
         :param work: context of work that other clients must wait for.
+        :param slow_s: a viewer that takes nothing for so long is dropped.
+        :param pause_s: least time between two messages of the viewer.
         """
         self._socket = socket
         self._session = session
         self._may_set = may_set
         self._work = work
+        self._slow_s, self._pause_s = slow_s, pause_s
         self._channels = channels_of(session)
         self._subscribed: dict[int, int] = {}
         """Channels by number of the subscription."""
@@ -123,7 +125,7 @@ class Viewer:
         try:
             async for message in self._socket:
                 await self._receive(message)
-                await asyncio.sleep(_PAUSE_S)
+                await asyncio.sleep(self._pause_s)
         finally:
             publishing.cancel()
             for error in await asyncio.gather(publishing, return_exceptions=True):
@@ -264,7 +266,7 @@ class Viewer:
 
     async def _put(self, message: str | bytes) -> None:
         try:
-            async with asyncio.timeout(_SLOW_S):
+            async with asyncio.timeout(self._slow_s):
                 await self._socket.send(message)
         except TimeoutError:
             self._socket.transport.abort()

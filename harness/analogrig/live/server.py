@@ -245,7 +245,12 @@ class BenchServer:
             if path == _FOXGLOVE:
                 try:
                     viewer = foxglove.Viewer(
-                        socket, self.session, may_set=lambda: self._may_set(socket), work=self._share_work
+                        socket,
+                        self.session,
+                        may_set=lambda: self._may_set(socket),
+                        work=self._share_work,
+                        slow_s=self._slow_s,
+                        pause_s=WATCHER_PAUSE_S,
                     )
                     await viewer.serve()
                 finally:
