@@ -86,6 +86,10 @@ def _shown(value: float | None, form: str) -> tuple[float | None, str]:
     return value, "–" if value is None else format(value, form)
 
 
+def _at_most(rate: float) -> str:
+    return "≤ 100%" if rate > 0.99 else f"≤ {100 * rate:.2g}%"
+
+
 _LATENCY = _Mapped(
     "Mean latency [samples]",
     ".1f",
@@ -96,7 +100,7 @@ _MISSES = _Mapped(
     "Miss rate",
     ".1%",
     lambda summary: summary.missed / summary.visible if summary.visible else None,
-    lambda summary: f"≤ {100 * summary.miss_rate[1]:.2g}%" if summary.visible else "",
+    lambda summary: _at_most(summary.miss_rate[1]) if summary.visible else "",
 )
 _MAPPED = (_LATENCY, _MISSES)
 
@@ -158,7 +162,7 @@ def _squares(
 def _title(plan: Plan, names: Mapping[str, str], summary: Summary) -> str:
     latency = "none detected" if summary.latency_n is None else f"latency {summary.latency_n:.1f} samples"
     bound = "" if summary.bound_n is None else f" (bound {summary.bound_n:.1f})"
-    rate = f" (rate ≤ {100 * summary.miss_rate[1]:.2g}%)" if summary.visible else ""
+    rate = f" (rate {_at_most(summary.miss_rate[1])})" if summary.visible else ""
     return (
         f"{_place(plan, names)}: {latency}{bound}, {summary.missed:,} of {summary.visible:,} changes missed{rate},"
         f" {number_of(summary.false_alarms, 'false alarm', form=',')}"
@@ -219,7 +223,7 @@ def _drawn_notes(quantity: _Mapped, total: int, count: int) -> tuple[str, str]:
     if not count:
         return "", title
     bound = RATES["missed"].sequence({"missed": total, "visible": count}, CONFIDENCE).bounds[1]
-    return f"≤ {100 * bound:.2g}%", title
+    return _at_most(bound), title
 
 
 def _distributions(results: Results) -> str:

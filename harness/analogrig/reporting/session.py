@@ -211,7 +211,7 @@ def _row(run: Entry) -> str:
     name = text(run.folder if run.folder != "." else "here")
     link = f'<a href="{text(quote(run.page))}">{name}</a>' if run.page else name
     places = [run.scenario, run.rig, run.device, run.build, run.commit]
-    numbers = [run.seed, run.samples, run.changes, run.missed, run.false_alarms]
+    numbers = [run.samples, run.changes, run.missed, run.false_alarms]
     outcome = cell(f"{_SIGNS[run.outcome]} {run.outcome}", f"text {_STYLES[run.outcome]}")
     return row(
         [
@@ -219,6 +219,7 @@ def _row(run: Entry) -> str:
             outcome,
             f'<th scope="row">{link}</th>',
             *map(cell, places),
+            number(run.seed, "d"),
             *(number(value, ",d") for value in numbers),
             number(run.ratio, ".2f"),
         ]
