@@ -119,7 +119,7 @@ def hold_signals() -> Iterator[None]:
 def signal_future() -> asyncio.Future[int]:
     """In a running event loop: a future that raises Interrupted at a signal that ends the command.
 
-    There, a handler that raises would end the task that happens to run at that moment.
+    A later signal ends the process. There, a handler that raises would end the task that happens to run at that moment.
     """
     import asyncio
 
@@ -129,6 +129,12 @@ def signal_future() -> asyncio.Future[int]:
     def end(name: str) -> None:
         if not ended.done():
             ended.set_exception(Interrupted(name))
+            loop.call_later(AGAIN_S, obey)
+
+    def obey() -> None:
+        for number in ENDING:
+            if loop.remove_signal_handler(number):
+                signal.signal(number, signal.SIG_DFL)
 
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:

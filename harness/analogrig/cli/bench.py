@@ -32,6 +32,8 @@ REPORT_INTERVAL_N = 64
 """Samples between estimates from a device of our catalogue: the page shows five states a second."""
 ARL0 = 1e8
 """Mean samples between false alarms of the device that is used if none is named: hours, not seconds."""
+_PATIENCE_S = 5.0
+"""Time until the terminal tells what the end waits for."""
 
 
 def add(commands: Any) -> None:
@@ -138,6 +140,9 @@ async def _serve(session: LiveSession, arguments: argparse.Namespace) -> int:
     finally:
         session.close()
         await server.close()
+        await asyncio.wait((playing,), timeout=_PATIENCE_S)
+        if not playing.done():
+            show("bench: device or rig do not answer, and a recording waits for them; another signal ends the process")
         await asyncio.gather(playing, return_exceptions=True)
 
 

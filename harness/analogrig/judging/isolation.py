@@ -38,7 +38,7 @@ def bound(model: Model, change: PlantChange, weight: NDArray[np.float64]) -> int
 
     :param weight: information per squared LSB of each sample after the change.
     """
-    if not change.changed:
+    if not change.changed or not len(change.course_lsb):
         return None
     rivals = _Rivals(model, change, weight)
     latest_n = 0

@@ -100,6 +100,7 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "factor": session.factor,
         "rates": dataclasses.asdict(session.meter.rates),
         "rate": session.sample_rate_hz,
+        "silent_s": round(session.silent_s, 1),
         "overruns": session.overruns_n,
         "missing": session.notes.missing_n,
         "mode": session.mode,

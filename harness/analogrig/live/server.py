@@ -439,7 +439,7 @@ def _select_subprotocol(socket: ServerConnection, offered: Any) -> Any:
 def _table_of(message: str | bytes) -> dict[str, Any]:
     """:raises ConfigurationError: a message is not one JSON object."""
     try:
-        table = json.loads(message) if isinstance(message, str) else None
+        table = json.loads(message, parse_constant=int) if isinstance(message, str) else None  # int refuses NaN
     except (ValueError, RecursionError):
         table = None
     if not isinstance(table, dict):

@@ -144,8 +144,8 @@ class LiveSession:
         """Time and sample from which the pace is counted."""
         self._turns: dict[str, _Turn] = {}
         """Turns that have not taken effect, by parameter."""
-        self._taken = 0
-        """Samples of this take that the rig has been asked for."""
+        self._taken, self._asked_s = 0, 0.0
+        """Samples of this take that the rig has been asked for, and the time of the last block."""
 
     # ---- from other threads
 
@@ -309,6 +309,12 @@ class LiveSession:
         return () if self.device.faulty_line is None else self.device.faulty_line.KINDS
 
     @property
+    def silent_s(self) -> float:
+        """Time for which the device has owed answers; 0.0 where that is not known."""
+        is_known = self.desk.is_stepped and self.factor <= 1.0  # slower blocks may be answered with the next one
+        return self.clock() - self._asked_s if is_known and self._taken > self.ring.end else 0.0
+
+    @property
     def injected(self) -> set[commands.Fault]:
         """Faults in force."""
         return set(self.desk.injected)
@@ -355,6 +361,7 @@ class LiveSession:
                 self.is_recording, self._ends_take = False, True
                 continue
             self._taken += length
+            self._asked_s = self.clock()
             yield length
 
     def _paced_length(self) -> int:
@@ -468,7 +475,7 @@ class LiveSession:
 
     def _turn_pots(self) -> None:
         """Turn the pots that the hand has turned, unless one is still turning."""
-        if not self._turns or self.desk.is_turning:
+        if not self._turns or self.desk.is_turning or self._taken == 1:  # a change comes after sample 0
             return
         if self.take.is_recorded and len(self.take.changes) >= MAX_CHANGES:
             self.notify(f"the recording has reached its limit of {MAX_CHANGES} changes")
@@ -582,9 +589,9 @@ class LiveSession:
     def _stop_after(self, reason: str) -> None:
         """Pause after a failure."""
         self.link_counters = dict(self.device.link_counters)
-        self.notify(f"stopped: {reason}")
         self.is_playing, self._steps, self.is_recording, self._has_failed = False, 0, False, True
         self._forget_times()
+        self.notify(f"stopped: {reason}")
 
     def _bring_back(self) -> None:
         """Bring the device back as soon as a hand wants to go on."""

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -57,6 +62,32 @@ def test_served_instrument_is_driven_record_by_record(tmp_path: Path, options: t
         rig = served.lucidac_file(tmp_path) if options else f"{served.rigs_file(tmp_path)}:bench"
         with benched("--rig", rig, "--allow", served.address, folder=tmp_path / "out") as bench:
             played(work)
+
+
+def test_bench_with_a_device_that_hangs_says_so_and_ends_at_a_later_signal(tmp_path: Path) -> None:
+    (tmp_path / "stuck.py").write_text(
+        "import threading\n\nclass Stuck:\n    def step(self, u, y, valid):\n        threading.Event().wait()\n"
+    )
+    command = [
+        *(sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--out", "out"),
+        "--dut",
+        "python:stuck:Stuck",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline().split()[-1]
+
+        bench: Any = SimpleNamespace(address=address, token=address.rpartition("=")[2])
+
+        async def work() -> None:
+            async with open_client(bench) as socket:
+                await Client(socket).until(lambda state: state["silent_s"] > 0.5)
+
+        played(work)
+        process.send_signal(signal.SIGINT)
+        assert "another signal ends the process" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait() == -signal.SIGINT
 
 
 def test_recording_cannot_be_operated_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -249,6 +249,27 @@ def test_turn_that_the_rig_cannot_make_is_refused_and_the_rig_plays_on(tmp_path:
     assert session.ring.place == (2, RECORD_N)
 
 
+def test_recording_that_ends_with_a_turn_that_no_sample_feels_is_judged(tmp_path: Path) -> None:
+    script = (
+        *((0.0, SetRecording(on=True)), (0.1, Turn("M", 60.0)), (0.3, SetPlaying(on=False))),
+        *((0.4, Turn("K", 15000.0)), (0.5, SetRecording(on=False)), (0.6, SetPlaying(on=False))),
+    )
+    (saved,) = scripted_session(script, tmp_path, dut=open_dut("inproc?exchange=block")).saved
+    run = Run.load(saved.run)
+    assert len(run.diagnosis_index)
+    assert run.segments[-1][0] == run.samples - 1
+    assert judge(run).outcome == "passed"
+
+
+def test_turn_at_the_first_sample_acts_after_the_second(tmp_path: Path) -> None:
+    script: tuple[tuple[float, Action], ...] = (
+        *((0.0, SetPlaying(on=False)), (0.1, Restart()), (0.2, Step(1)), (0.25, Turn("K", 18000.0))),
+        *((0.3, Step(1)), (0.4, Step(1)), (0.5, SetPlaying(on=False))),
+    )
+    session = scripted_session(script, tmp_path)
+    assert [change.sample for change in session.take.changes] == [1]
+
+
 def test_duty_is_refused_but_for_pulses(tmp_path: Path) -> None:
     def set_duty(session: LiveSession) -> None:
         with pytest.raises(ConfigurationError, match="only pulses have a duty"):
