@@ -13,7 +13,7 @@ import itertools
 import math
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -50,7 +50,8 @@ from .bench_engine import (
 from .figure import Figure
 
 PROGRAMS = ("duffing", "van-der-pol")
-SAMPLES = 800
+SAMPLES, LONG = 800, 8000
+"""Lengths of a play in samples."""
 OP_AMPS = ("exported", "knowing")
 SETTINGS = tuple(
     itertools.starmap(
@@ -76,10 +77,11 @@ Bstate 0 state I = 1e-10 * (max(-{slew}, min({slew}, {rate} * (v(inner) - v(stat
 _LINEAR_STATE = "Gstate 0 state inner state {1e-10 * rate}\n"
 
 NOTE = f"""\
-{SAMPLES} samples of a square wave between the levels of the trial play, nominal TL07x and AD633. The
-grid has {len(SETTINGS)} settings of method, time points, reltol, trtol and longest step. Exported decks are
-those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers, for none
-leaves its range. Equal accuracy is {TOLERATED_LSB:g} LSB at the output.
+A square wave between the levels of the trial play, nominal TL07x and AD633. The grid has {len(SETTINGS)}
+settings of method, time points, reltol, trtol and longest step, searched with {SAMPLES} samples. Its
+{FINALISTS} fastest accurate ones play {LONG:,} samples too. Exported decks are those of `analogrig netlist`.
+Knowing ones limit neither op-amps nor multipliers, for none leaves its range. Equal accuracy is
+{TOLERATED_LSB:g} LSB at the output. Ratios are times of ngspice over those of the emulator.
 
 The emulator, cold: the first play in a new process, machine and all matrices included. Own offsets:
 each machine has op-amps of its own. Again: the same machine as before, built anew.
@@ -92,6 +94,7 @@ class Played:
     """A program under its square wave."""
 
     program: PatchedProgram
+    samples: int = SAMPLES
 
     @cached_property
     def excitation(self) -> Excitation:
@@ -104,15 +107,15 @@ class Played:
         return self.program.scales.quantities[self.program.channels[1]].node
 
     @classmethod
-    def of(cls, name: str) -> Played:
+    def of(cls, name: str, samples: int = SAMPLES) -> Played:
         """A shipped program with AD633 multipliers."""
         program = load_program(fixtures() / "programs" / f"{name}.toml")
         model = MULTIPLIERS["ad633"]
         elements = (replace(each, model=model) if isinstance(each, Multiplier) else each for each in program.elements)
-        return cls(replace(program, elements=tuple(elements)))
+        return cls(replace(program, elements=tuple(elements)), samples)
 
     def play(self, computer: SuspensionComputer) -> NDArray[np.float64]:
-        return np.concatenate(list(computer.play(self.excitation, SAMPLES)))
+        return np.concatenate(list(computer.play(self.excitation, self.samples)))
 
     @cached_property
     def exact_v(self) -> NDArray[np.float64]:
@@ -121,8 +124,8 @@ class Played:
         return sign * self.play(SuspensionComputer(self.program))[:, 1]
 
     def deck(self, setting: Setting) -> str:
-        edges = self.excitation.edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
-        deck = Deck(SuspensionComputer(self.program).circuit, SAMPLES, RATE_HZ, {"F": edges})
+        edges = self.excitation.edges(0, self.samples * TICKS_PER_SAMPLE, RATE_HZ)
+        deck = Deck(SuspensionComputer(self.program).circuit, self.samples, RATE_HZ, {"F": edges})
         accuracy = Accuracy(reltol=setting.reltol, vntol_v=1e-6, trtol=setting.trtol, max_step_s=setting.max_step_s)
         text = in_setting(deck.text([self.node], accuracy), setting, r"U\d+")
         return text.replace(_LIMITS, _LINEAR_STATE) if setting.op_amps == "knowing" else text
@@ -137,29 +140,40 @@ class Played:
 def figures() -> Iterator[Figure]:
     """Times of ngspice at its best for each kind of deck, and the emulator beside the fastest of them."""
     for name in PROGRAMS:
-        played = Played.of(name)
-        best = dict(_best(name, played))
-        for op_amps, (setting, run) in best.items():
-            label = f"{setting}; {run.error_lsb:.3f} LSB"
-            yield Figure(f"ngspice, {name}: {op_amps} op-amps", 1e3 * run.spent_s, "ms", label)
-        setting, run = min(best.values(), key=lambda each: each[1].spent_s)
-        for what, spent_s in (("cold", _cold_s(name)), ("own offsets", _own_s(played)), ("again", _warm_s(played))):
-            ratio = run.spent_s / spent_s
-            yield Figure(f"emulator, {name}, {what}", 1e3 * spent_s, "ms", f"ngspice: {setting.op_amps}", ratio)
+        finalists = _finalists(name)
+        for played in (Played.of(name), Played.of(name, LONG)):
+            label = f"{name}, {played.samples:,} samples"
+            emulated = {"cold": _cold_s(name, played.samples), "own offsets": _own_s(played), "again": _warm_s(played)}
+            for what, spent_s in emulated.items():
+                yield Figure(f"emulator, {label}, {what}", 1e3 * spent_s, "ms")
+            for op_amps, settings in finalists.items():
+                setting, run = _best(played, settings)
+                accuracy = f"{setting}; {run.error_lsb:.3f} LSB"
+                for what, spent_s in emulated.items():
+                    deck = f"ngspice, {label}: {op_amps} op-amps, emulator {what}"
+                    yield Figure(deck, 1e3 * run.spent_s, "ms", accuracy, run.spent_s / spent_s)
 
 
-def _best(name: str, played: Played) -> Iterator[tuple[str, tuple[Setting, Simulated]]]:
-    """The fastest accurate setting of each kind of op-amps, with its best run."""
+def _finalists(name: str) -> dict[str, list[Setting]]:
+    """Fastest accurate settings of a short play, of each kind of op-amps, with both solvers."""
+    played = Played.of(name)
     found = {setting: played.simulate(setting) for setting in SETTINGS}
     rows = [f"{1e3 * run.spent_s:.1f},{run.error_lsb:.3f},{setting}" for setting, run in found.items()]
     Path(f"build/ngspice-{name}.csv").write_text("\n".join(["CPU ms,error LSB,setting", *rows, ""]))
-    for op_amps in OP_AMPS:
-        order = fastest({setting: run for setting, run in found.items() if setting.op_amps == op_amps})[:FINALISTS]
-        finalists = [replace(each, solver=solver) for each in order for solver in ("sparse", "klu")]
-        runs = [(each, played.simulate(each)) for each, _ in itertools.product(finalists, range(REPEATS))]
-        accurate = [each for each in runs if each[1].error_lsb <= TOLERATED_LSB]
-        if accurate:
-            yield op_amps, min(accurate, key=lambda each: each[1].spent_s)
+    return {
+        op_amps: [
+            replace(each, solver=solver)
+            for each in fastest({key: run for key, run in found.items() if key.op_amps == op_amps})[:FINALISTS]
+            for solver in ("sparse", "klu")
+        ]
+        for op_amps in OP_AMPS
+    }
+
+
+def _best(played: Played, settings: Iterable[Setting]) -> tuple[Setting, Simulated]:
+    """The fastest accurate one of several settings, with its best run."""
+    runs = [(each, played.simulate(each)) for each, _ in itertools.product(settings, range(REPEATS))]
+    return min((each for each in runs if each[1].error_lsb <= TOLERATED_LSB), key=lambda each: each[1].spent_s)
 
 
 def _warm_s(played: Played) -> float:
@@ -180,7 +194,7 @@ def _own_s(played: Played) -> float:
 _COLD = """\
 import sys, time
 from tests.benchmarks.bench_multipliers import Played, SuspensionComputer
-played = Played.of(sys.argv[1])
+played = Played.of(sys.argv[1], int(sys.argv[2]))
 played.excitation
 next(SuspensionComputer("front").play(played.excitation, 1))
 start_s = time.process_time()
@@ -190,9 +204,9 @@ print(time.process_time() - start_s)
 """The engine itself is loaded by another circuit."""
 
 
-def _cold_s(name: str) -> float:
+def _cold_s(name: str, samples: int) -> float:
     """CPU time of the first play in a process."""
-    command = [sys.executable, "-c", _COLD, name]
+    command = [sys.executable, "-c", _COLD, name, str(samples)]
     return min(
         float(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(REPEATS)
     )
