@@ -39,6 +39,15 @@ VAN_DER_POL = {
 }
 
 
+EXACT = LucidacParts(
+    computing=OpAmpModel(avol=1e8, gbw_hz=8e9, swing_v=(-2.5, 2.5)),
+    components=Components(),
+    adc_gain=0.0,
+    adc_offset=0.0,
+    adc_noise_lsb=0.0,
+)
+
+
 def configuration(lanes: dict[int, LucidacLane], adc: tuple[int, ...] = (0, 1), **more: float) -> Configuration:
     """Configuration whose integrators begin at -IC."""
     initial = {int(name[2:]): value for name, value in more.items() if name.startswith("ic")}
@@ -89,6 +98,22 @@ def test_slow_integrators_take_a_hundred_times_as_long() -> None:
     assert np.abs(played(prepared(slow), 50, 1e3) - played(prepared(fast), 50, 1e5)).max() < 1e-3
 
 
+def test_coefficients_written_during_a_run_act_from_the_next_block_on() -> None:
+    patch = configuration({0: LucidacLane(15, 0, -0.1)}, (0,), constant=1.0)
+    patch = replace(patch, integrators=(Integrator(k0=SLOW), *patch.integrators[1:]))
+    machine = Lucidac(EXACT)
+    machine.configure(patch)
+    blocks = machine.play(40_000, 400e3)
+    first = next(blocks)
+    machine.turn(replace(patch, lanes={0: LucidacLane(15, 0, 0.05)}))
+    values = np.concatenate([first, *blocks])[:, 0] * machine.scales[0].gain + machine.scales[0].offset
+    t_s, change = np.arange(len(values)) / 400e3, len(first) - 1
+    coefficients = [machine.parts.quantised(factor) for factor in (0.1, 0.05)]
+    expected = SLOW * (coefficients[0] * np.minimum(t_s, t_s[change]))
+    expected -= SLOW * coefficients[1] * np.maximum(t_s - t_s[change], 0.0)
+    assert len(values) == 40_000 and np.abs(values - expected).max() < 1e-4
+
+
 def test_specimens_differ_by_seed_and_repeat_by_seed() -> None:
     def of(seed: int) -> Values:
         parts = LucidacParts()
@@ -127,15 +152,8 @@ def test_ports_take_the_voltages_of_the_generator_by_cable() -> None:
 
 
 def test_a_perfect_machine_needs_no_calibration() -> None:
-    parts = LucidacParts(
-        computing=OpAmpModel(avol=1e8, gbw_hz=8e9, swing_v=(-2.5, 2.5)),
-        components=Components(),
-        adc_gain=0.0,
-        adc_offset=0.0,
-        adc_noise_lsb=0.0,
-    )
     patch = configuration(SINE, ic0=-0.9)
-    machine = Lucidac(parts)
+    machine = Lucidac(EXACT)
     machine.configure(patch)
     assert np.abs(played(machine, 1000) - ideal_solution(patch, 1000, RATE_HZ)).max() < 1e-4
 

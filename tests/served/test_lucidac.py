@@ -216,6 +216,25 @@ def test_machine_is_busy_for_others_during_a_run_and_free_when_its_client_is_gon
         pass
 
 
+def test_coefficients_can_be_written_in_op_by_the_client_of_the_run_where_the_parameter_says_so() -> None:
+    with serving("--as", "lucidac", "--defect", "writes_in_op=true") as served, Talk(served) as talk:
+        coefficients, *rest = ramp(0.0)
+        talk.configure(coefficients, *rest)
+        talk.start(62_500 * 10, 62_500)
+        module = protocol().Module(items=[ramp(0.25)[0]])
+        assert talk.ask("config_command", module=module).WhichOneof("kind") == "config_response"
+        for more in ({"module": module, "reset_before": True}, {"module": protocol().Module(items=rest)}):
+            assert talk.ask("config_command", **more).WhichOneof("kind") == "busy_response"
+        with Talk(served) as other:
+            assert other.ask("config_command", module=module).WhichOneof("kind") == "busy_response"
+        least, state = 0, ""
+        while state != "DONE" and least > -20_000:
+            message = talk.next().message_v1
+            state = protocol().RunState.Name(message.run_state_change_message.new_)
+            least = min([0, *np.frombuffer(message.run_data_message.data.data, "<i2")])
+        assert least <= -20_000
+
+
 @pytest.mark.parametrize(
     ("item", "why"),
     [

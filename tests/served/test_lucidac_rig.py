@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import socket
 import threading
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
+from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused
 from analogrig.hardware.calibration.averages import record, scenarios
 from analogrig.hardware.calibration.fit import calibrate
@@ -139,6 +141,31 @@ def test_generator_sleeps_between_records(served: Served, instrument: LucidacIns
     assert not sleeps()
     instrument.make_safe()
     assert sleeps()
+
+
+def test_doctor_asks_whether_coefficients_can_be_written_in_op(
+    instrument: LucidacInstrument, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert instrument.remarks() == ("coefficients cannot be written during OP: a change is a new run",)
+    with serving("--as", "lucidac", "--defect", "writes_in_op=true") as other:
+        assert main(["doctor", "--rig", other.lucidac_file(tmp_path), "--allow", other.address, "--json"]) == 0
+    (remark,) = json.loads(capsys.readouterr().out)["remarks"]
+    assert "can be written during OP" in remark
+
+
+def test_answer_after_op_is_none(instrument: LucidacInstrument, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device may answer once the run is over: then it did not write during OP."""
+    pb, asked = protocol(), []
+
+    def run(*_: object) -> Iterator[object]:
+        asked.append(1)
+        for state in (pb.RunState.OP, pb.RunState.OP_END, pb.RunState.DONE):
+            yield pb.MessageV1(run_state_change_message=pb.RunStateChangeMessage(new_=state))
+        yield pb.MessageV1(id="7", config_response=pb.ConfigResponse())
+
+    monkeypatch.setattr(instrument._connection, "_messages_of_run", run)
+    monkeypatch.setattr(instrument._connection, "_command", lambda *_, **__: "7")
+    assert not instrument._connection.accepts_in_op(pb.Module(), 3) and len(asked) == 3
 
 
 def test_busy_machine_and_refused_commands_are_one_line(served: Served, instrument: LucidacInstrument) -> None:

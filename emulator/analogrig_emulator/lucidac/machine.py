@@ -70,6 +70,13 @@ class Lucidac:
         self._wiring = wiring
         self.forget_calibration()
 
+    def turn(self, configuration: Configuration) -> None:
+        """Change coefficients alone, from the next block of a run under way on. The calibration stays."""
+        wiring = replace(self._wiring, configuration=configuration)
+        if configuration.used:
+            piecewise_linear(wiring.circuit())
+        self._wiring = wiring
+
     def forget_calibration(self) -> None:
         """Return to the uncalibrated machine."""
         self._wiring = replace(self._wiring, trims=Trims())
@@ -111,7 +118,7 @@ class Lucidac:
             yield np.zeros((samples, len(configuration.adc))), -1
             return
         points = max(1, math.ceil(WATCH_HZ / rate_hz))
-        run = _Run(self._wiring, samples, rate_hz * points, points)
+        run = _Run(lambda: self._wiring, samples, rate_hz * points, points)
         nodes = list(dict.fromkeys(self._wiring.computing_nodes.values()))
         columns = [nodes.index(self._wiring.output_node(output)) for output in configuration.adc]
         limit_v = self.parts.overload * UNIT_V
@@ -134,9 +141,11 @@ class Lucidac:
 
 
 class _Run:
-    """Run of a circuit, at `points` points a sample. phase: point of a block at which its first sample is."""
+    """Run of the present circuit, at `points` points a sample. phase: point of a block at which its first sample is."""
 
-    def __init__(self, wiring: LucidacCircuit, samples: int, rate_hz: float, points: int) -> None:
+    def __init__(self, present: Callable[[], LucidacCircuit], samples: int, rate_hz: float, points: int) -> None:
+        self._present = present
+        self._wiring = wiring = present()
         self._rate_hz, self._points, self._left = rate_hz, points, samples
         self._operating = piecewise_linear(wiring.circuit())
         self._charging = piecewise_linear(wiring.circuit(charging=True))
@@ -151,6 +160,9 @@ class _Run:
             samples = min(self._left, max(1, _BLOCK_POINTS // self._points))
             count = 1 + (samples - 1) * self._points if first else samples * self._points
             self.phase = 0 if first else self._points - 1
+            if (wiring := self._present()) is not self._wiring:
+                engine.set_system(piecewise_linear(wiring.circuit()))
+                self._wiring = wiring
             yield engine.run(count, self._ports.edges(*engine.window(count)))
             self._left -= samples
             first = False

@@ -67,7 +67,7 @@ class LucidacParts:
     overload: level of the overload flags, in machine units. full_scale: end of the converter's range, by the legacy
     firmware. adc_gain, adc_offset: its errors, uniform within +-. adc_noise_lsb: rms noise of 16 bits.
     cables: port of the front panel at which each output of the signal generator is plugged in: "sine", "square",
-    "dac0", "dac1".
+    "dac0", "dac1". writes_in_op: True if coefficients may be written while the machine operates.
     """
 
     computing: OpAmpModel = _COMPUTING
@@ -98,6 +98,7 @@ class LucidacParts:
     adc_offset: float = 2e-3
     adc_noise_lsb: float = 1.0
     cables: Mapping[str, int] = field(default_factory=lambda: {"square": 2, "sine": 3})
+    writes_in_op: bool = False
 
     def quantised(self, factor: float) -> float:
         """Coefficient that the converter of a lane gives."""

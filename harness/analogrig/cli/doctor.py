@@ -44,12 +44,13 @@ def _run(arguments: argparse.Namespace) -> int:
         try:
             with show_work(f"self-test of {arguments.rig}"):
                 findings = self_test(rig, arguments.seed, program)
+                remarks = rig.remarks()
         except RigError as error:
             return complain(f"INCONCLUSIVE: the self-test could not be made: {error}", INCONCLUSIVE)
     if arguments.json:
-        show_result(_as_json(findings, arguments.seed), arguments)
+        show_result(_as_json(findings, arguments.seed) | {"remarks": list(remarks)}, arguments)
     else:
-        show(_text(findings))
+        show("\n  ".join([_text(findings), *remarks]))
     if findings.in_state("wrong"):
         return FAILED
     return PASSED if findings.well else INCONCLUSIVE

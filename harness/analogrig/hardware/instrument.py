@@ -153,6 +153,10 @@ class Instrument(ABC):
         :raises ConfigurationError: it cannot be patched; names the term.
         """
 
+    def remarks(self) -> tuple[str, ...]:
+        """Properties that the patched instrument tells when asked, one line each."""
+        return ()
+
     def find_pots(self, names: Iterable[str]) -> PotBox:
         """Pots of the instrument, which are to have these names.
 

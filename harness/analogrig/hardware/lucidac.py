@@ -2,7 +2,9 @@
 
 The driver patches the program itself; a cable leads from the square-wave output of the generator to port 2 of the front
 panel. Converter channel 0 reads the input of the program, channel 1 its output. Coefficients change between runs: a
-record with changes is played in several runs, each from the states that the converter read at the change.
+record with changes is played in several runs, each from the states that the converter read at the change. A machine may
+accept coefficients during OP, which ``remarks`` asks for. Its answer has no time, so the sample of such a change would
+be unknown by the delay of the network, many samples at 20 kS/s.
 """
 
 from __future__ import annotations
@@ -26,12 +28,12 @@ from analogrig.hardware.instrument import (
 )
 from analogrig.hardware.lucidac_connection import LucidacConnection
 from analogrig.hardware.lucidac_messages import PORT
-from analogrig.hardware.lucidac_patch import LinearPatch, module_of
+from analogrig.hardware.lucidac_patch import LinearPatch, coefficients_of, module_of
 from analogrig.hardware.tcp_address import host_and_port, tcp_place
 from analogrig.links.wire import Clock
 from analogrig.program import Program
 from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
-from analogrig_emulator.lucidac.configuration import SignalGenerator
+from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
 from analogrig_emulator.lucidac.wiring import UNIT_V
 
 FULL_SCALE = 1.25
@@ -40,6 +42,9 @@ FULL_SCALE = 1.25
 _HALF_RANGE = 1 << 15
 _EARLY_N = 1e-3
 """Time from an edge of the generator to its first sample, in samples: the elements settle in 50 ns."""
+
+_ACCEPTS = "coefficients can be written during OP, but the answer tells no instant: a change is a new run"
+_REFUSES = "coefficients cannot be written during OP: a change is a new run"
 
 _ASLEEP = SignalGenerator("sine and square")
 
@@ -66,6 +71,8 @@ class LucidacInstrument(Instrument):
         self._mac = connection.carrier()
         self._patched: LinearPatch | None = None
         self._box: _Coefficients | None = None
+        self._accepts_in_op: bool | None = None
+        """Answer to the question of ``remarks``."""
 
     @classmethod
     def place(cls, address: str) -> str:
@@ -92,14 +99,26 @@ class LucidacInstrument(Instrument):
         self._patched = LinearPatch(Program.load(program))
         self._box = self.pots = _Coefficients(self._patched, self.name)
 
+    def remarks(self) -> tuple[str, ...]:
+        """Ask once, by a run during which the coefficients are written again with the values that they have."""
+        if self._patched is None or self._box is None:
+            return ()
+        if self._accepts_in_op is None:
+            self.make_safe()
+            coefficients = coefficients_of(self._at_rest(self._patched, self._box), self._mac)
+            self._accepts_in_op = self._connection.accepts_in_op(coefficients, 1 + len(self._patched.states))
+        return (_ACCEPTS if self._accepts_in_op else _REFUSES,)
+
     def rest(self, settle_s: float) -> None:
         """Wait for nothing: every run begins at the initial conditions."""
 
     def make_safe(self) -> None:
-        if self._patched is None or self._box is None:
-            return
-        at_rest = self._patched.configuration(self._box.values(), [0.0] * len(self._patched.states), _ASLEEP)
-        self._connection.ask("config_command", module=module_of(at_rest, self._mac), reset_before=True)
+        if self._patched is not None and self._box is not None:
+            at_rest = self._at_rest(self._patched, self._box)
+            self._connection.ask("config_command", module=module_of(at_rest, self._mac), reset_before=True)
+
+    def _at_rest(self, patched: LinearPatch, box: _Coefficients) -> Configuration:
+        return patched.configuration(box.values(), [0.0] * len(patched.states), _ASLEEP)
 
     def close(self) -> None:
         self._connection.close()

@@ -7,6 +7,7 @@ import math
 import socket
 import time
 import uuid
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,10 @@ from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, 
 from analogrig.links.wire import Clock
 
 _MOST_ANSWER_BYTES = 1 << 20
+
+_QUESTION_RATE_HZ = 1000
+_QUESTION_SAMPLES = (100, 1000, 10_000)
+"""Runs during which a configuration is sent: the next one if the answer comes too late."""
 
 
 class LucidacConnection:
@@ -41,12 +46,8 @@ class LucidacConnection:
 
     def ask_once(self, kind: str, **fields: Any) -> Any:
         """Send a command. Return the message that answers it, be it an error."""
-        message = self._pb.MessageV1(id=str(uuid.uuid4()))
-        command = getattr(message, kind)
-        command.SetInParent()
-        command.MergeFrom(type(command)(**fields))
-        self._send(frame(message), kind)
-        while (answer := self._next(kind, self._timeout_s)).id != message.id:
+        command_id = self._command(kind, **fields)
+        while (answer := self._next(kind, self._timeout_s)).id != command_id:
             pass
         return answer
 
@@ -80,34 +81,53 @@ class LucidacConnection:
 
         :raises RecordIncomplete: samples are missing.
         """
-        pb, run_id = self._pb, str(uuid.uuid4())
-        op_ns = math.ceil(samples / rate_hz * 1e9)
+        values, ends, taken = np.empty((samples, channels)), np.zeros((samples, channels), np.bool_), 0
+        for message in self._messages_of_run(samples, rate_hz, channels):
+            if message.WhichOneof("kind") == "run_data_message":
+                part, at_end = self._samples(message.run_data_message.data, channels)
+                count = min(len(part), samples - taken)
+                values[taken : taken + count], ends[taken : taken + count] = part[:count], at_end[:count]
+                taken += count
+        if taken < samples:
+            raise RecordIncomplete(f"instrument {self.name}: returned {taken} of {samples} samples")
+        return values, ends
+
+    def accepts_in_op(self, module: Any, channels: int) -> bool:
+        """True if the device accepts a configuration while it operates, and answers before OP ends."""
+        answers = (self._ask_in_op(module, samples, channels) for samples in _QUESTION_SAMPLES)
+        return next(filter(None, answers), "") in ("config_response", "success_message")
+
+    def _ask_in_op(self, module: Any, samples: int, channels: int) -> str:
+        """Kind of the answer to a configuration sent in OP; empty if it came too late."""
+        states, command_id, operates, answered = self._pb.RunState, "", False, ""
+        for message in self._messages_of_run(samples, _QUESTION_RATE_HZ, channels):
+            if message.WhichOneof("kind") == "run_state_change_message":
+                operates = message.run_state_change_message.new_ == states.OP
+                if operates:
+                    command_id = self._command("config_command", module=module)
+            elif operates and message.id == command_id:
+                answered = message.WhichOneof("kind")
+        return answered
+
+    def _messages_of_run(self, samples: int, rate_hz: int, channels: int) -> Iterator[Any]:
+        """Start a run. Yield all messages until it is done."""
+        pb, op_ns = self._pb, math.ceil(samples / rate_hz * 1e9)
         self.ask(
             "start_run_command",
-            run=pb.Run(id=run_id),
+            run=pb.Run(id=str(uuid.uuid4())),
             run_config=pb.RunConfig(
                 ic_time=pb.Time(value=1, prefix=pb.MILLI), op_time=pb.Time(value=op_ns, prefix=pb.NANO)
             ),
             daq_config=pb.DaqConfig(num_channels=channels, sample_rate=rate_hz, sample_op=True),
         )
-        values, ends, taken = np.empty((samples, channels)), np.zeros((samples, channels), np.bool_), 0
         while True:
             message = self._next("the run", self._timeout_s + op_ns * 1e-9)
-            kind = message.WhichOneof("kind")
-            if kind == "run_data_message":
-                part, at_end = self._samples(message.run_data_message.data, channels)
-                count = min(len(part), samples - taken)
-                values[taken : taken + count], ends[taken : taken + count] = part[:count], at_end[:count]
-                taken += count
-            elif kind == "run_state_change_message":
-                change = message.run_state_change_message
-                if change.new_ == pb.RunState.ERROR:
-                    raise RigError(f"instrument {self.name}: the run failed: {change.reason[:200]!r}")
-                if change.new_ == pb.RunState.DONE:
-                    break
-        if taken < samples:
-            raise RecordIncomplete(f"instrument {self.name}: returned {taken} of {samples} samples")
-        return values, ends
+            yield message
+            change = message.run_state_change_message
+            if change.new_ == pb.RunState.ERROR:
+                raise RigError(f"instrument {self.name}: the run failed: {change.reason[:200]!r}")
+            if change.new_ == pb.RunState.DONE:
+                return
 
     def overloads(self) -> list[str]:
         """Elements that were overloaded since the flags were cleared."""
@@ -137,6 +157,15 @@ class LucidacConnection:
         limits = np.iinfo(raw.dtype) if raw.dtype.kind == "i" else None
         at_end = np.zeros(raw.shape, np.bool_) if limits is None else (raw == limits.min) | (raw == limits.max)
         return values, at_end[:, order]
+
+    def _command(self, kind: str, **fields: Any) -> str:
+        """Send a command. Return the id of its answer."""
+        message = self._pb.MessageV1(id=str(uuid.uuid4()))
+        command = getattr(message, kind)
+        command.SetInParent()
+        command.MergeFrom(type(command)(**fields))
+        self._send(frame(message), kind)
+        return str(message.id)
 
     def _send(self, data: bytes, what: str) -> None:
         try:
@@ -178,8 +207,3 @@ class LucidacConnection:
             if not received:
                 raise RigClosed(f"instrument {self.name}: connection closed at {what}")
             self._reader.feed(received)
-
-
-def _nanoseconds(value: int) -> Any:
-    pb = protocol()
-    return pb.Time(value=value, prefix=pb.NANO)

@@ -202,11 +202,6 @@ def module_of(configuration: Configuration, mac: str) -> Any:
         ),
         (f"{cluster}/U", "select_config", pb.SelectConfig(connections=select)),
         (
-            f"{cluster}/C",
-            "coef_config",
-            pb.CoefConfig(elements=[pb.CoefConfig.Element(idx=n, factor=lane.factor) for n, lane in lanes.items()]),
-        ),
-        (
             f"{cluster}/I",
             "sum_config",
             pb.SumConfig(
@@ -239,4 +234,12 @@ def module_of(configuration: Configuration, mac: str) -> Any:
         ),
     ]
     items = [pb.Item(entity=pb.EntityId(path=path), **{kind: content}) for path, kind, content in contents]
-    return pb.Module(items=items)
+    return pb.Module(items=[*items, *coefficients_of(configuration, mac).items])
+
+
+def coefficients_of(configuration: Configuration, mac: str) -> Any:
+    """Items of a configuration message that set the coefficients alone."""
+    pb = protocol()
+    elements = [pb.CoefConfig.Element(idx=n, factor=lane.factor) for n, lane in configuration.lanes.items()]
+    entity = pb.EntityId(path=f"{mac}/0/C")
+    return pb.Module(items=[pb.Item(entity=entity, coef_config=pb.CoefConfig(elements=elements))])

@@ -88,6 +88,11 @@ class RealRig(Rig):
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
 
+    def remarks(self) -> tuple[str, ...]:
+        instrument, _ = self._open()
+        with self._leave_safe(instrument):
+            return instrument.remarks()
+
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         """Begin to play, as Rig.perform. The first play begins with the self-test, whose findings are caveats."""
         plan = self._plan(scenario, seed)

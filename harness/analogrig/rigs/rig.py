@@ -112,6 +112,13 @@ class Rig(Protocol):
     def description(self) -> Mapping[str, Any]:
         """Name and settings in plain values, for the record."""
 
+    def remarks(self) -> tuple[str, ...]:
+        """Properties that the rig tells when asked, one line each.
+
+        :raises RigError: the rig failed.
+        """
+        return ()
+
     def __enter__(self) -> Self:
         return self
 

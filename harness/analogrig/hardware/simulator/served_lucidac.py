@@ -8,6 +8,8 @@ everything malformed, is answered with an error; a stream that cannot be cut int
 What no public document says, and is assumed here:
 
     config         leaves the machine uncalibrated; reset_before starts from an empty machine
+                   during a run: busy; with the parameter writes_in_op the run's client may write coefficients, which
+                   act some blocks later and leave the calibration as it is
     reset          keeps the circuit unless circuit_reset is set
     manual control is accepted for IC, OP and HALT, and has no further effect
     samples        at k / rate, n = floor(op time x rate); rate x channels at most MOST_RATE_HZ
@@ -230,18 +232,24 @@ class LucidacServer(TcpServer):
         if command.overload_reset:
             self._machine.overloads.clear()
         if command.circuit_reset:
-            self._enter(Registers(), [])
+            self._machine.configure(Registers().configuration())
+            self._registers, self._items = Registers(), []
         return self._pb.ResetResponse(entity=command.entity)
 
-    def _configure(self, _: Client, command: Any) -> Any:
-        self._require_idle()
+    def _configure(self, client: Client, command: Any) -> Any:
         before, items = (Registers(), []) if command.reset_before else (self._registers, self._items)
-        self._enter(before.with_items(command.module.items, MAC), _merged(items, list(command.module.items)))
+        registers, items = before.with_items(command.module.items, MAC), _merged(items, list(command.module.items))
+        if client is self._runner and self._may_write_in_op(command):
+            self._machine.turn(registers.configuration())
+        else:
+            self._require_idle()
+            self._machine.configure(registers.configuration())
+        self._registers, self._items = registers, items
         return self._pb.ConfigResponse()
 
-    def _enter(self, registers: Registers, items: list[Any]) -> None:
-        self._machine.configure(registers.configuration())
-        self._registers, self._items = registers, items
+    def _may_write_in_op(self, command: Any) -> bool:
+        kinds = {item.WhichOneof("kind") for item in command.module.items}
+        return self._machine.parts.writes_in_op and not command.reset_before and kinds == {"coef_config"}
 
     def _calibrate(self, _: Client, command: Any) -> Any:
         self._require_idle()
