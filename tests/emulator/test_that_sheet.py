@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import re
 from dataclasses import replace
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -11,8 +13,10 @@ import pytest
 from analogrig.config import locate, names
 from analogrig_emulator import ProgramError
 from analogrig_emulator.machine.compiler import PatchedProgram, load_program
+from analogrig_emulator.machine.that_drawing import that_drawing
 from analogrig_emulator.machine.that_sheet import ThatSheet
 
+SVG = "{http://www.w3.org/2000/svg}"
 K0 = 1000.0
 """Volts per second and volt of an integrator at weight 1."""
 
@@ -67,6 +71,29 @@ def test_cables_compute_the_equations(name: str) -> None:
             assert found[places[x]] == pytest.approx(scale[x] * slope * sheet.speed, rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.parametrize("name", sorted(set(names("programs")) - set(REFUSED)))
+def test_every_cable_of_the_sheet_is_drawn_from_an_output_to_an_input_of_its_own(name: str) -> None:
+    sheet = ThatSheet(program_named(name))
+    drawing = ET.fromstring(that_drawing(sheet))  # noqa: S314 - our own
+    jacks = {
+        (each.get("cx"), each.get("cy")): each for each in drawing.iter(f"{SVG}circle") if each.get("class") == "jack"
+    }
+    sources = len(sheet.program.input_nodes) + 2
+    assert len(jacks) == 8 * 2 + 4 * 8 + 4 * 2 + 5 * 9 + 2 * 3 + sources
+    ends, pieces = [], []
+    for path in drawing.iter(f"{SVG}path"):
+        if number := path.get("data-cable"):
+            pieces.append(int(number))
+            points = re.findall(r"[\d.]+ [\d.]+", path.get("d", ""))
+            start, end = (tuple(each.split()) for each in (points[0], points[-1]))
+            assert jacks[start].get("r") == "6" and jacks[end].get("r") == "9"
+            assert all(0 <= float(x) <= 1280 and 0 <= float(y) <= 720 for x, y in map(str.split, points))
+            ends.append(end)
+    assert len(set(ends)) == len(ends)
+    drawn = [number for number, name in enumerate(sheet.coefficients, 1) for _ in range(2 if name else 1)]
+    assert sorted(pieces) == drawn
+
+
 @pytest.mark.parametrize(("name", "why"), REFUSED.items())
 def test_program_that_does_not_fit_is_refused_with_the_count(name: str, why: str) -> None:
     with pytest.raises(ProgramError, match=f"program {name}: {why}"):
@@ -86,4 +113,5 @@ def test_slow_integrators_lead_to_their_jack() -> None:
     slower = [replace(each, farad=100e-9) if each.name == "U4" else each for each in program.patch]
     sheet = ThatSheet(replace(program, patch=tuple(slower)))
     assert sheet.slow == ("INT2",)
+    assert "INT2 to its jack SLOW" in that_drawing(sheet)
     assert "Also from the output to SLOW: INT2" in sheet.text()

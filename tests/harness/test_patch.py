@@ -27,8 +27,12 @@ def test_shipped_program_goes_by_its_name(capsys: pytest.CaptureFixture[str]) ->
     assert "no program is called 'pendolum': there are bump-stop, dc-motor" in capsys.readouterr().err
 
 
-def test_sheet_for_the_analog_thing_or_the_reason_against_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["patch", "front", "--machine", "that"]) == 0
+def test_sheet_for_the_analog_thing_or_the_reason_against_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawing = tmp_path / "front.svg"
+    assert main(["patch", "front", "--machine", "that", "--drawing", str(drawing)]) == 0
+    assert "<title>front on THE ANALOG THING</title>" in drawing.read_text()
     assert "front on THE ANALOG THING" in capsys.readouterr().out
     assert main(["patch", "front", "--machine", "that", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

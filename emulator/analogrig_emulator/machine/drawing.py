@@ -80,7 +80,7 @@ def patch_drawing(program: PatchedProgram) -> str:
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" class="patch" role="group" aria-label={label} {size} {view}>',
         f"<title>{escape(title)}</title><style>{_STYLE}</style>",
-        f'<rect class="paper" {size}/>{_text(Point(16, 26), title)}',
+        f'<rect class="paper" {size}/>{text_at(Point(16, 26), title)}',
         *(_wire(node, wire) for node, wire in layout.wires.items()),
     ]
     for block, place in zip(blocks, layout.places, strict=True):
@@ -136,16 +136,16 @@ def _block(block: _Drawn, place: Point) -> Iterator[str]:
         yield from _input(pin, Point(place.x, place.y + (i + 0.5) * ROW), left)
     if block.symbol:
         yield f'<rect class="body" x="{left:g}" y="{place.y:g}" width="{_BODY_WIDTH}" height="{height}"/>'
-        yield _text(Point(left + _BODY_WIDTH / 2, middle + 5), block.symbol, anchor="middle")
-        yield _text(Point(left + 4, place.y + 12), block.name, is_small=True)
+        yield text_at(Point(left + _BODY_WIDTH / 2, middle + 5), block.symbol, anchor="middle")
+        yield text_at(Point(left + 4, place.y + 12), block.name, is_small=True)
     elif block.pins:
         yield f'<path class="body" d="M{left:g} {place.y:g}L{right:g} {middle:g}L{left:g} {place.y + height:g}Z"/>'
         if block.has_bar:
             yield f'<rect class="body" x="{left - 6:g}" y="{place.y:g}" width="6" height="{height}"/>'
-        yield _text(Point(left + 6, middle + 4), block.name, is_small=True)
+        yield text_at(Point(left + 6, middle + 4), block.name, is_small=True)
     label, end = f"{block.node}: {block.quantity}", place.x + BLOCK_WIDTH
     below, beside = Point(right, place.y + height + 14), Point(end - 10, middle + 4)
-    yield _text(below if block.pins else beside, _short(label), anchor="end", is_small=True)
+    yield text_at(below if block.pins else beside, shorten(label, _LONGEST), anchor="end", is_small=True)
     yield "</g>"
     start = right if block.pins else end
     yield (
@@ -159,15 +159,17 @@ def _input(pin: _Pin, at: Point, left: float) -> Iterator[str]:
     yield f'<path class="wire" d="M{at.x:g} {at.y:g}H{left:g}"/>'
     if pin.pot:
         yield f'<circle class="body" cx="{at.x + _POT_X:g}" cy="{at.y:g}" r="9"/>'
-        yield _text(Point(at.x + 2, at.y - 11), pin.pot, is_small=True)
+        yield text_at(Point(at.x + 2, at.y - 11), pin.pot, is_small=True)
     if pin.gain != 1:
-        yield _text(Point(left - 22, at.y - 3), str(pin.gain), is_small=True)
+        yield text_at(Point(left - 22, at.y - 3), str(pin.gain), is_small=True)
 
 
-def _text(at: Point, text: str, *, anchor: str = "start", is_small: bool = False) -> str:
+def text_at(at: Point, text: str, *, anchor: str = "start", is_small: bool = False) -> str:
+    """Text of a drawing."""
     style = ' class="small"' if is_small else ""
     return f'<text x="{at.x:g}" y="{at.y:g}" text-anchor="{anchor}"{style}>{escape(text)}</text>'
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+def shorten(text: str, most: int) -> str:
+    """Text of at most so many characters."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."

@@ -12,10 +12,12 @@ Our integrators have k0 = 10,000 per second and more at weight 1. So all rates a
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.compiler import INPUT_OHM, PatchedElement, PatchedProgram
@@ -25,7 +27,8 @@ from analogrig_emulator.machine.stages import StageKind
 MACHINE = "THE ANALOG THING"
 
 _NAMES = {StageKind.INTEGRATOR: "INT", StageKind.SUMMER: "SUM", StageKind.PRODUCT: "MULT"}
-_COUNTS = {"INT": 5, "SUM": 4, "INV": 4, "MULT": 2, "COEF": 8}
+COUNTS = {"INT": 5, "SUM": 4, "INV": 4, "MULT": 2, "COEF": 8}
+"""Number of elements by kind."""
 _PLURALS = {
     "INT": "integrators",
     "SUM": "summers",
@@ -33,7 +36,8 @@ _PLURALS = {
     "MULT": "multipliers",
     "COEF": "coefficients",
 }
-_INPUTS = {1: 4, 10: 3}
+INPUTS = {1: 4, 10: 3}
+"""Number of an element's inputs by weight."""
 _K0 = 1000.0
 _SLOW = 0.01
 
@@ -47,6 +51,15 @@ class Cable:
     pot: str
     target: str
     jack: str
+
+
+class Output(NamedTuple):
+    """Output of an element: its quantity with sign, the full scale at 10 V, and its name in our patch."""
+
+    place: str
+    quantity: str
+    full: float
+    name: str
 
 
 @dataclass(frozen=True)
@@ -64,12 +77,12 @@ class ThatSheet:
                 raise self._error(f"needs a {each.stage.kind.value}, and {MACHINE} has none")
         counts = Counter(name.rstrip("0123456789") for name in self.places.values())
         counts["COEF"] = sum(cable.coefficient < 1.0 for cable in self.cables)
-        for kind, count in _COUNTS.items():
+        for kind, count in COUNTS.items():
             if counts[kind] > count:
                 raise self._error(f"needs {counts[kind]} {_PLURALS[kind]}, and {MACHINE} has {count}")
         for (target, jack), count in Counter((cable.target, cable.jack) for cable in self.cables).items():
-            if jack.isdecimal() and count > _INPUTS[int(jack)]:
-                raise self._error(f"needs {count} inputs of weight {jack} at {target}, which has {_INPUTS[int(jack)]}")
+            if jack.isdecimal() and count > INPUTS[int(jack)]:
+                raise self._error(f"needs {count} inputs of weight {jack} at {target}, which has {INPUTS[int(jack)]}")
 
     def _error(self, text: str) -> ProgramError:
         return ProgramError(f"program {self.program.name}: {text}")
@@ -145,24 +158,36 @@ class ThatSheet:
     def _is_slow(self, element: PatchedElement) -> bool:
         return self._rate(element) <= self.delay * _SLOW * (1.0 + 1e-9)
 
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Coefficient on the way of each cable; empty if there is none."""
+        counts = itertools.accumulate(int(cable.coefficient < 1.0) for cable in self.cables)
+        return tuple(
+            f"COEF{count}" if cable.coefficient < 1.0 else "" for cable, count in zip(self.cables, counts, strict=True)
+        )
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Outputs of the elements in use."""
+        program, places = self.program, self.places
+        own = [(e.name, signed(e.sign, e.stage.name), e.full) for e in program.patch]
+        own += [(e.name, signed(-e.sign, e.quantity), program.fulls[e.quantity]) for e in inverters(program)]
+        return tuple(Output(places[name], quantity, full, name) for name, quantity, full in own)
+
+    @property
+    def head(self) -> tuple[str, str]:
+        """Title and speed."""
+        return f"{self.program.name} on {MACHINE}", f"1 s of the machine is {self.speed:g} s of the plant."
+
     def text(self) -> str:
         """Text of the sheet."""
-        program, coefficients = self.program, 0
         rows: list[Sequence[str]] = [("cable", "from", "coefficient", "set to", "pot", "to", "jack")]
-        for number, cable in enumerate(self.cables, 1):
-            used = cable.coefficient < 1.0
-            coefficients += used
-            through = (f"COEF{coefficients}", f"{cable.coefficient:.4f}", cable.pot or "none") if used else ("", "", "")
+        for number, (cable, coefficient) in enumerate(zip(self.cables, self.coefficients, strict=True), 1):
+            through = (coefficient, f"{cable.coefficient:.4f}", cable.pot or "none") if coefficient else ("", "", "")
             rows.append((str(number), cable.source, *through, cable.target, cable.jack))
         outputs = [("element", "output", "full scale", "in our patch")]
-        for element in program.patch:
-            quantity = signed(element.sign, element.stage.name)
-            outputs.append((self.places[element.name], quantity, f"{element.full:g}", element.name))
-        for each in inverters(program):
-            quantity = signed(-each.sign, each.quantity)
-            outputs.append((self.places[each.name], quantity, f"{program.fulls[each.quantity]:g}", each.name))
-        head = [f"{program.name} on {MACHINE}", f"1 s of the machine is {self.speed:g} s of the plant."]
-        parts = [head, ["Elements: 10 V stand for the full scale.", *table(iter(outputs))]]
+        outputs += [(each.place, each.quantity, f"{each.full:g}", each.name) for each in self.outputs]
+        parts = [self.head, ["Elements: 10 V stand for the full scale.", *table(iter(outputs))]]
         parts.append(["Cables; set each coefficient with its cable plugged in", *table(iter(rows))])
         if self.slow:
             parts.append([f"Also from the output to SLOW: {', '.join(self.slow)}"])

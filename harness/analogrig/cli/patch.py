@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
         "compile a program file, and print its scaling sheet",
         "patch dc-motor",
         "patch motor.toml --drawing build/motor.svg --netlist build/motor.cir",
-        "patch front --machine that",
+        "patch front --machine that --drawing build/front.svg",
     )
     command.add_argument("program", metavar="PROGRAM", help="program file, or the name of a shipped one")
     command.add_argument(
@@ -32,7 +32,9 @@ def add(commands: Any) -> None:
         default="own",
         help="own: scaling sheet of the emulated computer; that: patch sheet for THE ANALOG THING (default: own)",
     )
-    command.add_argument("--drawing", type=Path, metavar=FILE, help="drawing of the patch, an .svg file")
+    command.add_argument(
+        "--drawing", type=Path, metavar=FILE, help="drawing of the patch on that machine, an .svg file"
+    )
     command.add_argument("--netlist", type=Path, metavar=FILE, help="SPICE deck of the patch, for ngspice")
     add_json(command)
     command.set_defaults(command=_patch)
@@ -46,6 +48,7 @@ def _patch(arguments: argparse.Namespace) -> int:
     from analogrig_emulator.machine.compiler import load_program
     from analogrig_emulator.machine.drawing import patch_drawing
     from analogrig_emulator.machine.sheet import dials, scaling_sheet
+    from analogrig_emulator.machine.that_drawing import that_drawing
 
     if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
         raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
@@ -59,7 +62,7 @@ def _patch(arguments: argparse.Namespace) -> int:
     that = _that_sheet(program) if arguments.machine == "that" else None
     texts = {}
     if arguments.drawing is not None:
-        texts[arguments.drawing] = patch_drawing(program)
+        texts[arguments.drawing] = patch_drawing(program) if that is None else that_drawing(that)
     if arguments.netlist is not None:
         texts[arguments.netlist] = _deck(program)
     for path, text in texts.items():
