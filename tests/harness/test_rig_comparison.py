@@ -83,6 +83,8 @@ def test_offset_is_a_difference_and_noise_is_not() -> None:
     assert displacement.rms_lsb == pytest.approx(3.0, abs=0.15)
     assert displacement.rms_most_lsb >= displacement.rms_lsb
     assert displacement.mean_lsb == pytest.approx(3.0, abs=0.1)
+    assert displacement.mean_least_lsb < displacement.mean_lsb < displacement.mean_most_lsb
+    assert displacement.mean_most_lsb - displacement.mean_least_lsb < 0.5
     assert displacement.noise_lsb == pytest.approx(np.hypot(1.5, np.sqrt(2.0 / 12.0)), rel=0.1)
     assert force.rms_lsb < 0.5
 

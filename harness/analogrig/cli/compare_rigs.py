@@ -111,10 +111,11 @@ def _text(found: RigComparison) -> str:
 
 
 def _signal_lines(found: RigComparison) -> list[str]:
-    heads = ("rms", "at most", "mean", "largest", "at sample", "by noise", "noise")
+    heads = ("rms", "at most", "mean", "at least", "at most", "largest", "at sample", "by noise", "noise")
     lines = [f"  {'LSB of A':13}{''.join(f'{head:>11}' for head in heads)}"]
     for each in found.signals:
-        numbers = (each.rms_lsb, each.rms_most_lsb, each.mean_lsb, each.largest_lsb)
+        means = (each.mean_lsb, each.mean_least_lsb, each.mean_most_lsb)
+        numbers = (each.rms_lsb, each.rms_most_lsb, *means, each.largest_lsb)
         texts = [*(f"{n:.3f}" for n in numbers), str(each.largest_at)]
         texts += [f"{each.largest_noise_lsb:.3f}", f"{each.noise_lsb:.3f}"]
         edges = f"  {each.edges_apart} samples at edges differ" if each.edges_apart else ""

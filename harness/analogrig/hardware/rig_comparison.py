@@ -47,6 +47,9 @@ class SignalDifference:
     """Upper confidence bound of the mean over such plays."""
     mean_lsb: float
     """Offset between the rigs."""
+    mean_least_lsb: float
+    mean_most_lsb: float
+    """Confidence bounds of the mean over such plays."""
     largest_lsb: float
     """Largest mean over 5 samples in any play."""
     largest_at: int
@@ -192,12 +195,15 @@ def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence:
     squares = np.array([np.mean(np.square(each[use])) for each, use in pairs])
     mean_square, _, most_square = mean_interval(squares - noise**2, 2.0 * confidence - 1.0)
     largest, at = max((_largest(each, use) for each, use in pairs), key=lambda found: abs(found[0]))
+    mean, mean_least, mean_most = mean_interval([each[use].mean() for each, use in pairs], confidence)
     count = int(sum(use.sum() for use in compared))
     return SignalDifference(
         channel=channel,
         rms_lsb=math.sqrt(max(mean_square, 0.0)),
         rms_most_lsb=math.sqrt(max(most_square, noise**2 * math.sqrt(2.0 / count))),
-        mean_lsb=float(np.mean([each[use].mean() for each, use in pairs])),
+        mean_lsb=mean,
+        mean_least_lsb=mean_least,
+        mean_most_lsb=mean_most,
         largest_lsb=largest,
         largest_at=at,
         largest_noise_lsb=noise * math.sqrt(2.0 * math.log(count / _SMOOTHED_N + 2.0) / _SMOOTHED_N),
