@@ -134,6 +134,8 @@ class Segment:
     """Latest possible end of the ramp; None: ``ramp_n`` is exact."""
     unseen: str = ""
     """Reason that the change could not be found in the samples; empty otherwise."""
+    also: tuple[str, ...] = ()
+    """Further parameters that the steps of the pots move a little with the change."""
 
     def earliest(self) -> Self:
         """The same segment with its change at the earliest possible instants."""

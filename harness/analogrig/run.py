@@ -476,7 +476,7 @@ def _to_json(conditions: Conditions) -> dict[str, Any]:
         out["identity"] = identity.as_table()
     out["channels"] = {name: vars(channel) for name, channel in conditions.channels.items()}
     out["segments"] = [
-        {**{key: value for key, value in vars(s).items() if value is not None}, "plant": s.plant.parameters()}
+        {**{key: value for key, value in vars(s).items() if value not in (None, ())}, "plant": s.plant.parameters()}
         for s in conditions.segments
     ]
     return out

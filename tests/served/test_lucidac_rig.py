@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
+from analogrig.catalogue import Change
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused
 from analogrig.hardware.calibration.averages import record, scenarios
@@ -29,7 +30,7 @@ from analogrig.hardware.wiring import RealDescription
 from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig.rigs.description import describe
-from analogrig.scenario import DEFAULT_SEED
+from analogrig.scenario import DEFAULT_SEED, PotChange
 from analogrig_emulator import Capacitor, Excitation, SuspensionComputer
 from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
 from analogrig_emulator.lucidac.wiring import FAST_FARAD
@@ -81,6 +82,23 @@ def test_thesis_has_the_verdict_of_the_emulated_rig(served: Served, tmp_path: Pa
 def test_self_test_finds_nothing_wrong(served: Served, tmp_path: Path) -> None:
     with open_rig(served.lucidac_file(tmp_path), allow=[served.address], self_test=False) as rig:
         assert not self_test(rig, 0, "front").reasons
+
+
+def test_run_says_which_parameters_the_steps_of_the_coefficients_moved_with_a_change(
+    served: Served, tmp_path: Path
+) -> None:
+    """A mass acts on three coefficients, a spring on one. So "several" is no wrong name for a change of the mass."""
+    changes = (PotChange(600, {"M": 92.0}), PotChange(900, {"K": 19600.0}))
+    scenario = dataclasses.replace(Scenario.load("thesis"), samples=1200, tweaks=changes)
+    address = served.address
+    with open_rig(served.lucidac_file(tmp_path), allow=[address], self_test=False) as rig, open_dut("inproc") as dut:
+        run = Bench(rig, dut).play(scenario, seed=7)
+    run.save(tmp_path / "run.npz")
+    run = Run.load(tmp_path / "run.npz")
+    assert [each.also for each in run.conditions.segments] == [(), ("B", "K"), ()]
+    several = dataclasses.replace(run, diagnosis_change=np.full_like(run.diagnosis_change, Change.SEVERAL))
+    diagnoses = [change.diagnosis for change in judge(several).tweaks]
+    assert [each is not None and each.right for each in diagnoses] == [True, False]
 
 
 class Uncalibrated(LucidacInstrument):

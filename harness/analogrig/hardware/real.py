@@ -40,6 +40,9 @@ LEAD_N = 1000
 _AFTER_N = 0.05
 """Delay of a scheduled pot change after its sample, in samples."""
 
+_UNMOVED = 1e-6
+"""Largest relative difference of a value that did not move."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -58,6 +61,14 @@ class PlayPlan:
     """Segments dated by the samples; None if the instrument's instants are exact."""
     standing: dict[str, float] = field(default_factory=dict)
     """Values of the parameters at the first sample, by the positions that the pots took."""
+    also: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    """Parameters that the positions of the pots moved with those of a change, by its sample."""
+
+    def segments(self, scenario: Scenario) -> tuple[Segment, ...]:
+        """Segments of the play so far."""
+        if self.dated is not None:
+            return tuple(self.dated)
+        return tuple(dataclasses.replace(each, also=self.also.get(each.start, ())) for each in scenario.segments())
 
 
 class RealRig(Rig):
@@ -102,7 +113,7 @@ class RealRig(Rig):
             channels=self._description.channels(plan.computer, self._noise_lsb),
             blocks=self._blocks(scenario, plan),
             hindsight=lambda: Hindsight(
-                segments=scenario.segments() if plan.dated is None else tuple(plan.dated),
+                segments=plan.segments(scenario),
                 caveats=(*(self._caveats or ()), *plan.contradictions),
                 noise_lsb=self._noise_lsb,
                 standing=plan.standing,
@@ -172,7 +183,7 @@ class RealRig(Rig):
         period_s = self._description.time_scale(plan.computer) / self._datasheet.rate_hz
         cuts = split_records(scenario.samples, self._datasheet.record_n, [change.sample for change in plan.changes])
         dials, plant = dict(plan.computer.dials), scenario.plant
-        plan.standing.update(_values_standing(scenario.program, pots, dials))
+        plan.standing.update(standing := _values_standing(scenario.program, pots, dials))
         for record, (start, end) in enumerate(cuts):
             changes = [dataclasses.replace(c, sample=c.sample - start) for c in plan.changes if start <= c.sample < end]
             with self._leave_safe(instrument):
@@ -181,6 +192,8 @@ class RealRig(Rig):
                 taken, by_hand = self._record(instrument, pots, end - start, changes)
             for change in changes:
                 dials, plant = {**dials, **change.dials}, change.after
+                earlier, standing = standing, _values_standing(scenario.program, pots, dials)
+                plan.also[start + change.sample] = _moved_with(change, earlier, standing)
             self._standing = dials
             volts, codes, clipped = self._description.convert(taken, channels)
             measured = Signals.of(codes, clipped, channels, period_s)
@@ -306,6 +319,17 @@ def _values_standing(program: Program, pots: Pots, dials: Mapping[str, float]) -
     computer = SuspensionComputer(program.circuit)
     computer.set(**{f"{pot}_dial": dial for pot, dial in standing.items()})
     return program.values_at(computer.coefficients)
+
+
+def _moved_with(change: PlannedChange, before: Mapping[str, float], after: Mapping[str, float]) -> tuple[str, ...]:
+    """Parameters that a change moves beside those that it is to move."""
+    planned = change.before.changes_to(change.after)
+    return tuple(
+        name
+        for name in after
+        if name in before and name not in planned
+        if not math.isclose(before[name], after[name], rel_tol=_UNMOVED)
+    )
 
 
 def _switch_off(instrument: Instrument) -> str:

@@ -601,16 +601,19 @@ def _attribute_alarms(
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
                 if detection is None or not diagnosed
-                else _judge_diagnosis(run, start, (detection, end), changed, isolation_bound_n),
+                else _judge_diagnosis(run, by_start[start], (detection, end), changed, isolation_bound_n),
             )
         )
     return tuple(tweaks), tuple(sorted(set(alarms) - detected))
 
 
 def _judge_diagnosis(
-    run: Run, start: int, span: tuple[int, int], changed: Mapping[str, tuple[float, float]], bound_n: int | None
+    run: Run, segment: Segment, span: tuple[int, int], changed: Mapping[str, tuple[float, float]], bound_n: int | None
 ) -> DiagnosisVerdict | None:
-    """Verdict on the first diagnosis within ``span`` (detection to end of the segment, inclusive); None without one."""
+    """Verdict on the first diagnosis within ``span`` (detection to end of the segment, inclusive); None without one.
+
+    "several" is right as well where the pots moved other parameters with the one that was to change.
+    """
     reported = np.flatnonzero((run.diagnosis_index >= span[0]) & (run.diagnosis_index <= span[1]))
     if not len(reported):
         return None
@@ -619,14 +622,14 @@ def _judge_diagnosis(
     named = parameters.get(diagnosis, diagnosis)
     ratio = float(run.diagnosis_extent[first])
     extent = ratio if diagnosis in parameters and math.isfinite(ratio) else None
-    right = (named,) == tuple(changed) or (named == "several" and len(changed) > 1)
+    right = (named,) == tuple(changed) or (named == "several" and len({*changed, *segment.also}) > 1)
     error = extent * changed[named][0] / changed[named][1] - 1.0 if right and extent is not None else None
     return DiagnosisVerdict(
         named=named,
         right=right,
-        delay_n=int(run.diagnosis_index[first]) - start,
+        delay_n=int(run.diagnosis_index[first]) - segment.start,
         bound_n=bound_n,
-        onset_error_n=int(run.diagnosis_onset[first]) - start,
+        onset_error_n=int(run.diagnosis_onset[first]) - segment.start,
         extent=extent,
         extent_error=error,
     )
