@@ -11,7 +11,8 @@ What no public document says, and is assumed here:
                    during a run: busy; with the parameter writes_in_op the run's client may write coefficients, which
                    act some blocks later and leave the calibration as it is
     reset          keeps the circuit unless circuit_reset is set
-    manual control is accepted for IC, OP and HALT, and has no further effect
+    manual control is accepted for IC, OP and HALT; the mode changes no answer, as only runs are sampled and watched for
+                   overload, and each begins at its initial conditions
     samples        at k / rate, n = floor(op time x rate); rate x channels at most MOST_RATE_HZ
     run data end   holds the last sample
 """
