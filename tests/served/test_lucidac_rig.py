@@ -164,11 +164,11 @@ def test_generator_sleeps_between_records(served: Served, instrument: LucidacIns
 def test_doctor_asks_whether_coefficients_can_be_written_in_op(
     instrument: LucidacInstrument, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert instrument.remarks() == ("coefficients cannot be written during OP: a change is a new run",)
+    assert instrument.remarks() == ("the machine accepts no coefficients during OP: a change is a new run",)
     with serving("--as", "lucidac", "--defect", "writes_in_op=true") as other:
         assert main(["doctor", "--rig", other.lucidac_file(tmp_path), "--allow", other.address, "--json"]) == 0
     (remark,) = json.loads(capsys.readouterr().out)["remarks"]
-    assert "can be written during OP" in remark
+    assert "accepts coefficients during OP" in remark
 
 
 def test_answer_after_op_is_none(instrument: LucidacInstrument, monkeypatch: pytest.MonkeyPatch) -> None:

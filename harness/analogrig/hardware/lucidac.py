@@ -43,8 +43,8 @@ _HALF_RANGE = 1 << 15
 _EARLY_N = 1e-3
 """Time from an edge of the generator to its first sample, in samples: the elements settle in 50 ns."""
 
-_ACCEPTS = "coefficients can be written during OP, but the answer tells no instant: a change is a new run"
-_REFUSES = "coefficients cannot be written during OP: a change is a new run"
+_ACCEPTS = "the machine accepts coefficients during OP, but its answer tells no instant: a change is a new run"
+_REFUSES = "the machine accepts no coefficients during OP: a change is a new run"
 
 _ASLEEP = SignalGenerator("sine and square")
 

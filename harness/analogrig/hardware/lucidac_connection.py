@@ -21,7 +21,7 @@ _MOST_ANSWER_BYTES = 1 << 20
 
 _QUESTION_RATE_HZ = 1000
 _QUESTION_SAMPLES = (100, 1000, 10_000)
-"""Runs during which a configuration is sent: the next one if the answer comes too late."""
+"""Lengths of runs during which a configuration is sent: the next one if the answer comes too late."""
 
 
 class LucidacConnection:

@@ -238,13 +238,12 @@ class LucidacServer(TcpServer):
         return self._pb.ResetResponse(entity=command.entity)
 
     def _configure(self, client: Client, command: Any) -> Any:
+        writes_in_op = client is self._runner and self._may_write_in_op(command)
+        if not writes_in_op:
+            self._require_idle()
         before, items = (Registers(), []) if command.reset_before else (self._registers, self._items)
         registers, items = before.with_items(command.module.items, MAC), _merged(items, list(command.module.items))
-        if client is self._runner and self._may_write_in_op(command):
-            self._machine.turn(registers.configuration())
-        else:
-            self._require_idle()
-            self._machine.configure(registers.configuration())
+        (self._machine.turn if writes_in_op else self._machine.configure)(registers.configuration())
         self._registers, self._items = registers, items
         return self._pb.ConfigResponse()
 
