@@ -25,7 +25,7 @@ MAX_SAMPLES = 10_000_000
 MAX_CHANGES = 1_000
 """Largest number of changes, and of records, in a run. The bounds of each take milliseconds to compute."""
 
-LEAST_PARAMETER, MOST_PARAMETER = 1e-12, 1e12
+LEAST_PARAMETER, MOST_PARAMETER = 1e-15, 1e15
 """Limits of each parameter in its unit, exclusive."""
 
 BLOCK_SAMPLES = 64
@@ -36,7 +36,7 @@ BLOCK_SAMPLES = 64
 class Plant:
     """Program with values of its parameters, in their order.
 
-    ValueError: a value is not positive, or 1e12 or more.
+    ValueError: a value is not between 1e-15 and 1e15.
     """
 
     program: Program
@@ -109,7 +109,7 @@ class Plant:
 
 
 def check_parameter(name: str, value: float) -> None:
-    """:raises ValueError: the value of a parameter is not positive, or 1e12 or more."""
+    """:raises ValueError: the value of a parameter is not between 1e-15 and 1e15."""
     if not LEAST_PARAMETER < value < MOST_PARAMETER:
         limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"
         raise ValueError(f"{name} must be {limit if value > 0.0 else 'more than 0'}, not {value:g}")

@@ -167,6 +167,10 @@ class PatchedProgram(ProgramCircuit):
             raise PotError(f"pot {pot}: {cause}") from cause
 
     @property
+    def is_linear(self) -> bool:
+        return self.stages.is_linear
+
+    @property
     def amplifiers(self) -> int:
         return sum(1 for element in self.elements if isinstance(element, OpAmp))
 

@@ -121,6 +121,11 @@ class ProgramCircuit(ABC):
         return {}
 
     @property
+    def is_linear(self) -> bool:
+        """True if amplifiers with resistors and capacitors alone solve it."""
+        return True
+
+    @property
     @abstractmethod
     def amplifiers(self) -> int:
         """Number of amplifiers U1, U2, ..."""

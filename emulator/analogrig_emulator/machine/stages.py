@@ -87,6 +87,11 @@ class Stages:
     stages: tuple[PatchStage, ...]
     composites: Mapping[str, Formula]
 
+    @property
+    def is_linear(self) -> bool:
+        """True if summers and integrators solve the equations."""
+        return all(stage.kind in (StageKind.SUMMER, StageKind.INTEGRATOR) for stage in self.stages)
+
     def factor(self, factors: Factors, values: Mapping[str, float]) -> float:
         """Product of factors. Raises ProgramError unless it is finite and positive."""
         product = 1.0
@@ -126,7 +131,8 @@ class Stages:
             case StageKind.RECTIFIER:
                 return np.asarray(np.maximum(0.0, a))
             case StageKind.PRODUCT:
-                return np.asarray(a * quantities[stage.cords[1].source])
+                with np.errstate(all="ignore"):
+                    return np.asarray(a * quantities[stage.cords[1].source])
             case StageKind.QUOTIENT:
                 with np.errstate(all="ignore"):
                     return np.asarray(a / quantities[stage.cords[1].source])

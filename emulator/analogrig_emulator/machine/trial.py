@@ -24,8 +24,6 @@ _POINTS = 200
 _MOST_EVALUATIONS = 20_000
 _TOLERANCE = 1e-5
 _LARGEST = 1e30
-_LINEAR = (StageKind.SUMMER, StageKind.INTEGRATOR)
-
 _States = NDArray[np.float64]
 """(states, settings)"""
 
@@ -82,8 +80,7 @@ def _played(
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
     """Inputs (instants,) by name, and states (instants, states, settings)."""
     equations = stages.equations
-    is_linear = all(stage.kind in _LINEAR for stage in stages.stages)
-    solve = _solved_linear if is_linear else _solved
+    solve = _solved_linear if stages.is_linear else _solved
     slopes = equations.slopes()
     instants_s = np.linspace(0.0, 0.5 * equations.period_s, _POINTS)
     parameters = {name: np.array([values[name] for values in every]) for name in equations.parameters}
