@@ -72,16 +72,20 @@ class Take:
         return len(set(alarms).difference(*explained))
 
     def played(self, run: Run) -> Scenario:
-        """Scenario that plays this take again, and allows the false alarms that were seen."""
+        """Scenario that plays this take again, and allows the false alarms that were seen.
+
+        Injected faults are no part of a scenario: alarms of a take with one are not allowed.
+        """
         changes = tuple(change for change in self.changes if change.sample < run.samples)
         told = [f"{name} to {value:.6g} at {each.sample}" for each in changes for name, value in each.set.items()]
         more = f" and {len(told) - _MOST_TOLD} more" if len(told) > _MOST_TOLD else ""
         expect = self.scenario.expect
+        allowed = 0 if self.caveats or run.conditions.faults else self.false_alarms(run)
         return dataclasses.replace(
             self.scenario,
             samples=run.samples,
             tweaks=changes,
-            expect=dataclasses.replace(expect, false_alarms=max(expect.false_alarms, self.false_alarms(run))),
+            expect=dataclasses.replace(expect, false_alarms=max(expect.false_alarms, allowed)),
             name="by hand",
             description=f"Recorded by hand: {', '.join(told[:_MOST_TOLD]) or 'no change'}{more}.",
         )
