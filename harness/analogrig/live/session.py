@@ -84,7 +84,7 @@ class Saved:
     samples: int
     alarms: int
     false_alarms: int
-    """Alarms that no change explains; its scenario allows them, unless a fault was injected."""
+    """Alarms before any injected fault that no change explains; its scenario allows them."""
     is_faulty: bool
     """True if it holds an injected fault, so that its verdict will be INCONCLUSIVE."""
 
@@ -293,7 +293,7 @@ class LiveSession:
         if self.desk.is_stepped:
             self._show_take()
         for kind in () if self.device.faulty_line is None else self.device.faulty_line.lasting:
-            self.take.add_caveat(f"line fault {kind}: injected by hand before the recording")
+            self.take.add_caveat(f"line fault {kind}: injected by hand before the recording", 0)
 
     def _show_take(self) -> None:
         """Show the take instead of the one before, which a rig of whole records shows until it has the next one."""
@@ -482,7 +482,7 @@ class LiveSession:
         label = self.desk.faults[fault]
         self.notes.disturb(self._taken, label, lasts=fault in self.injected)
         if fault in self.injected:
-            self.take.add_caveat(f"{WRONG_SAMPLES}{label}, injected by hand at sample {self._taken}")
+            self.take.add_caveat(f"{WRONG_SAMPLES}{label}, injected by hand at sample {self._taken}", self._taken)
 
     def _turn_pots(self) -> None:
         """Turn the pots that the hand has turned, unless one is still turning."""
@@ -533,7 +533,7 @@ class LiveSession:
             for each in spoils:
                 self.device.faulty_line.inject(each.kind, each.direction)
                 what = f"line fault {each.kind}, {each.direction} the device"
-                self.take.add_caveat(f"{what}: injected by hand at sample {self.ring.end}")
+                self.take.add_caveat(f"{what}: injected by hand at sample {self.ring.end}", self.ring.end)
                 self.notes.disturb(self.ring.end, what, lasts=False)
                 self.notify(f"{LINE_LABELS[each.kind]}, {each.direction} the device: at sample {self.ring.end}")
 
@@ -579,10 +579,10 @@ class LiveSession:
         )
         self.saved.append(saved)
         held = f"{number_of(run.samples, 'sample', form=',')}, {number_of(saved.alarms, 'alarm')}"
+        if saved.false_alarms:
+            held += f", {saved.false_alarms} of them without a change: allowed in the scenario"
         if saved.is_faulty:
             held += ". It holds an injected fault, or a failure: its verdict will be INCONCLUSIVE"
-        elif saved.false_alarms:
-            held += f", {saved.false_alarms} of them without a change: allowed in the scenario"
         self.notify(f"saved {saved.run}: {held}")
         if self._on_saved is not None:
             self._on_saved(saved)

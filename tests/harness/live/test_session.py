@@ -671,7 +671,7 @@ def test_recording_with_an_injected_fault_says_that_it_cannot_be_judged(tmp_path
     (saved,) = scripted_session(script, tmp_path, on_saved=told.append).saved
     assert told == [saved]
     assert saved.is_faulty
-    assert saved.alarms == saved.false_alarms > 0
+    assert saved.alarms > saved.false_alarms == 0
     assert Scenario.load(str(saved.scenario)).expect.false_alarms == 0
     assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
 

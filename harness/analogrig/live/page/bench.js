@@ -12,6 +12,7 @@
   const HAND_MS = 40; // time between two messages of a hand that turns a pot
   const RAMP_N = 16; // samples of its ramps: each takes the emulator as long as fifty of a pot that stands still
   const BEHIND_MS = 3000; // time for which the page warns that the bench has fallen behind real time
+  const SILENT_S = 3; // without an answer, of which the page tells
   const NOTICE_MS = 15000; // time for which a message stays at the bottom: the list keeps it
   const PATCH_WIDTH = 560;
   const SVG = "http://www.w3.org/2000/svg";
@@ -543,10 +544,17 @@
       if (voltages.has(name)) put(voltages.get(name), `${volts.toFixed(2)} V`);
     }
     showDevice();
-    const cure = state.line_faults.length ? "Mend the line, then press Run." : "Press Run to try again.";
-    put($("failure"), state.failure ? `Stopped: ${state.failure}. ${cure}` : "");
+    put($("failure"), failure());
     showNotices();
     showSaved();
+  }
+
+  // Failure of the device in one line, with its cure.
+  function failure() {
+    const { failure: reason, line_faults: faults, silent_s: silent } = state;
+    if (silent >= SILENT_S) return `The device has not answered for ${silent.toFixed(0)} s. If it hangs, end the bench in its terminal.`;
+    if (!reason) return "";
+    return `Stopped: ${reason}. ${faults.length ? "Mend the line, then press Run." : "Press Run to try again."}`;
   }
 
   function showBehind() {
