@@ -53,5 +53,9 @@ def counter_text(n: int, name: str) -> str:
     words = name.split("_")
     if n == 1:
         noun = next((i for i, word in enumerate(words) if word.endswith("s") and not word.endswith("ss")), None)
-        words = [word[:-1] if i == noun else word for i, word in enumerate(words)]
+        words = [_singular(word) if i == noun else word for i, word in enumerate(words)]
     return f"{n} {' '.join(words)}"
+
+
+def _singular(word: str) -> str:
+    return word.removesuffix("es") if word.endswith(("shes", "sses")) else word.removesuffix("s")

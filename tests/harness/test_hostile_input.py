@@ -442,6 +442,7 @@ def test_counts_have_their_nouns_in_number() -> None:
     assert counter_text(1, "error_frames") == "1 error frame"
     assert counter_text(2, "frames_foreign") == "2 frames foreign"
     assert counter_text(1, "messages_of_other_runs") == "1 message of other runs"
+    assert counter_text(1, "refreshes") == "1 refresh"
 
 
 def test_message_of_any_length_is_one_printable_line() -> None:

@@ -21,7 +21,7 @@ from analogrig.cli.terminal import PASSED, show, show_json
 
 if TYPE_CHECKING:
     from analogrig.devices.device import Device
-    from analogrig.live.session import LiveSession
+    from analogrig.live.session import LiveSession, Saved
 
 TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
 """Environment variable with the token of the address; by default a random one."""
@@ -90,7 +90,14 @@ def _run(arguments: argparse.Namespace) -> int:
         _open_device(arguments.dut or scenario.dut, arguments) as device,
     ):
         identity = Identity.here(arguments.command_line, arguments.started, device.files())
-        session = LiveSession(rig, scenario, device, seed, folder=arguments.out, identity=identity)
+
+        def show_saved(saved: Saved) -> None:
+            if arguments.json:
+                show_json({"saved": str(saved.run), "scenario": str(saved.scenario)})
+            else:
+                show(f"saved {saved.run}, scenario {saved.scenario}")
+
+        session = LiveSession(rig, scenario, device, seed, folder=arguments.out, identity=identity, on_saved=show_saved)
         return asyncio.run(_serve(session, arguments))
 
 

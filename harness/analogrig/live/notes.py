@@ -47,7 +47,7 @@ class NotedAlarm:
     again: str = ""
     """Names of the parameters of a change that an earlier alarm had found already."""
     fault: str = ""
-    """Injected fault that was in force, if no change explains the alarm."""
+    """Injected fault or mode of the computer in force, if no change explains the alarm."""
     change: int = 0
     """Sample of the change."""
     latency_n: int | None = None
@@ -75,7 +75,7 @@ class Notes:
         self.felt_s: deque[float] = deque(maxlen=_MOST_TIMED)
         """Times from a turn of a pot to the first answered sample that feels it."""
         self._disturbed: dict[str, float] = {}
-        """Last samples that injected faults of this take act on."""
+        """Last samples that injected faults and modes of this take act on."""
         self.alarms: deque[NotedAlarm] = deque(maxlen=_MOST_NOTED)
         self.alarm_count = 0
         self.diagnosis = ""
@@ -92,7 +92,7 @@ class Notes:
         self._disturbed = {}
 
     def disturb(self, sample: int, what: str, *, lasts: bool) -> None:
-        """Note an injected fault at a sample, from which alarms may come."""
+        """Note an injected fault or a mode at a sample, from which alarms may come."""
         self._disturbed[what] = math.inf if lasts else sample + _AFTER_N
 
     def await_turn(self, sample: int, times_s: Sequence[float]) -> None:

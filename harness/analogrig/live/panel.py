@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
+from collections.abc import Mapping
 from typing import Any, get_args
 
 from analogrig.live.commands import Mode
@@ -15,7 +17,8 @@ from analogrig.live.scope import (
     MOST_WINDOW_N,
     signals_of,
 )
-from analogrig.live.session import LiveSession
+from analogrig.live.session import LiveSession, Saved
+from analogrig.wording import counter_text
 from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
 from analogrig_emulator.machine.patching import patches
 
@@ -114,15 +117,28 @@ def state_table(session: LiveSession) -> dict[str, Any]:
         "volts": _volts(session),
         "diagnosis": session.notes.diagnosis,
         "misfit": session.notes.misfit,
-        "counters": {name: count for name, count in session.counters.items() if count},
-        "link_counters": {name: count for name, count in session.link_counters.items() if count},
+        "counters": _counted(session.counters),
+        "link_counters": _counted(session.link_counters),
         "alarms": [dataclasses.asdict(alarm) for alarm in list(session.notes.alarms)[-12:]],
         "alarm_count": session.notes.alarm_count,
+        "failure": session.failure,
         "recording": session.is_recording,
-        "saved": [{"run": str(each.run), "scenario": str(each.scenario)} for each in list(session.saved)[-3:]],
+        "saved": [_replayed(each) for each in list(session.saved)[-3:]],
         "notices": list(session.notices)[-3:],
         "felt_ms": round(1e3 * session.notes.felt_s[-1], 1) if session.notes.felt_s else None,
     }
+
+
+def _counted(counters: Mapping[str, int]) -> list[str]:
+    """Counters that have counted, as texts."""
+    return [counter_text(count, name) for name, count in counters.items() if count]
+
+
+def _replayed(saved: Saved) -> dict[str, Any]:
+    """Files of a recording, and the commands that play it again."""
+    run, scenario = str(saved.run), str(saved.scenario)
+    replay, play = shlex.join(("analogrig", "replay", run)), shlex.join(("analogrig", "run", "--scenario", scenario))
+    return {"run": run, "scenario": scenario, "commands": [replay, play]}
 
 
 def _last(session: LiveSession, column: str) -> float | None:

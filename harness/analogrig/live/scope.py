@@ -7,6 +7,7 @@ values of each signal (float32), all little-endian.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -27,6 +28,18 @@ _MEASURE_S = 0.2
 """Time between two measurements, which people read."""
 _HYSTERESIS = 0.002
 """Hysteresis of the trigger, as a part of the source's range in the ring."""
+_SEARCHED_N = 4000
+"""Samples in which a trigger is sought, if the screen has fewer."""
+_ROLL_S = 1.0
+"""Wall-clock time of a screen from which it rolls, since a triggered one would lag."""
+_NOISE_LSB = 10.0
+"""Range of a signal, in LSB, below which it has neither frequency nor overshoot."""
+_IRREGULAR = 0.25
+"""Spread of its periods, as a part of their mean, above which a signal has no frequency."""
+_SETTLED_PART = 0.25
+"""Part of the samples of a state that must have settled."""
+_SETTLED = 0.01
+"""Width of a settled state, as a part of the step; noise may add 2 LSB."""
 
 Values = NDArray[np.float64]
 
@@ -42,6 +55,8 @@ class Signal:
     """Problem unit; empty if only volts, or the device's own numbers, make sense."""
     per_volt: float
     """Problem units per volt."""
+    resolution: float = 0.0
+    """Least difference that can be told apart: LSB of the card in volts; 0.0 if unknown."""
     node: str = ""
     """Node of the patch."""
 
@@ -89,12 +104,13 @@ def signals_of(session: LiveSession) -> dict[str, Signal]:
     out = []
     for name, channel in performance.channels.items():
         label, node = name.replace("_", " "), quantities[name].node
-        out.append(Signal(name, label, "channel", channel.unit, channel.unit_per_v, node))
+        out.append(Signal(name, label, "channel", channel.unit, channel.unit_per_v, channel.lsb_v, node))
+    lsb_v = min(channel.lsb_v for channel in performance.channels.values())
     nodes = {scale.node: (name, scale) for name, scale in quantities.items()}
     for name, node in zip(desk.amplifiers, desk.nodes, strict=True):
         quantity, scale = nodes.get(node, ("", None))
         label = f"{name} {'-' if scale.sign < 0 else ''}{quantity.replace('_', ' ')}" if scale else name
-        out.append(Signal(name, label, "amplifier", "", 1.0, node))
+        out.append(Signal(name, label, "amplifier", "", 1.0, lsb_v, node))
     reported = {"statistic": sheet.statistic, "innovation": sheet.innovation}
     out += [Signal(name, name, "device", "", 1.0) for name, is_reported in reported.items() if is_reported]
     names = session.notes.estimate_names
@@ -136,8 +152,8 @@ class Screen:
         """Take and first sample that may trigger a single shot; None: those after the next frame."""
         self._held: tuple[int, float] | None = None
         """Take and trigger of the single shot that is shown."""
-        self._shown: tuple[int, int] | None = None
-        """Take and last sample of the last frame."""
+        self._shown: tuple[int, int, bool] | None = None
+        """Take and last sample of the last frame, and true if the session was playing."""
         self._measured_s = -_MEASURE_S
         """Time of the last measurements."""
 
@@ -154,38 +170,41 @@ class Screen:
         view, ring = self.view, session.ring
         if view is None or (self._held is not None and self._shown is not None):
             return None
+        plays = session.is_playing  # read once: another thread writes it
         take, end = ring.place
         if view.trigger.mode == "single" and self._armed is None:
             self._armed = take, end
         least = LEAST_WINDOW_N if view.kind == "fft" else 2
-        if end < least or self._shown == (take, end):
+        if end < least or self._shown == (take, end, plays):
             return None
         try:
-            return self._frame(view, session, take, end)
+            frame = self._frame(view, session, take, end, plays=plays)
         except LookupError:  # the ring has moved on, or the take has ended
             return None
+        self._shown = self._shown if frame is None else (take, end, plays)
+        return frame
 
-    def _frame(self, view: View, session: LiveSession, take: int, end: int) -> bytes | None:
+    def _frame(self, view: View, session: LiveSession, take: int, end: int, *, plays: bool) -> bytes | None:
         samples = min(view.samples, end)
-        found = self._find_trigger(view, session, take, end)
-        if found is None and view.trigger.mode != "auto" and view.kind != "fft":
-            return None
-        if found is None:
-            first, trigger = end - samples, None
-        else:
-            trigger = found
-            first = min(max(int(found) - round(view.trigger.position * samples), session.ring.start), end - samples)
+        rate_hz = session.sample_rate_hz
+        is_auto = view.trigger.mode == "auto"
+        rolls = is_auto and (not plays or view.samples * session.factor / rate_hz >= _ROLL_S)
+        trigger = None if rolls else self._find_trigger(view, session, take, end)
+        if trigger is None and not is_auto and view.kind != "fft":
+            return self._waiting(view, session, end) if self._is_due(session, plays=plays) else None
+        first = end - samples
+        if trigger is not None:
+            first = min(max(int(trigger) - round(view.trigger.position * samples), session.ring.start), first)
         signals = {name: read_signal(session, name, first, first + samples) for name in view.signals}
-        self._shown = take, end
         if trigger is not None and view.trigger.mode == "single":
             self._held = take, trigger
-        rate_hz = session.sample_rate_hz
         header: dict[str, Any] = {"take": take, "first": first, "samples": samples, "rate": rate_hz, "end": end}
-        header |= {"trigger": trigger, "kind": view.kind, "signals": list(signals)}
-        now_s = session.clock()
-        if now_s - self._measured_s >= _MEASURE_S or not session.is_playing:
-            self._measured_s = now_s
-            header["measures"] = {name: measures(values, rate_hz) for name, values in signals.items()}
+        header |= {"trigger": trigger, "rolls": rolls, "kind": view.kind, "signals": list(signals)}
+        if self._is_due(session, plays=plays):
+            known = signals_of(session)
+            header["measures"] = {
+                name: measures(values, rate_hz, known[name].resolution) for name, values in signals.items()
+            }
         if view.kind == "fft":
             header["step"] = rate_hz / samples
             columns, per = reduced([spectrum_db(values) for values in signals.values()], view.columns)
@@ -196,6 +215,21 @@ class Screen:
             columns, per = reduced(list(signals.values()), view.columns)
         header |= {"points": len(columns[0]), "per": per}
         return packed(header, columns)
+
+    def _waiting(self, view: View, session: LiveSession, end: int) -> bytes:
+        """Frame without a picture: the trigger has not come. It holds the range in which its source moves."""
+        searched = min(max(view.samples, _SEARCHED_N), end - session.ring.start)
+        source = read_signal(session, view.trigger.source, end - searched, end)
+        source = source[np.isfinite(source)]
+        moves = [float(source.min()), float(source.max())] if len(source) else [None, None]
+        return packed({"waiting": moves, "signals": []}, [])
+
+    def _is_due(self, session: LiveSession, *, plays: bool) -> bool:
+        """Return True if people can read new measurements, and note the time."""
+        now_s = session.clock()
+        is_due = now_s - self._measured_s >= _MEASURE_S or not plays
+        self._measured_s = now_s if is_due else self._measured_s
+        return is_due
 
     def _find_trigger(self, view: View, session: LiveSession, take: int, end: int) -> float | None:
         """Instant of the trigger, in samples: that of a single shot stays.
@@ -221,7 +255,7 @@ def _crossing(trigger: Trigger, session: LiveSession, end: int, samples: int, af
     """
     before = round(trigger.position * samples)
     last = end - (samples - before)
-    first = max(session.ring.start, before, last - max(samples, 4000))
+    first = max(session.ring.start, before, last - max(samples, _SEARCHED_N))
     if last - first < 2:
         return None
     source = read_signal(session, trigger.source, first, last)
@@ -257,8 +291,15 @@ def spectrum_db(values: Values) -> Values:
     return np.asarray(20.0 * np.log10(np.maximum(lines, 1e-9)))
 
 
-def measures(values: Values, rate_hz: float) -> dict[str, float | None]:
-    """Measurements of a signal: extremes, mean, rms, frequency [Hz] and overshoot (part of the step)."""
+def measures(values: Values, rate_hz: float, lsb: float = 0.0) -> dict[str, float | None]:
+    """Measurements of a signal: extremes, mean, rms, frequency [Hz] and overshoot (part of the step).
+
+    Noise has no frequency, nor have pulses without a period. A signal that does not settle has no overshoot.
+
+    :param lsb: resolution of the values.
+    """
+    if not np.isfinite(values).all():
+        return dict.fromkeys(("min", "max", "mean", "rms", "frequency", "overshoot"))
     low, high = float(values.min()), float(values.max())
     out: dict[str, float | None] = {
         "min": low,
@@ -268,21 +309,32 @@ def measures(values: Values, rate_hz: float) -> dict[str, float | None]:
         "frequency": None,
         "overshoot": None,
     }
-    if not np.isfinite(values).all():
-        return dict.fromkeys(out)
-    middle = 0.5 * (low + high)
-    is_high = values > middle + 0.1 * (high - low)
-    is_low = values < middle - 0.1 * (high - low)
-    state = np.zeros(len(values), np.int8)
-    state[is_high], state[is_low] = 1, -1
-    known = np.flatnonzero(state)
-    rises = known[1:][(state[known[1:]] == 1) & (state[known[:-1]] == -1)]
-    if len(rises) > 1:
-        out["frequency"] = float(rate_hz * (len(rises) - 1) / (rises[-1] - rises[0]))
-    if is_high.any() and is_low.any():
-        top, base = float(np.median(values[is_high])), float(np.median(values[is_low]))
-        out["overshoot"] = (high - top) / (top - base)
+    middle, guard = 0.5 * (low + high), 0.1 * (high - low)
+    is_high, is_low = values > middle + guard, values < middle - guard
+    if high - low <= _NOISE_LSB * lsb or not (is_high.any() and is_low.any()):
+        return out
+    known = np.flatnonzero(is_high | is_low)
+    rises = known[1:][is_high[known[1:]] & is_low[known[:-1]]]
+    periods = np.diff(rises)
+    if len(periods) and np.ptp(periods) <= 2 + _IRREGULAR * periods.mean():
+        out["frequency"] = float(rate_hz / periods.mean())
+    top, top_width = state_level(values[is_high])
+    base, base_width = state_level(values[is_low])
+    if max(top_width, base_width) <= _SETTLED * (top - base) + 2.0 * lsb:
+        out["overshoot"] = max(0.0, (high - top) / (top - base))
     return out
+
+
+def state_level(values: Values) -> tuple[float, float]:
+    """Level of the samples of one state, and the width of the part that lies closest together.
+
+    Method of IEEE Std 181 (shorth), with ``_SETTLED_PART`` instead of a half: the rest is transitions and overshoot.
+    """
+    ordered = np.sort(values)
+    part = math.ceil(_SETTLED_PART * len(ordered))
+    widths = ordered[part - 1 :] - ordered[: len(ordered) - part + 1]
+    at = int(np.argmin(widths))
+    return float(ordered[at : at + part].mean()), float(widths[at])
 
 
 def packed(header: dict[str, Any], columns: list[Values]) -> bytes:
@@ -296,5 +348,7 @@ def unpacked(frame: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32
     """Header and signals of a frame; inverse of ``packed``."""
     (length,) = struct.unpack_from("<I", frame)
     header = json.loads(frame[4 : 4 + length])
+    if not header["signals"]:
+        return header, {}
     values = np.frombuffer(frame, "<f4", offset=4 + length).reshape(len(header["signals"]), -1)
     return header, dict(zip(header["signals"], values, strict=True))

@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,8 @@ from analogrig.storage import replace_file
 from analogrig.wording import number_of
 from analogrig_emulator import EmulatorError, Excitation
 
+ANOTHER_MODE = "computer in another mode"
+"""Explanation of alarms from samples that the computer has not played in OPERATE, or just after."""
 BLOCK_S = 0.0125
 """Wall-clock length of a block: a hand is felt within two of them."""
 MOST_BLOCK_N = 1024
@@ -55,6 +57,12 @@ _MOST_NOTED = 50
 
 _STEPPED_ONLY = commands.Operate | commands.Step | commands.ClearLamps | commands.Tempo
 """Commands to rigs that are not played in whole records."""
+_FIXED: Mapping[type[Command], str] = {
+    commands.Generate: "the generator",
+    commands.Operate: "the mode",
+    commands.Restart: "the start",
+}
+"""Commands that a recording refuses, and their objects."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,9 @@ class Saved:
     samples: int
     alarms: int
     false_alarms: int
-    """Alarms that no change explains; its scenario allows them."""
+    """Alarms before any injected fault that no change explains; its scenario allows them."""
+    is_faulty: bool
+    """True if it holds an injected fault, so that its verdict will be INCONCLUSIVE."""
 
 
 class LiveSession:
@@ -92,10 +102,12 @@ class LiveSession:
         folder: Path,
         clock: LiveClock | None = None,
         identity: Identity | None = None,
+        on_saved: Callable[[Saved], None] | None = None,
     ) -> None:
         """Prepare; nothing is played before ``run``.
 
         :param folder: receives the recordings.
+        :param on_saved: called with each recording that was saved, by the thread that plays.
         :raises ConfigurationError: the rig cannot be operated by hand, or cannot play the scenario.
         """
         self.desk = open_desk(rig, scenario, seed, self._lengths)
@@ -104,6 +116,7 @@ class LiveSession:
         self.knobs = self.desk.knobs
         self._folder = folder
         self._identity = identity
+        self._on_saved = on_saved
         self.clock = clock or WallClock()
         self._lock, self._woken = threading.Lock(), threading.Event()
         self._waiting: deque[tuple[Command, float]] = deque()
@@ -134,8 +147,8 @@ class LiveSession:
         self.version = 0
         """Number that grows with every change of the state, apart from samples."""
         self._notice_numbers = itertools.count(1)
-        self._has_failed = False
-        """True until the device has been brought back after a failure."""
+        self.failure = ""
+        """Reason of the last failure, until the device has been brought back."""
         self._spoils: list[commands.Spoil] = []
         """Faults of the line that wait for the next answered block: handshake and configuration are spared."""
         self._steps = 0
@@ -183,6 +196,9 @@ class LiveSession:
         self.version += 1
 
     def _check(self, command: Command) -> None:
+        if self.is_recording and type(command) in _FIXED:
+            what = _FIXED[type(command)]
+            raise ConfigurationError(f"{what} cannot change within a recording, which is one scenario: end it first")
         match command:
             case commands.Turn():
                 if command.name not in self.knobs:
@@ -191,11 +207,8 @@ class LiveSession:
                 if command.value != self.values[command.name]:
                     self.desk.check_turn(self.values, {command.name: command.value})
             case commands.Generate():
-                self._refuse_while_recording("the generator")
                 excitation = self._generated(command)
                 self.desk.check(dataclasses.replace(self.desk.scenario, excitation=excitation))
-            case commands.Operate():
-                self._refuse_while_recording("the mode")
             case commands.Spoil() if command.kind not in self.line_faults:
                 raise ConfigurationError(f"the line of this device has no fault {command.kind!r} to inject")
             case commands.Spoil() if len(self._spoils) >= MOST_WAITING:
@@ -204,10 +217,6 @@ class LiveSession:
                 raise ConfigurationError(f"this rig has no fault {command.fault!r} to inject")
         if not self.desk.is_stepped and isinstance(command, _STEPPED_ONLY):
             raise ConfigurationError("this rig plays whole records: it has no modes, no tempo and no single step")
-
-    def _refuse_while_recording(self, what: str) -> None:
-        if self.is_recording:
-            raise ConfigurationError(f"{what} cannot change within a recording, which is one scenario: end it first")
 
     def _generated(self, command: commands.Generate) -> Any:
         """Excitation with the settings of a command.
@@ -231,7 +240,7 @@ class LiveSession:
     def run(self) -> None:
         """Play takes until ``close``."""
         while not self._is_closed:
-            if self._has_failed:
+            if self.failure:
                 self._bring_back()
             else:
                 self._play_take()
@@ -284,7 +293,7 @@ class LiveSession:
         if self.desk.is_stepped:
             self._show_take()
         for kind in () if self.device.faulty_line is None else self.device.faulty_line.lasting:
-            self.take.add_caveat(f"line fault {kind}: injected by hand before the recording")
+            self.take.add_caveat(f"line fault {kind}: injected by hand before the recording", 0)
 
     def _show_take(self) -> None:
         """Show the take instead of the one before, which a rig of whole records shows until it has the next one."""
@@ -459,6 +468,8 @@ class LiveSession:
         match command:
             case commands.Operate():
                 self.desk.switch(command.mode)
+                if command.mode != self.mode:
+                    self.notes.disturb(self._taken, ANOTHER_MODE, lasts=command.mode != "OPERATE")
             case commands.Inject():
                 self.desk.inject(command.fault, on=command.on)
                 self._note_fault(command.fault)
@@ -471,7 +482,7 @@ class LiveSession:
         label = self.desk.faults[fault]
         self.notes.disturb(self._taken, label, lasts=fault in self.injected)
         if fault in self.injected:
-            self.take.add_caveat(f"{WRONG_SAMPLES}{label}, injected by hand at sample {self._taken}")
+            self.take.add_caveat(f"{WRONG_SAMPLES}{label}, injected by hand at sample {self._taken}", self._taken)
 
     def _turn_pots(self) -> None:
         """Turn the pots that the hand has turned, unless one is still turning."""
@@ -522,7 +533,7 @@ class LiveSession:
             for each in spoils:
                 self.device.faulty_line.inject(each.kind, each.direction)
                 what = f"line fault {each.kind}, {each.direction} the device"
-                self.take.add_caveat(f"{what}: injected by hand at sample {self.ring.end}")
+                self.take.add_caveat(f"{what}: injected by hand at sample {self.ring.end}", self.ring.end)
                 self.notes.disturb(self.ring.end, what, lasts=False)
                 self.notify(f"{LINE_LABELS[each.kind]}, {each.direction} the device: at sample {self.ring.end}")
 
@@ -564,12 +575,17 @@ class LiveSession:
             concluded.samples,
             len(concluded.alarm_index),
             self.take.false_alarms(concluded),
+            bool(concluded.conditions.faults),
         )
         self.saved.append(saved)
         held = f"{number_of(run.samples, 'sample', form=',')}, {number_of(saved.alarms, 'alarm')}"
         if saved.false_alarms:
             held += f", {saved.false_alarms} of them without a change: allowed in the scenario"
-        self.notify(f"saved {saved.run}: {held}; scenario: {saved.scenario}")
+        if saved.is_faulty:
+            held += ". It holds an injected fault, or a failure: its verdict will be INCONCLUSIVE"
+        self.notify(f"saved {saved.run}: {held}")
+        if self._on_saved is not None:
+            self._on_saved(saved)
 
     def _reserve_number(self) -> int:
         """Number of the next recording; its scenario is created, so that no other bench takes it.
@@ -589,7 +605,8 @@ class LiveSession:
     def _stop_after(self, reason: str) -> None:
         """Pause after a failure."""
         self.link_counters = dict(self.device.link_counters)
-        self.is_playing, self._steps, self.is_recording, self._has_failed = False, 0, False, True
+        self.is_playing, self._steps, self.is_recording = False, 0, False
+        self.failure = reason or "the device has failed"
         self._forget_times()
         self.notify(f"stopped: {reason}")
 
@@ -604,5 +621,5 @@ class LiveSession:
         except AnalogrigError as error:
             self._stop_after(str(error))
         else:
-            self._has_failed = False
+            self.failure = ""
             self.notify("the device runs again")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -39,6 +40,8 @@ class Take:
     changes: list[PotChange] = field(default_factory=list)
     caveats: list[str] = field(default_factory=list)
     """Reasons that its recording cannot be judged."""
+    faulty_from: float = math.inf
+    """First sample that an injected fault may spoil."""
 
     def change(self, sample: int, values: Mapping[str, float], ramp_n: int) -> None:
         """Note a change of parameters after a sample."""
@@ -52,8 +55,9 @@ class Take:
             oldest = self.changes.pop(0)
             self.scenario = self.scenario.with_plant(self.scenario.plant.changed(oldest.set))
 
-    def add_caveat(self, reason: str) -> None:
-        """Note a reason that the recording cannot be judged."""
+    def add_caveat(self, reason: str, sample: int) -> None:
+        """Note a reason that the recording cannot be judged, and the first sample that it concerns."""
+        self.faulty_from = min(self.faulty_from, sample)
         if self.is_recorded and len(self.caveats) < MAX_CHANGES:
             self.caveats.append(reason)
 
@@ -62,8 +66,9 @@ class Take:
         return segments_of(self.scenario.plant, self.changes)
 
     def false_alarms(self, run: Run) -> int:
-        """Number of alarms of its run that no change explains."""
-        alarms, segments = run.alarm_index.tolist(), self.segments()[1:]
+        """Number of alarms of its run before any injected fault that no change explains."""
+        alarms = [k for k in run.alarm_index.tolist() if k < self.faulty_from]
+        segments = self.segments()[1:]
         ends = [*(segment.start for segment in segments[1:]), run.samples]
         explained = [
             alarms_of_change([k for k in alarms if segment.start < k <= end], segment.start + segment.ramp_n)

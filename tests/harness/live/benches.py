@@ -22,7 +22,7 @@ from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.live.commands import Command
 from analogrig.live.server import BenchServer
-from analogrig.live.session import LiveSession
+from analogrig.live.session import LiveSession, Saved
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.scenario import Scenario
@@ -95,11 +95,13 @@ def scripted_session(
     scenario: Scenario | None = None,
     rig: str | Rig = "emulator",
     dut: Device | None = None,
+    on_saved: Callable[[Saved], None] | None = None,
 ) -> LiveSession:
     """Session that has played a script to its end; time is that of the machine. The device is closed."""
     clock = ScriptedClock(script)
     with open_rig(rig) if isinstance(rig, str) else rig as opened, dut or describe("inproc").direct() as device:
-        session = LiveSession(opened, scenario or Scenario.load("thesis"), device, SEED, folder=folder, clock=clock)
+        played = scenario or Scenario.load("thesis")
+        session = LiveSession(opened, played, device, SEED, folder=folder, clock=clock, on_saved=on_saved)
         clock.session = session
         session.run()
     return session
@@ -162,14 +164,16 @@ class LiveBench:
 
 @contextmanager
 def benched(*options: str, folder: Path) -> Iterator[Any]:
-    """Address and token of a running command; it is ended by SIGTERM."""
+    """Address and token of a running command. It is ended by SIGTERM; ``output`` is what it has printed until then."""
     command = [sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--json", "--out", str(folder), *options]
+    bench = SimpleNamespace()
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             address = json.loads(process.stdout.readline())["address"]
-            yield SimpleNamespace(address=address, token=address.rpartition("=")[2])
+            bench.address, bench.token = address, address.rpartition("=")[2]
+            yield bench
         finally:
             process.send_signal(signal.SIGTERM)
-            errors = process.communicate()[1]
+            bench.output, errors = process.communicate()
     assert (process.returncode, errors) == (130, "analogrig: interrupted\n")

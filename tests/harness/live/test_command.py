@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -88,6 +89,20 @@ def test_bench_with_a_device_that_hangs_says_so_and_ends_at_a_later_signal(tmp_p
         assert "another signal ends the process" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait() == -signal.SIGINT
+
+
+def test_recording_under_way_is_saved_and_named_when_the_command_ends(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with open_client(bench) as socket:
+            client = Client(socket)
+            assert await client.ask("record", on=True) == ""
+            await client.until(lambda state: state["recording"] and state["samples"] > 500)
+
+    with benched(folder=tmp_path) as bench:
+        played(work)
+    saved = json.loads(bench.output)
+    assert saved == {"saved": str(tmp_path / "recording-1.npz"), "scenario": str(tmp_path / "recording-1.toml")}
+    assert Run.load(Path(saved["saved"])).samples > 500
 
 
 def test_recording_cannot_be_operated_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -39,6 +39,16 @@ def opened(browser: Browser, bench: BenchServer) -> Iterator[Watched]:
     watched.page.close()
 
 
+COUNT_IN_LINE = """(canvas, [r, g, b, height]) => {
+    const { width } = canvas;
+    const { data } = canvas.getContext("2d").getImageData(0, Math.round(height * canvas.height) - 2, width, 5);
+    let count = 0;
+    for (let i = 0; i < data.length; i += 4) count += data[i] === r && data[i + 1] === g && data[i + 2] === b;
+    return count;
+}"""
+"""Number of pixels of a colour about a horizontal line."""
+
+
 def opened_at(browser: Browser, bench: Any) -> Watched:
     """Page of anything with an address."""
     watched = Watched(browser, bench.address)
@@ -68,6 +78,9 @@ def test_scope_moves_without_a_fault_or_a_request_elsewhere(opened: Watched, ben
     assert opened.page.locator("#curves").evaluate(COUNT_PIXELS, [0, 114, 178]) > 100
     expect(opened.page.locator("#triggered")).to_have_text("triggered")
     expect(opened.page.locator('tr[data-signal="force"]')).to_contain_text("200 Hz")
+    named = opened.page.locator("select:visible, [role=group]:visible")
+    names = named.evaluate_all("all => all.map((each) => each.ariaLabel ?? each.labels[0]?.firstChild.data.trim())")
+    assert len(set(names)) == len(names)
     assert opened.requests == [bench.address]
     assert opened.faults() == []
 
@@ -89,7 +102,7 @@ def test_pot_turned_by_the_keyboard_raises_an_alarm_within_twice_its_bound(opene
     assert (take, change) == ("2", "K")
     assert int(sample) == 1699 + int(latency)
     assert 0 < int(latency) <= 2 * int(bound)
-    expect(page.locator("#alarm")).to_contain_text(f"K changed: alarm {latency} samples later")
+    expect(page.locator("#alarm")).to_contain_text(f"K changed {latency} samples before, best possible {bound}")
     curves, axes = (page.locator(each).bounding_box() for each in ("#curves", ".u-over"))
     assert curves is not None
     assert curves == pytest.approx(axes, abs=0.5)
@@ -101,6 +114,8 @@ def test_recording_made_on_the_page_replays_with_the_same_alarms(
     page = opened.page
     page.get_by_role("button", name="Record").click()
     expect(page.get_by_role("button", name="End the recording")).to_be_visible()
+    for refused in ("#restart", "#generator-on", "[data-key=shape]", "[data-mode=HOLD]"):
+        expect(page.locator(refused)).to_be_disabled()
     page.wait_for_function(
         "() => Number(document.getElementById('clock').textContent.match(/(\\d+) samples/)[1]) > 2000"
     )
@@ -109,6 +124,14 @@ def test_recording_made_on_the_page_replays_with_the_same_alarms(
     page.get_by_role("button", name="End the recording").click()
     expect(page.locator("#notices")).to_contain_text("analogrig replay")
     (saved,) = bench.session.saved
+    expect(page.locator("#replay")).to_have_text(f"analogrig replay {saved.run}")
+    expect(page.locator("#rerun")).to_have_text(f"analogrig run --scenario {saved.scenario}")
+    expect(page.locator("#alarm")).to_contain_text("no alarm in this take (last one: take 2, sample")
+    page.locator("#copy-replay").click()
+    expect(page.locator("#copy-replay")).to_have_text("Copied")
+    assert page.evaluate("getSelection().toString()") == f"analogrig replay {saved.run}"
+    page.get_by_role("button", name="Close").click()
+    expect(page.locator("#saved")).to_be_hidden()
     recorded = Run.load(saved.run)
     assert len(recorded.alarm_index) >= 1
     cli.main(["replay", str(saved.run), "--out", str(tmp_path / "again")])
@@ -137,9 +160,18 @@ def test_pots_turn_by_wheel_drag_and_number(opened: Watched, bench: BenchServer)
     page.wait_for_function("(most) => document.querySelector('[data-parameter=K]').ariaValueNow < most", arg=before)
     page.wait_for_function("() => document.querySelector('#felt').textContent !== '–'")
     assert values["K"] < 19802
+    trouble = page.locator("#trouble")
     page.locator(".knob").filter(has=knob).locator("input").fill("1e9")
     page.keyboard.press("Enter")
     expect(knob).to_have_attribute("aria-valuenow", "29000")
+    expect(trouble).to_have_text("K: limited to 15000 … 29000 N/m")
+    page.get_by_label("Frequency").fill("1e9")
+    page.keyboard.press("Enter")
+    expect(trouble).to_contain_text("Frequency")
+    expect(trouble).not_to_contain_text("frequency_hz")
+    page.locator(".knob").filter(has=knob).locator("input").fill("28000")
+    page.keyboard.press("Enter")
+    expect(trouble).to_be_empty()
 
 
 def test_modes_faults_generator_and_probes_are_at_hand(opened: Watched, bench: BenchServer) -> None:
@@ -156,9 +188,30 @@ def test_modes_faults_generator_and_probes_are_at_hand(opened: Watched, bench: B
     page.get_by_role("button", name="probe U3").click()
     expect(page.locator('tr[data-signal="U3"]')).to_be_visible()
     page.get_by_role("button", name="probe U2").press("Enter")
-    expect(page.locator('tr[data-signal="U2"]')).not_to_contain_text("–")
+    expect(page.locator('tr[data-signal="U2"] .number').first).not_to_have_text("–")
     page.get_by_role("button", name="Switch off").click()
     expect(page.locator("#role")).to_contain_text("generator is off")
+    assert opened.complaints == []
+
+
+def test_trigger_that_does_not_come_is_told_and_shown_at_once(opened: Watched) -> None:
+    page, told = opened.page, opened.page.locator("#triggered")
+    colour = [204, 121, 167]  # of the displacement, whose values end at 6 V
+    page.locator("#source").select_option("displacement")
+    page.locator("#mode").select_option("normal")
+    page.locator("#level").fill("8")
+    page.keyboard.press("Enter")
+    expect(told).to_have_text("waiting for a trigger: the level is above all values of displacement")
+    assert page.locator("#curves").evaluate(COUNT_IN_LINE, [*colour, 0.1]) > 50  # 8 V of -10 to 10
+    page.locator("#mode").select_option("single")
+    expect(told).to_have_text("armed: the level is above all values of displacement")
+    page.locator("#level").fill("3")
+    page.keyboard.press("Enter")
+    expect(told).to_have_text("stopped after a single shot")
+    page.locator("#mode").select_option("auto")
+    expect(told).to_have_text("triggered")
+    page.get_by_role("button", name="Pause").click()
+    expect(told).to_have_text("newest samples, the last one at the right")
     assert opened.complaints == []
 
 
@@ -179,7 +232,9 @@ def test_spectrum_xy_persistence_and_cursors(opened: Watched) -> None:
     )
     assert painted > 1000
     page.get_by_label("Units").select_option("problem")
-    expect(page.locator('tr[data-signal="displacement"]')).to_contain_text(" m")
+    expect(page.locator('tr[data-signal="displacement"] td').first).to_have_text("m")
+    page.get_by_label("Display").select_option("yt")
+    expect(page.get_by_label("force: per division")).to_have_value("500")  # N
     assert opened.complaints == []
 
 
@@ -209,7 +264,7 @@ def test_page_connects_again_when_the_server_has_been_restarted(browser: Browser
     with LiveBench(tmp_path, token=TOKEN, port=port):
         page.wait_for_selector("html[data-connected]")
         wait_for_frames(page, frames_of(page) + 3)
-        expect(page.locator("#trouble")).to_be_hidden()
+        expect(page.locator("#trouble")).to_be_empty()
         page.close()
 
 
@@ -244,12 +299,14 @@ def test_cut_line_is_reported_and_mended(browser: Browser, tmp_path: Path) -> No
         page = watched.page
         page.locator("#line-fault").select_option("disconnect")
         page.get_by_role("button", name="Inject into the next frame").click()
-        expect(page.locator("#notice")).to_contain_text("the line is cut")
+        expect(page.locator("#failure")).to_contain_text("the line is cut")
+        expect(page.locator("#failure")).to_contain_text("Mend the line, then press Run.")
         expect(page.locator("#line-faults")).to_have_text("in force: disconnect")
         page.get_by_role("button", name="Mend the line").click()
         expect(page.locator("#line-faults")).to_be_empty()
         page.get_by_role("button", name="Run", exact=True).click()
         expect(page.locator("#clock")).to_contain_text("take 2, ")
+        expect(page.locator("#failure")).to_be_empty()
         expect(page.locator("#frames")).not_to_have_text("–")
         assert watched.complaints == []
         page.close()

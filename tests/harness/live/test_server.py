@@ -69,12 +69,13 @@ class Client:
         return self.state
 
     async def frame(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Next frame."""
+        """Next frame with a picture."""
         while True:
             message = await self.socket.recv()
             if isinstance(message, bytes):
                 header, values = unpacked(message)
-                return header, dict(values)
+                if "waiting" not in header:
+                    return header, dict(values)
 
 
 def open_client(server: BenchServer, path: str = "/live", **more: Any) -> Any:

@@ -41,7 +41,7 @@ from analogrig.live.desk import RECORD_N, SteppedDesk
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.panel import bench_table, state_table
 from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
-from analogrig.live.session import BLOCK_S, LiveSession
+from analogrig.live.session import ANOTHER_MODE, BLOCK_S, LiveSession, Saved
 from analogrig.live.take import MOST_KEPT_CHANGES, Take
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
@@ -49,6 +49,7 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Performance
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig.wording import counter_text
 from analogrig_emulator import SuspensionComputer
 from tests import tools
 from tests.harness.live.benches import SEED, Action, RecordsRig, linked, scripted_session
@@ -450,9 +451,9 @@ def test_command_beyond_the_limits_of_the_rig_is_refused_and_changes_nothing(
     assert session.ring.place[0] == 1
 
 
-def test_generator_and_mode_cannot_change_within_a_recording(tmp_path: Path) -> None:
+def test_generator_mode_and_start_cannot_change_within_a_recording(tmp_path: Path) -> None:
     def refuse(session: LiveSession) -> None:
-        for command in (Generate(high_v=5.0), Operate("HOLD")):
+        for command in (Generate(high_v=5.0), Operate("HOLD"), Restart()):
             with pytest.raises(ConfigurationError, match="within a recording"):
                 session.do(command)
 
@@ -528,7 +529,8 @@ def test_state_reads_no_counters_of_the_device_that_another_thread_writes(
             states.append(state_table(session))
 
     session = scripted_session(((0.02, Spoil("flip", "from")), (0.1, note)), tmp_path, dut=linked())
-    assert states[0]["link_counters"] == {k: v for k, v in session.device.link_counters.items() if v} != {}
+    counted = [counter_text(count, name) for name, count in session.device.link_counters.items() if count]
+    assert states[0]["link_counters"] == counted != []
 
 
 def test_lasting_line_fault_from_before_the_recording_makes_it_inconclusive(tmp_path: Path) -> None:
@@ -623,7 +625,7 @@ def test_single_shot_shows_the_first_trigger_after_it_was_armed_in_every_view(tm
 
     def shoot(session: LiveSession) -> None:
         frame = screen.frame(session)
-        shots.append(None if frame is None else unpacked(frame)[0])
+        shots.append({} if frame is None else unpacked(frame)[0])
 
     def show(samples: int) -> Callable[[LiveSession], None]:
         return lambda _: screen.change(replace(view, samples=samples))
@@ -631,9 +633,47 @@ def test_single_shot_shows_the_first_trigger_after_it_was_armed_in_every_view(tm
     script: tuple[Action, ...] = (SetPlaying(on=False), show(40), shoot, Step(250), shoot, show(80), shoot, shoot)
     session = scripted_session([(0.1 + 0.1 * i, each) for i, each in enumerate(script)], tmp_path)
     armed = session.ring.end - 250
-    assert [shot is not None for shot in shots] == [False, True, True, False]
+    assert ["trigger" in shot for shot in shots] == [False, True, True, False]
+    assert shots[0]["waiting"] == pytest.approx([0.1, 9.9], abs=0.03)  # the force
     assert armed <= shots[1]["trigger"] < armed + 100 + 1  # a period of the force
     assert (shots[2]["trigger"], shots[2]["samples"]) == (shots[1]["trigger"], 80)
+
+
+def test_screen_that_lags_rolls(tmp_path: Path) -> None:
+    """While paused, and if it takes a second or more, the newest samples are shown."""
+    screen = Screen()
+    screen.change(View(("force",), Trigger("force", level=5.0), samples=400))
+    shown: list[tuple[bool, bool]] = []
+
+    def show(session: LiveSession) -> None:
+        frame = screen.frame(session)
+        assert frame is not None
+        header, _ = unpacked(frame)
+        shown.append((header["rolls"], header["first"] + 400 == session.ring.end))
+
+    slow, slower = (0.1, Tempo(40.0)), (0.2, Tempo(50.0))
+    script = ((0.1, show), slow, (0.2, show), slower, (0.5, show), (0.5, SetPlaying(on=False)), (0.6, show))
+    session = scripted_session(script, tmp_path)
+    assert session.ring.end > 2000
+    assert shown == [(False, False), (False, False), (True, True), (True, True)]
+
+
+def test_alarms_of_another_mode_are_not_called_false(tmp_path: Path) -> None:
+    script = ((0.05, Operate("HOLD")), (0.1, Operate("OPERATE")), (0.2, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path)
+    assert session.notes.alarms
+    assert {alarm.fault for alarm in session.notes.alarms} == {ANOTHER_MODE}
+
+
+def test_recording_with_an_injected_fault_says_that_it_cannot_be_judged(tmp_path: Path) -> None:
+    told: list[Saved] = []
+    script = ((0.0, SetRecording(on=True)), (0.05, Inject("stuck", on=True)), (0.1, SetRecording(on=False)))
+    (saved,) = scripted_session(script, tmp_path, on_saved=told.append).saved
+    assert told == [saved]
+    assert saved.is_faulty
+    assert saved.alarms > saved.false_alarms == 0
+    assert Scenario.load(str(saved.scenario)).expect.false_alarms == 0
+    assert cli.main(["judge", str(saved.run), "--out", str(tmp_path / "judged")]) == 3
 
 
 @pytest.mark.parametrize(

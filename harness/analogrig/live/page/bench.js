@@ -4,7 +4,7 @@
   const COLOURS = ["first", "second", "third", "truth", "missing", "false", "ink"];
   const BASES_S = [0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2];
   const DIVISIONS = 5; // above and below the middle
-  const SCALES = [1, 2, 2.5, 5];
+  const STEPS = [1, 2, 5, 10]; // of scales, in each decade
   const SPECTRUM = { per: 20, middle: -60 }; // dB
   const WIDTH = 1; // of curves: wider ones take three times as long to draw without a graphics processor
   const KEPT = 12; // frames of the persistence
@@ -12,6 +12,9 @@
   const HAND_MS = 40; // time between two messages of a hand that turns a pot
   const RAMP_N = 16; // samples of its ramps: each takes the emulator as long as fifty of a pot that stands still
   const BEHIND_MS = 3000; // time for which the page warns that the bench has fallen behind real time
+  const SILENT_S = 3; // without an answer, of which the page tells
+  const NOTICE_MS = 15000; // time for which a message stays at the bottom: the list keeps it
+  const PATCH_WIDTH = 560;
   const SVG = "http://www.w3.org/2000/svg";
   const $ = (id) => document.getElementById(id);
   const ink = plotting.inks();
@@ -20,22 +23,26 @@
   let bench = null;
   let state = null;
   let frame = null;
+  let waiting = null; // range of the source while the trigger has not come
   let frames = 0; // that were drawn
   let isDue = false; // true until the last frame is drawn
   let measures = null; // that were not shown yet
   let shown = [];
   let current = "";
-  const scales = new Map(); // of each signal: volts per division, and volts at the middle
+  const scales = new Map(); // of each signal in each choice of units: volts per division, and volts at the middle
   let plot = null; // axes and grid, drawn when they change; the curves are drawn above it
   let plotKey = "";
   let size = { width: 800, height: 420 }; // of the screen: asking the page for it would lay it out anew
   let known = {}; // last measures of each signal
-  let behind = { samples: 0, until: 0 };
+  let behind = { samples: 0, until: 0, factor: 1 };
   let kept = [];
   let arm = 0;
   let level = 0; // of the trigger, in volts or in the device's own numbers
   let number = 0;
-  const views = new Set(); // numbers of views that are not answered; their answers leave an error in sight
+  const views = new Set(); // numbers of views that are not answered
+  let isOfView = false; // true if the error in sight is that of a view
+  let notice = { number: 0, until: 0 };
+  let closed = ""; // recording whose commands the hand has put away
   const knobs = new Map();
   const voltages = new Map(); // texts of the patch by amplifier
   const settings = document.querySelectorAll("#generator [data-key]");
@@ -43,6 +50,7 @@
     ".bar button, .bar select, #generator button, #generator [data-key], #modes button, #fault-section button, " +
     "#fault-section select, #clear-lamps";
   let operated = document.querySelectorAll(OPERATED); // what only the page that drives can operate
+  const FIXED = "#restart, #generator button, #generator [data-key], #modes button"; // within a recording
 
   // ---- messages
 
@@ -54,12 +62,14 @@
     socket.onclose = () => {
       document.documentElement.removeAttribute("data-connected");
       leave();
+      put($("failure"), "");
       complain("The bench does not answer. Trying again; if it was started anew, open the address that it prints.");
       setTimeout(connect, RETRY_MS);
     };
   }
 
   function send(name, table = {}) {
+    if (name !== "view") complain("");
     if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ do: name, id: ++number, ...table }));
     return number;
   }
@@ -68,7 +78,7 @@
     if (message.bench) {
       views.clear();
       bench = message.bench;
-      behind = { samples: Infinity, until: 0 };
+      behind = { samples: Infinity, until: 0, factor: 0 };
       complain("");
       build();
       look();
@@ -79,14 +89,22 @@
     } else {
       for (const knob of knobs.values()) knob.answered(message.re);
       const isView = views.delete(message.re);
-      if (message.error || !isView) complain(message.error ?? "");
+      if (message.error) complain(named(message.error), isView);
+      else if (isView && isOfView) complain("");
       if (message.error && state) show();
     }
   }
 
-  function complain(text) {
-    $("trouble").textContent = text;
-    $("trouble").hidden = !text;
+  function complain(text, ofView = false) {
+    put($("trouble"), text);
+    isOfView = ofView;
+  }
+
+  // An error with the names of this page instead of those of the commands.
+  function named(error) {
+    let text = error.replace(/^(excitation|generate): /, "Generator: ");
+    for (const each of settings) text = text.replaceAll(each.dataset.key, each.parentElement.firstChild.data.trim());
+    return text;
   }
 
   // ---- numbers
@@ -124,12 +142,21 @@
 
   function reading(id, value) {
     const unit = unitOf(id);
-    return value === null ? "–" : `${short(value * factorOf(id))}${unit ? ` ${unit}` : ""}`;
+    return `${rounded(id, value)}${unit && value !== null ? ` ${unit}` : ""}`;
+  }
+
+  // Text of a value with the decimals that its signal resolves.
+  function rounded(id, value) {
+    if (value === null) return "–";
+    const decimals = Math.max(0, Math.ceil(-Math.log10(signal(id).resolution * factorOf(id))));
+    if (decimals > 6) return short(value * factorOf(id));
+    return Number((value * factorOf(id)).toFixed(decimals)).toFixed(decimals); // twice: no minus before zero
   }
 
   function scaleOf(id) {
-    if (!scales.has(id)) scales.set(id, { per: signal(id).group === "device" ? 0 : 2.5, middle: 0 });
-    return scales.get(id);
+    const key = `${$("units").value} ${id}`;
+    if (!scales.has(key)) scales.set(key, { per: signal(id).group !== "device" && unitOf(id) === "V" ? 2 : 0, middle: 0 });
+    return scales.get(key);
   }
 
   function colourOf(id) {
@@ -246,6 +273,7 @@
       head.append(swatch, name, " ", remove);
       row.append(head);
       row.setAttribute("aria-current", String(id === current));
+      cell(row, unitOf(id));
       cell(row, "").append(field(id, "per", `${label}: per division`));
       cell(row, "").append(field(id, "middle", `${label}: at the middle`));
       for (let i = 0; i < 6; i++) cell(row, "–", "number");
@@ -321,6 +349,9 @@
         const value = Number(this.input.value);
         if (this.input.value !== "" && Number.isFinite(value)) this.turn(value);
         else this.input.value = short(this.value, 6);
+        if (value < knob.low || value > knob.high) {
+          complain(`${name}: limited to ${short(knob.low)} … ${short(knob.high)} ${unit}`.trimEnd());
+        }
       };
     }
 
@@ -431,7 +462,7 @@
       const height = 30 * Math.max(1, row.inputs.length);
       const label = `${row.name}, ${row.kind}${row.quantity ? `, ${row.quantity}` : ""}`;
       const group = svg(drawing, "g", { role: "button", tabindex: 0, "data-probe": row.name, "aria-label": `probe ${label}` });
-      svg(group, "rect", { x: 0, y: y - 6, width: 620, height: height + 12, fill: "transparent" });
+      svg(group, "rect", { x: 0, y: y - 6, width: PATCH_WIDTH, height: height + 12, fill: "transparent" });
       row.inputs.forEach((input, i) => {
         const middle = y + 30 * i + 15;
         svg(group, "text", { x: 8, y: middle + 4 }, input.node);
@@ -447,7 +478,7 @@
       svg(group, "path", { class: "wire", d: `M310 ${y + height / 2}H340` });
       svg(group, "text", { x: 248, y: y + height / 2 + 4, class: "small" }, row.name);
       svg(group, "text", { x: 348, y: y + height / 2 + 4 }, `${row.node}${row.quantity ? `: ${row.quantity}` : ""}`);
-      voltages.set(row.name, svg(group, "text", { x: 540, y: y + height / 2 + 4, "text-anchor": "end" }, "–"));
+      voltages.set(row.name, svg(group, "text", { x: PATCH_WIDTH - 8, y: y + height / 2 + 4, "text-anchor": "end" }, "–"));
       group.onclick = () => toggle(row.name);
       group.onkeydown = (event) => {
         if (event.key !== "Enter" && event.key !== " ") return;
@@ -456,8 +487,7 @@
       };
       y += height + 18;
     }
-    drawing.setAttribute("width", 620);
-    drawing.setAttribute("height", y);
+    drawing.setAttribute("viewBox", `0 0 ${PATCH_WIDTH} ${y}`);
   }
 
   // ---- the state
@@ -476,18 +506,20 @@
     const off = state.generator.on ? "" : " The generator is off: switch it on.";
     const watches = state.driven ? "This page watches: another one drives." : "Nobody drives the bench.";
     put($("role"), drives ? `This page drives the bench.${off}` : watches);
-    const now = performance.now();
-    behind = { samples: state.overruns, until: state.overruns > behind.samples ? now + BEHIND_MS : behind.until };
-    $("behind").hidden = now > behind.until;
+    showBehind();
     $("drive").hidden = state.driven;
     document.documentElement.dataset.role = drives ? "drives" : "watches";
     for (const each of operated) each.disabled = !drives;
     if (!bench.stepped) $("tempo").disabled = true;
+    for (const each of document.querySelectorAll(FIXED)) {
+      each.disabled ||= state.recording;
+      each.title = state.recording ? "end the recording first: it is one scenario" : "";
+    }
     pressed($("play"), state.playing, state.playing ? "Pause" : "Run");
     pressed($("record"), state.recording, state.recording ? "End the recording" : "Record");
     pressed($("generator-on"), state.generator.on, state.generator.on ? "Switch off" : "Switch on");
     if (document.activeElement !== $("tempo")) $("tempo").value = String(state.factor);
-    put($("clock"), `take ${state.take}, ${withPrefix(state.samples / state.rate, "s")}, ${state.samples} samples`);
+    put($("clock"), `take ${state.take}, ${withPrefix(state.samples / state.rate, "s")}, ${samples(state.samples)}`);
     for (const [name, knob] of knobs) {
       knob.disable(!drives);
       if (!knob.held && !knob.awaited && state.values[name] !== undefined) knob.show(state.values[name]);
@@ -495,12 +527,15 @@
     for (const each of settings) {
       const value = state.generator[each.dataset.key];
       if (document.activeElement !== each) each.value = typeof value === "number" ? short(value, 6) : value;
-      if (each.dataset.key === "duty") each.disabled ||= state.generator.shape !== "pulse";
+      if (each.dataset.key === "duty") {
+        each.disabled ||= state.generator.shape !== "pulse";
+        each.title ||= each.disabled ? "only pulses have a duty" : "";
+      }
     }
     for (const each of $("modes").children) each.setAttribute("aria-pressed", String(each.dataset.mode === state.mode));
     for (const each of $("faults").children) {
       const on = state.faults.includes(each.dataset.fault);
-      pressed(each, on, `${bench.faults[each.dataset.fault]}${on ? ": on" : ""}`);
+      pressed(each, on, bench.faults[each.dataset.fault]);
     }
     put($("line-faults"), state.line_faults.length ? `in force: ${state.line_faults.join(", ")}` : "");
     put($("lamps"), state.lamps.length ? state.lamps.join(", ") : "none");
@@ -509,10 +544,57 @@
       if (voltages.has(name)) put(voltages.get(name), `${volts.toFixed(2)} V`);
     }
     showDevice();
-    const notices = state.notices.map(([, text]) => text).reverse();
-    put($("notice"), notices[0] ?? "");
-    const files = state.saved.map(({ run }) => `analogrig replay ${run}`);
-    list($("notices"), [...notices, ...files.map((text) => `to play it again: ${text}`)]);
+    put($("failure"), failure());
+    showNotices();
+    showSaved();
+  }
+
+  // Failure of the device in one line, with its cure.
+  function failure() {
+    const { failure: reason, line_faults: faults, silent_s: silent } = state;
+    if (silent >= SILENT_S) return `The device has not answered for ${silent.toFixed(0)} s. If it hangs, end the bench in its terminal.`;
+    if (!reason) return "";
+    return `Stopped: ${reason}. ${faults.length ? "Mend the line, then press Run." : "Press Run to try again."}`;
+  }
+
+  function showBehind() {
+    const { overruns, factor, rates, rate, playing } = state;
+    const now = performance.now();
+    const fellBehind = overruns > behind.samples && factor === behind.factor; // the rate of another pace tells nothing
+    behind = { samples: overruns, until: fellBehind ? now + BEHIND_MS : behind.until, factor };
+    $("behind").hidden = !playing || now > behind.until;
+    const part = Math.min(100, Math.round((100 * rates.samples_hz * factor) / rate));
+    put($("behind"), `behind: ${part} % of ${factor === 1 ? "real time" : "the chosen pace"}`);
+  }
+
+  function showNotices() {
+    const notices = [...state.notices].reverse();
+    const [number, text] = notices[0] ?? [0, ""];
+    if (number !== notice.number) {
+      notice = { number, until: performance.now() + NOTICE_MS };
+      setTimeout(showNotices, NOTICE_MS + 1);
+    }
+    put($("notice"), performance.now() > notice.until ? "" : text);
+    const again = state.saved.flatMap(({ commands }) => commands.map((command) => `to play it again: ${command}`));
+    list($("notices"), [...notices.map(([, text]) => text), ...again]);
+  }
+
+  // Commands that play the last recording again.
+  function showSaved() {
+    const last = state.saved.at(-1);
+    $("saved").hidden = !last || state.recording || last.run === closed;
+    if (!last || last.run === $("saved").dataset.run) return;
+    $("saved").dataset.run = last.run;
+    for (const [i, id] of ["replay", "rerun"].entries()) {
+      put($(id), last.commands[i]);
+      put($(`copy-${id}`), "Copy");
+    }
+  }
+
+  async function copy(id) {
+    getSelection().selectAllChildren($(id)); // all that an address without a clipboard allows
+    await navigator.clipboard?.writeText($(id).textContent);
+    put($(`copy-${id}`), navigator.clipboard ? "Copied" : "Selected");
   }
 
   function pressed(button, on, text) {
@@ -530,7 +612,10 @@
   function showDevice() {
     const alarms = [...state.alarms].reverse();
     const [last] = alarms;
-    put($("alarm"), last ? `alarm at sample ${last.sample}: ${cause(last)}` : "no alarm yet");
+    const isPast = !last || last.take !== state.take;
+    const past = `no alarm in this take${last ? ` (last one: take ${last.take}, sample ${last.sample})` : ""}`;
+    put($("alarm"), isPast ? past : `alarm at sample ${last.sample}: ${cause(last)}`);
+    $("alarm").classList.toggle("past", isPast);
     rows($("alarms"), alarms, (row, alarm) => {
       cell(row, alarm.take);
       cell(row, alarm.sample, "number");
@@ -563,18 +648,18 @@
     put($("overruns"), state.overruns);
     put($("missing"), state.missing);
     put($("felt"), state.felt_ms === null ? "–" : `${state.felt_ms} ms`);
-    put($("link-counters"), counted(state.link_counters));
-    put($("counters"), counted(state.counters));
+    put($("link-counters"), state.link_counters.join(", ") || "none");
+    put($("counters"), state.counters.join(", ") || "none");
   }
 
   function cause({ what, again, fault, latency_n: latency, bound_n: bound }) {
-    if (what) return `${what} changed: alarm ${latency} samples later${bound === null ? "" : `, best possible ${bound}`}`;
+    if (what) return `${what} changed ${samples(latency)} before${bound === null ? "" : `, best possible ${bound}`}`;
     if (again) return `the change of ${again} again`;
-    return fault ? `injected fault: ${fault}` : "false alarm, no change explains it";
+    return fault ? `${fault}, no false alarm` : "false alarm, no change explains it";
   }
 
-  function counted(counters) {
-    return Object.entries(counters).map(([name, count]) => `${count} ${name.replaceAll("_", " ")}`).join(", ") || "none";
+  function samples(count) {
+    return `${count} sample${count === 1 ? "" : "s"}`;
   }
 
   function rows(table, items, fill) {
@@ -591,7 +676,7 @@
     if (!bench) return;
     const { limits } = bench;
     const within = (value, [low, high]) => Math.round(Math.min(high, Math.max(low, value)));
-    const samples = within(Number($("base").value) * bench.rate, limits.samples);
+    const count = within(Number($("base").value) * bench.rate, limits.samples);
     const trigger = {
       source: $("source").value,
       slope: $("slope").value,
@@ -610,12 +695,17 @@
     $("xy").hidden = kind !== "xy";
     $("cursor-panel").hidden = !$("cursors").checked || kind === "xy";
     $("screen").setAttribute("aria-label", kind === "fft" ? "Spectrum of the signals" : "Signals over time");
-    views.add(send("view", { signals: shown, samples, columns, kind, trigger, arm }));
+    views.add(send("view", { signals: shown, samples: count, columns, kind, trigger, arm }));
+    redraw();
   }
 
   function receiveFrame(buffer) {
     const length = new DataView(buffer).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+    waiting = header.waiting ?? null;
+    if (!isDue) requestAnimationFrame(redraw);
+    isDue = true;
+    if (waiting) return;
     const values = {};
     header.signals.forEach((id, i) => {
       values[id] = new Float32Array(buffer, 4 + length + 4 * i * header.points, header.points);
@@ -623,12 +713,11 @@
     frame = { ...header, values };
     measures = header.measures ?? measures;
     if ($("persist").checked) kept = [...kept.slice(1 - KEPT), frame];
-    if (!isDue) requestAnimationFrame(redraw);
-    isDue = true;
   }
 
   function redraw() {
     isDue = false;
+    put($("triggered"), triggering());
     if (!frame || !frame.signals.every((id) => shown.includes(id))) return;
     const fresh = frame.kind === "fft" ? [] : frame.signals.filter((id) => !scaleOf(id).per);
     fresh.forEach(fit);
@@ -637,19 +726,26 @@
     else drawPlot();
     if (measures) showMeasures();
     if (!$("cursor-panel").hidden) showCursors();
-    put($("triggered"), triggering());
     frames += 1;
     document.documentElement.dataset.frames = frames;
     if (frames === 1) document.documentElement.setAttribute("data-drawn", "");
   }
 
   function triggering() {
-    if (frame.kind === "fft") return "";
-    if (frame.trigger !== null) return "triggered";
-    const source = $("source").value;
-    const { min, max } = known[source] ?? {};
-    const side = level >= max ? "above" : level < min ? "below" : "";
-    return side ? `no trigger: the level is ${side} all values of ${signal(source).label}` : "no trigger";
+    const isSingle = $("mode").value === "single";
+    if ($("kind").value === "fft") return "";
+    if (waiting) return `${isSingle ? "armed" : "waiting for a trigger"}${beside(...waiting)}`;
+    if (!frame) return "";
+    if (frame.rolls) return "newest samples, the last one at the right";
+    if (frame.trigger !== null) return isSingle ? "stopped after a single shot" : "triggered";
+    const { min, max } = known[$("source").value] ?? {};
+    return `no trigger${beside(min, max)}`;
+  }
+
+  // Note on a level that the source does not reach.
+  function beside(least, most) {
+    const side = level > most ? "above" : level <= least ? "below" : "";
+    return side ? `: the level is ${side} all values of ${signal($("source").value).label}` : "";
   }
 
   function fit(id) {
@@ -658,10 +754,11 @@
       if (Number.isFinite(value)) [low, high] = [Math.min(low, value), Math.max(high, value)];
     }
     if (low > high) return;
-    const least = Math.max(high - low, 0.02 * Math.abs(high), 1e-9) / 8;
+    const factor = factorOf(id);
+    const least = (Math.max(high - low, 0.02 * Math.abs(high), 1e-9) / 8) * factor;
     const decade = 10 ** Math.floor(Math.log10(least));
-    const per = [...SCALES, 10].map((step) => step * decade).find((step) => step >= least);
-    scales.set(id, { per, middle: Math.round((low + high) / 2 / per) * per });
+    const per = (STEPS.find((step) => step * decade >= least) * decade) / factor;
+    Object.assign(scaleOf(id), { per, middle: Math.round((low + high) / 2 / per) * per });
   }
 
   // Position of the first point on the x axis, distance of two points, and both ends of the axis.
@@ -670,7 +767,7 @@
       const pitch = of.per * of.step;
       return { start: 0, pitch, ends: [0, (of.points - 1) * pitch] };
     }
-    const before = of.trigger === null ? 0 : of.trigger - of.first;
+    const before = of.trigger === null ? of.points * of.per : of.trigger - of.first; // 0 ms is the trigger, or now
     const ms = 1000 / of.rate;
     const low = -Math.floor(before); // the axis stays where it is from frame to frame
     return { start: -before * ms, pitch: of.per * ms, ends: [low * ms, (low + of.points * of.per) * ms] };
@@ -683,7 +780,7 @@
   function drawPlot() {
     const { per, middle } = heightScale(frame, current);
     const { width, height } = size;
-    const key = [frame.kind, width, height, current, colourOf(current), per, middle, $("units").value, dark(), devicePixelRatio].join(";");
+    const key = [frame.kind, frame.trigger === null, width, height, current, colourOf(current), per, middle, $("units").value, dark(), devicePixelRatio].join(";");
     const { ends } = across(frame);
     if (key !== plotKey) {
       plotKey = key;
@@ -703,7 +800,7 @@
     const title = isSpectrum ? "dB of 1 V rms" : `selected: ${signal(current).label}${unit}`;
     const { per, middle } = heightScale(frame, current);
     const factor = isSpectrum ? 1 : factorOf(current);
-    const ticks = (_, splits) => splits.map((at) => short((at * per + middle) * factor, 3));
+    const ticks = (_, splits) => splits.map((at) => short((at * per + middle) * factor, 5));
     const vertical = Array.from({ length: 2 * DIVISIONS + 1 }, (_, i) => i - DIVISIONS);
     plot = new uPlot(
       {
@@ -713,7 +810,7 @@
         scales: { x: { time: false }, y: { range: [-DIVISIONS, DIVISIONS] } },
         series: [{}, {}],
         axes: [
-          plotting.axis("x", isSpectrum ? "frequency, Hz" : "time, ms", 2, ink, { size: 28, labelSize: 18 }),
+          plotting.axis("x", isSpectrum ? "frequency, Hz" : `time${frame.trigger === null ? " until now" : ""}, ms`, 2, ink, { size: 28, labelSize: 18 }),
           plotting.axis("y", title, 3, ink, { size: 70, splits: () => vertical, values: ticks }),
         ],
         hooks: { draw: [drawCurves] }, // it lays the axes out later
@@ -768,6 +865,7 @@
       context.lineTo(...to);
       context.stroke();
     };
+    if (frame.kind === "yt") frame.signals.forEach((id) => drawZero(context, id));
     const source = $("source").value;
     if (frame.kind === "yt" && frame.trigger !== null) {
       const x = Math.round((-low * width) / (high - low)) + 0.5;
@@ -785,6 +883,20 @@
       }
     }
     context.setLineDash([]);
+  }
+
+  // Mark at the height of zero, or at the edge beyond which it lies.
+  function drawZero(context, id) {
+    const { per, middle } = scaleOf(id);
+    const { height } = context.canvas;
+    const size = 5 * devicePixelRatio;
+    const wanted = height / 2 + (middle * height) / (2 * DIVISIONS) / per;
+    const y = Math.min(height - size, Math.max(size, wanted));
+    const points = { false: [[0, y - size], [2 * size, y], [0, y + size]], true: [[0, y], [2 * size, y], [size, wanted < y ? y - size : y + size]] };
+    context.fillStyle = ink(colourOf(id));
+    context.beginPath();
+    for (const point of points[String(wanted !== y)]) context.lineTo(...point);
+    context.fill();
   }
 
   function dark() {
@@ -812,13 +924,26 @@
     [canvas.width, canvas.height] = [canvas.clientWidth * px, canvas.clientHeight * px];
     const context = canvas.getContext("2d");
     const [x, y] = [frame.signals[0], frame.signals[1] ?? frame.signals[0]];
-    const size = Math.min(canvas.width, canvas.height);
+    const margin = 46 * px; // of the numbers
+    const size = Math.min(canvas.width, canvas.height) - 2 * margin;
     const place = (value, length, sign) => length / 2 + (sign * value * size) / (2 * DIVISIONS);
+    const number = (at, id) => short((at * scaleOf(id).per + scaleOf(id).middle) * factorOf(id), 5);
+    const title = (id) => `${signal(id).label}${unitOf(id) ? `, ${unitOf(id)}` : ""}`;
+    const [left, bottom] = [place(-DIVISIONS, canvas.width, 1), place(-DIVISIONS, canvas.height, -1)];
     context.strokeStyle = ink("line");
+    context.fillStyle = ink("muted");
+    context.font = `${12 * px}px system-ui, sans-serif`;
     for (let i = -DIVISIONS; i <= DIVISIONS; i++) {
-      context.strokeRect(place(i, canvas.width, 1), place(-DIVISIONS, canvas.height, 1), 0, size);
-      context.strokeRect(place(-DIVISIONS, canvas.width, 1), place(i, canvas.height, 1), size, 0);
+      context.strokeRect(place(i, canvas.width, 1), bottom - size, 0, size);
+      context.strokeRect(left, place(i, canvas.height, -1), size, 0);
+      context.textAlign = "center";
+      if (i % 2) context.fillText(number(i, x), place(i, canvas.width, 1), bottom + 16 * px);
+      context.textAlign = "right";
+      context.fillText(number(i, y), left - 6 * px, place(i, canvas.height, -1) + 4 * px);
     }
+    context.textAlign = "center";
+    context.fillText(title(x), canvas.width / 2, bottom + 34 * px);
+    context.fillText(title(y), left, bottom - size - 14 * px);
     for (const each of kept.length ? kept.filter(({ kind }) => kind === "xy") : [frame]) {
       const [h, v] = [x, y].map((id) => [...each.values[id]].map((value) => (value - scaleOf(id).middle) / scaleOf(id).per));
       context.globalAlpha = each === frame ? 1 : 0.25;
@@ -829,9 +954,6 @@
       context.stroke();
     }
     context.globalAlpha = 1;
-    context.fillStyle = ink("muted");
-    context.font = `${12 * px}px system-ui, sans-serif`;
-    context.fillText(`X ${signal(x).label}, Y ${signal(y).label}`, 8 * px, 16 * px);
   }
 
   function showMeasures() {
@@ -839,9 +961,9 @@
       const id = row.dataset.signal;
       const found = measures[id];
       if (!found) continue;
-      const texts = ["min", "max", "mean", "rms"].map((key) => reading(id, found[key]));
+      const texts = ["min", "max", "mean", "rms"].map((key) => rounded(id, found[key]));
       texts.push(withPrefix(found.frequency, "Hz"), found.overshoot === null ? "–" : `${(100 * found.overshoot).toFixed(1)} %`);
-      texts.forEach((text, i) => put(row.cells[3 + i], text));
+      texts.forEach((text, i) => put(row.cells[4 + i], text));
     }
     known = measures;
     measures = null;
@@ -860,6 +982,12 @@
     $("clear-lamps").onclick = () => send("clear lamps");
     $("spoil").onclick = () => send("spoil", { kind: $("line-fault").value, direction: $("line-direction").value });
     $("mend").onclick = () => send("mend");
+    $("copy-replay").onclick = () => copy("replay");
+    $("copy-rerun").onclick = () => copy("rerun");
+    $("close-saved").onclick = () => {
+      closed = $("saved").dataset.run;
+      $("saved").hidden = true;
+    };
     for (const each of settings) {
       each.onchange = () => {
         const value = each.type === "number" ? Number(each.value) : each.value;
@@ -881,7 +1009,6 @@
     $("units").onchange = () => {
       if (bench) buildSignals();
       look();
-      redraw();
     };
     $("add").onchange = () => $("add").value && toggle($("add").value);
     $("persist").onchange = () => {
