@@ -154,7 +154,7 @@ def toml_of(data: bytes, path: Path) -> dict[str, Any]:
     :raises ConfigurationError: they are not TOML.
     """
     try:
-        text = data.decode("utf-8")
+        text = data.decode("utf-8-sig")
         _check_nesting(text)
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number

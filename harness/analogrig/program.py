@@ -31,6 +31,7 @@ _KEYS_OF_CHANGES = ("sample", "set", "ramp_n")
 _DIAGNOSES = tuple(change.name.lower() for change in (Change.MASS, Change.DAMPING, Change.STIFFNESS))
 """Parameters in the diagnoses of a device."""
 
+
 @dataclass(frozen=True, repr=False)
 class Program:
     """Equations of a plant with its channels, scales and parameters; programs with equal files are equal.

@@ -216,10 +216,11 @@ class Scenario:
         driven = program.channels[0]
         volts = program.circuit.scales.volts(driven)
         low_v, high_v = (level * volts for level in program.equations.inputs[driven].trial)
-        name, row = next(iter(program.parameters.items()))
-        goals = (max(0.8 * row.value, row.low), min(1.2 * row.value, row.high))
-        goal = max(goals, key=lambda value: abs(value / row.value - 1.0))
-        tweaks = (PotChange(1000, {name: goal}),) if goal != row.value else ()
+        tweaks: tuple[PotChange, ...] = ()
+        for name, row in itertools.islice(program.parameters.items(), 1):
+            goals = (max(0.8 * row.value, row.low), min(1.2 * row.value, row.high))
+            goal = max(goals, key=lambda value: abs(value / row.value - 1.0))
+            tweaks = (PotChange(1000, {name: goal}),) if goal != row.value else ()
         excitation = Excitation(low_v=low_v, high_v=high_v)
         return cls(1500, excitation, program, tweaks=tweaks, random_phase=True, name=program.name)
 

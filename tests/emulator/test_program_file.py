@@ -267,6 +267,7 @@ BAD: dict[str, tuple[Change, str]] = {
         equation("omega' = (torque - (d - 1e-3)*omega) / J", without_units),
         "d - 0.001 is -0.0008 with d = 0.0002; a pot needs it positive",
     ),
+    "division by a zero after others": (equation("omega' = (torque - d*omega) / J / 0"), "line 3: a division by zero"),
     "division by zero": (equation("omega' = (torque - d*omega) / (0*J)"), "line 3: a division by zero"),
     "right side of zero": (equation("omega' = d*omega/J - omega*d/J"), "line 3: the right side is zero; delete"),
     "number of no value": (

@@ -83,6 +83,13 @@ def test_undetectable_change_is_named() -> None:
     )
 
 
+def test_change_within_the_warm_up_is_named() -> None:
+    run = made_run(np.zeros(800), [(0, FRONT), (400, SOFT)], theta=GOOD_THETA)
+    dut = {**run.conditions.dut, "estimator": {**run.conditions.dut["estimator"], "warm_up_n": 550}}
+    told = advised(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, dut=dut)))
+    assert "K at 400 changes within the device's warm-up of 550 samples" in told
+
+
 def test_implausible_estimate_is_named() -> None:
     assert "samples 0-799 describes no plant" in advised(made_run(LOADED, [(0, FRONT)]))
 

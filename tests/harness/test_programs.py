@@ -78,6 +78,26 @@ def test_any_program_is_played_and_judged(program: str) -> None:
     assert (ESTIMATES in verdict.not_judged) == (program != "front")
 
 
+@pytest.mark.parametrize(
+    ("flow", "linear"), [("q - l*p", True), ("max(q - 2e-3, 0) - l*p", False), ("q - l*p - n*p**2", False)]
+)
+def test_program_is_linear_by_its_elements_whatever_its_scales(flow: str, linear: bool) -> None:  # noqa: FBT001
+    """A vessel in Pa and m^3/s: between some Pa all three are straight."""
+    parameters = {"l": {"value": 2e-8, "range": [1e-8, 4e-8]}, "V": {"value": 1e-8, "range": [8e-9, 2e-8]}}
+    tables = {
+        "name": "vessel",
+        "speed": 100.0,
+        "channels": ["q", "p"],
+        "equations": f"p' = ({flow}) / V",
+        "inputs": {"q": {"full": 0.01, "trial": [0.0, 0.005]}},
+        "states": {"p": {}},
+        "parameters": parameters | ({"n": {"value": 2e-12}} if "n*" in flow else {}),
+    }
+    program = Program.of(tables, "here")
+    assert program.is_linear == linear
+    assert judge(played(Scenario.of_program(program))).outcome in {"passed", "failed"}
+
+
 @pytest.mark.parametrize("name", sorted({*config.names("programs")} - {"silverbox"}))  # measured data stand for it
 def test_example_scenario_of_every_program_is_judged(name: str) -> None:
     scenario = Scenario.load({"front": "thesis"}.get(name, name))

@@ -206,7 +206,7 @@ def _parsed(data: bytes) -> Equations:
     if len(data) > _MOST_BYTES:
         raise ProgramError(f"larger than {_MOST_BYTES} bytes")
     try:
-        return equations_of(tomllib.loads(data.decode()))
+        return equations_of(tomllib.loads(data.decode("utf-8-sig")))
     except UnicodeDecodeError as cause:
         raise ProgramError(f"is no UTF-8 text: byte {cause.start} does not fit; save it as UTF-8") from None
     except ValueError as cause:  # a TOMLDecodeError, or a number of too many digits

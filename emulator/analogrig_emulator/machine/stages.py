@@ -261,6 +261,8 @@ class _Builder:
             raise ProgramError(f"{self.place}: a division by zero")
         if len(below) == 1:
             ((factors, signals), number), *_ = below.items()
+            if number == 0.0:
+                raise ProgramError(f"{self.place}: a division by zero")
             inverse: _Terms = {(tuple((name, -power) for name, power in factors), ()): 1.0 / number}
             if not signals:
                 return self._product(above, inverse)

@@ -44,7 +44,10 @@ def _patch(arguments: argparse.Namespace) -> int:
     from analogrig.config import locate
     from analogrig.errors import ConfigurationError
     from analogrig.output import move_aside
+    from analogrig.program import Program
+    from analogrig.rigs.emulator import emulator_errors
     from analogrig.storage import replace_file
+    from analogrig_emulator import SuspensionComputer
     from analogrig_emulator.machine.compiler import load_program
     from analogrig_emulator.machine.drawing import patch_drawing
     from analogrig_emulator.machine.sheet import dials, scaling_sheet
@@ -59,6 +62,8 @@ def _patch(arguments: argparse.Namespace) -> int:
     for path in wanted:
         move_aside(path, [file])
     program = load_program(file)
+    with emulator_errors(f"{file}: "):
+        SuspensionComputer(Program.load(str(file)).circuit)  # refuses what a run would
     that = _that_sheet(program) if arguments.machine == "that" else None
     texts = {}
     if arguments.drawing is not None:

@@ -44,6 +44,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_noise_setting(run),
         *_edge_spacing(run),
         *_warm_up(run),
+        *_changes_in_warm_up(run, verdict),
         *_false_alarm_rate(verdict),
         *_undetectable_changes(verdict),
         *_implausible_estimates(verdict),
@@ -176,6 +177,16 @@ def _warm_up(run: Run) -> Iterator[str]:
             f"the device's warm-up of {number_of(warm_up_n, 'sample')} ends before edge {WARM_UP_EDGES} of the"
             " excitation: expect false alarms at the first edges; raise warm_up_n"
         )
+
+
+def _changes_in_warm_up(run: Run, verdict: Verdict) -> Iterator[str]:
+    sheet = run.datasheet
+    for tweak in verdict.tweaks:
+        if tweak.sample < sheet.warm_up_n and not sheet.armed:
+            yield (
+                f"{tweak.what} at {tweak.sample} changes within the device's warm-up of"
+                f" {number_of(sheet.warm_up_n, 'sample')}, which raises no alarm: change it later"
+            )
 
 
 def _excitation(run: Run) -> Excitation | None:

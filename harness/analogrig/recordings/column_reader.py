@@ -146,12 +146,18 @@ def read_text(path: Path, wanted: Sequence[str], skip_lines: int) -> tuple[list[
             if len(found[0]) == MAX_SAMPLES:
                 raise ColumnError(f"has more than {MAX_SAMPLES} samples")
             row = next(csv.reader([line], delimiter=delimiter))
+            if len(row) > len(names) and any(cell.strip() for cell in row[len(names) :]):
+                raise ColumnError(
+                    f"line {number} has {len(row)} cells, the first line {len(names)}: cells with decimal commas need"
+                    " another separator, such as semicolons"
+                )
             for place, column in zip(places, found, strict=True):
                 try:
                     column.append(_number(row[place], delimiter))
                 except (IndexError, ValueError):
-                    cell = repr(row[place][:40]) if place < len(row) else "no such cell"
-                    raise ColumnError(f"line {number}, column {names[place][:_MOST_NAME]}: {cell}") from None
+                    where = f"line {number}, column {names[place][:_MOST_NAME]}"
+                    why = f"{row[place][:40]!r} is no number" if place < len(row) else "the line has no such cell"
+                    raise ColumnError(f"{where}: {why}; mend or delete the line") from None
     return names, {name: np.frombuffer(column) for name, column in zip(wanted, found, strict=True)}
 
 

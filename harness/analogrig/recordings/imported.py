@@ -132,6 +132,8 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         values = columns[each.column] * each.scale + each.offset
         channels[name] = _channel(path, each, described.bits, values)
         codes[:, at], clipped[:, at] = _converted(values, channels[name], is_ranged=each.range is not None)
+        if clipped[:, at].all():
+            raise RecordingError(f"{path}: column {each.column}: no value lies within its range")
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), **dataclasses.asdict(described)}
     return _run(path, codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), scenario)
@@ -187,8 +189,11 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
     else:
         finite = np.abs(values[np.isfinite(values)])
         most = float(finite.max(initial=0.0)) / (1.0 - 2.0 / codes)  # the last code stands for the largest value
+        if not finite.size:
+            raise RecordingError(f"{path}: column {described.column}: holds no number")
         if not 1e-9 < most < 1e8:
-            raise RecordingError(f"{path}: column {described.column}: largest magnitude {most:g}: no signal; scale it")
+            where = f"{path}: column {described.column}"
+            raise RecordingError(f"{where}: largest magnitude {most:g}: must be 1e-9 to 1e8; scale it")
         low, high = -most, most
     return Channel(low, (high - low) / codes, described.unit, 1.0, 0.0, codes)
 

@@ -28,6 +28,8 @@ from analogrig_emulator import (
 
 SETTLING_N = 200
 """Samples at the beginning of a span that are played and not compared, by default: the machine starts from rest."""
+_LEAST_N = 100
+"""Usable samples of the output in a span."""
 
 MOST_FITS = 50
 """Largest number of steps of the fit."""
@@ -140,6 +142,11 @@ class RecordedPlant:
             lacking = first + int(u_clipped.argmax())
             raise ConfigurationError(f"sample {lacking}: the input is missing or clipped, and cannot be played")
         valid = ~y_clipped & (np.arange(end - first) >= settling_n)
+        if (count := np.count_nonzero(valid)) < _LEAST_N:
+            raise ConfigurationError(
+                f"samples {first} to {end}: {count} of the output are neither missing nor clipped after settling;"
+                f" a span needs {_LEAST_N}"
+            )
         return Span(first, end, u, y, valid)
 
     def simulate(self, values: Mapping[str, float], span: Span) -> NDArray[np.float64]:
