@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import socket
@@ -21,7 +22,7 @@ from analogrig.hardware.calibration.fit import calibrate
 from analogrig.hardware.instrument import DialChange
 from analogrig.hardware.lucidac import LucidacInstrument
 from analogrig.hardware.lucidac_connection import LucidacConnection
-from analogrig.hardware.lucidac_messages import protocol
+from analogrig.hardware.lucidac_messages import frame, protocol
 from analogrig.hardware.lucidac_patch import LinearPatch
 from analogrig.hardware.real import RealRig
 from analogrig.hardware.self_test import self_test
@@ -342,3 +343,27 @@ def test_data_of_another_form_is_refused(served: Served) -> None:
         with pytest.raises(RigError, match="sent"):
             connection._samples(pb.DaqData(**{**fields, **change}), 2)
     connection.close()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\0", "sent no message of this protocol; is a LUCIDAC at this address"),
+        (frame(protocol().MessageV1(id="of another")), "no answer within 0.5 s"),
+    ],
+    ids=["empty", "of another"],
+)
+def test_peer_that_sends_frames_without_end_is_given_up(content: bytes, message: str) -> None:
+    def flood() -> None:
+        with contextlib.suppress(OSError), listening.accept()[0] as client:
+            while True:
+                client.sendall(100 * content)
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=flood)
+        thread.start()
+        connection = LucidacConnection("127.0.0.1", listening.getsockname()[1], 0.5)
+        with pytest.raises(RigError, match=message):
+            connection.carrier()
+        connection.close()
+        thread.join()

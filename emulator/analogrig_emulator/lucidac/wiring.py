@@ -31,6 +31,7 @@ from analogrig_emulator.circuit.components import Components, Grade, MultiplierG
 from analogrig_emulator.circuit.nonlinear import Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
+from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.lucidac.configuration import (
     COEFFICIENT_STEPS,
     FAST,
@@ -38,6 +39,7 @@ from analogrig_emulator.lucidac.configuration import (
     FIRST_PORT_LANE,
     INTEGRATORS,
     OUTPUTS,
+    PORTS,
     Configuration,
     LucidacLane,
 )
@@ -99,6 +101,18 @@ class LucidacParts:
     adc_noise_lsb: float = 1.0
     cables: Mapping[str, int] = field(default_factory=lambda: {"square": 2, "sine": 3})
     writes_in_op: bool = False
+
+    def __post_init__(self) -> None:
+        steps = ("coefficient_steps", "gain_step", "offset_step", "multiplier_step", "overload", "full_scale")
+        for name in steps:
+            if not getattr(self, name) > 0:
+                raise CircuitError(f"{name} must be more than 0, not {getattr(self, name):g}")
+        for name in ("adc_gain", "adc_offset", "adc_noise_lsb"):
+            if not 0 <= getattr(self, name) < 1e6:
+                raise CircuitError(f"{name} must be at least 0 and below 1e6, not {getattr(self, name):g}")
+        ports = list(self.cables.values())
+        if not set(ports) <= set(range(PORTS)) or len(set(ports)) < len(ports):
+            raise CircuitError(f"cables: each in one of the ports 0 to {PORTS - 1}, not {ports}")
 
     def quantised(self, factor: float) -> float:
         """Coefficient that the converter of a lane gives."""

@@ -39,13 +39,10 @@ def add(commands: Any) -> None:
     )
     command.add_argument(
         "--rig",
-        default="emulator",
         metavar=RIG,
-        help="emulated rig: shipped name or .toml file, which may have a table [instrument] (default: %(default)s)",
+        help="emulated rig: shipped name or .toml file, which may have a table [instrument] (default: emulator)",
     )
-    command.add_argument(
-        "--program", metavar=PROGRAM, default="front", help="shipped name or .toml file (default: %(default)s)"
-    )
+    command.add_argument("--program", metavar=PROGRAM, help="shipped name or .toml file (default: front)")
     add_seed(command, default=None, shown="1995")
     command.add_argument(
         "--defect",
@@ -97,16 +94,21 @@ def _red_pitaya(arguments: argparse.Namespace, seed: int, clock: Clock | None) -
     from analogrig.hardware.simulator.server import Server
     from analogrig.program import Program
 
-    described = ServedDescription.load(arguments.rig, arguments.defect)
-    server = Server(described.set_up(Program.load(arguments.program), seed, clock))
+    program = Program.load(arguments.program or "front")
+    described = ServedDescription.load(arguments.rig or "emulator", arguments.defect)
+    server = Server(described.set_up(program, seed, clock))
     if described.unsupported:
         complain(f"{described.name}: the instrument has no {', '.join(described.unsupported)}", PASSED)
-    return server, {"rig": described.name, "program": arguments.program}
+    return server, {"rig": described.name, "program": arguments.program or "front"}
 
 
 def _lucidac(arguments: argparse.Namespace, seed: int, clock: Clock | None) -> tuple[TcpServer, dict[str, Any]]:
+    from analogrig.errors import ConfigurationError
     from analogrig.hardware.simulator.served_lucidac import LucidacServer, specimen
 
+    if arguments.rig or arguments.program:
+        option = "--rig" if arguments.rig else "--program"
+        raise ConfigurationError(f"{option}: a LUCIDAC gets its program from its client: leave out {option}")
     return LucidacServer(specimen(seed, arguments.defect), clock), {"rig": "lucidac", "program": ""}
 
 

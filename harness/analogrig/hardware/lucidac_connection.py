@@ -19,6 +19,11 @@ from analogrig.links.wire import Clock
 
 _MOST_ANSWER_BYTES = 1 << 20
 
+_MOST_SPARE = 10_000
+"""Samples beyond those asked for that a run may send."""
+
+_IS_IT_ONE = "is a LUCIDAC at this address?"
+
 _QUESTION_RATE_HZ = 1000
 _QUESTION_SAMPLES = (100, 1000, 10_000)
 """Lengths of runs during which a configuration is sent: the next one if the answer comes too late."""
@@ -47,7 +52,8 @@ class LucidacConnection:
     def ask_once(self, kind: str, **fields: Any) -> Any:
         """Send a command. Return the message that answers it, be it an error."""
         command_id = self._command(kind, **fields)
-        while (answer := self._next(kind, self._timeout_s)).id != command_id:
+        deadline_s = self._clock() + self._timeout_s
+        while (answer := self._next(kind, deadline_s)).id != command_id:
             pass
         return answer
 
@@ -82,9 +88,13 @@ class LucidacConnection:
         :raises RecordIncomplete: samples are missing.
         """
         values, ends, taken = np.empty((samples, channels)), np.zeros((samples, channels), np.bool_), 0
+        spare = samples + _MOST_SPARE
         for message in self._messages_of_run(samples, rate_hz, channels):
             if message.WhichOneof("kind") == "run_data_message":
                 part, at_end = self._samples(message.run_data_message.data, channels)
+                spare -= len(part)
+                if spare < 0:
+                    raise RigError(f"instrument {self.name}: sends more than the {samples} samples that were asked for")
                 count = min(len(part), samples - taken)
                 values[taken : taken + count], ends[taken : taken + count] = part[:count], at_end[:count]
                 taken += count
@@ -120,8 +130,12 @@ class LucidacConnection:
             ),
             daq_config=pb.DaqConfig(num_channels=channels, sample_rate=rate_hz, sample_op=True),
         )
+        within_s = self._timeout_s + op_ns * 1e-9
+        deadline_s = self._clock() + within_s
         while True:
-            message = self._next("the run", self._timeout_s + op_ns * 1e-9)
+            message = self._next("the run", deadline_s)
+            if message.WhichOneof("kind") == "run_data_message":
+                deadline_s = self._clock() + within_s
             yield message
             change = message.run_state_change_message
             if change.new_ == pb.RunState.ERROR:
@@ -176,30 +190,29 @@ class LucidacConnection:
         except OSError as error:
             raise RigClosed(f"instrument {self.name}: connection lost at {what}: {error.strerror or error}") from error
 
-    def _next(self, what: str, within_s: float) -> Any:
-        """Next message.
+    def _next(self, what: str, deadline_s: float) -> Any:
+        """Next message, of whatever sender.
 
         :raises RigTimeout: it does not come in time.
         """
-        deadline_s = self._clock() + within_s
         while True:
+            left_s = deadline_s - self._clock()
+            if left_s <= 0.0:
+                raise RigTimeout(self._silence(what))
             try:
                 content = self._reader.next()
             except FrameError as error:
-                raise RigError(f"instrument {self.name}: {what}: {error}") from error
+                raise RigError(f"instrument {self.name}: {what}: {error}; {_IS_IT_ONE}") from error
             if content is not None:
                 envelope = parse_envelope(content)
-                if envelope is None:
-                    raise RigError(f"instrument {self.name}: {what}: sent no message of this protocol")
+                if envelope is None or not envelope.HasField("message_v1"):
+                    raise RigError(f"instrument {self.name}: {what}: sent no message of this protocol; {_IS_IT_ONE}")
                 return envelope.message_v1
-            left_s = deadline_s - self._clock()
-            if left_s <= 0.0:
-                raise RigTimeout(f"instrument {self.name}: {what}: no answer within {within_s:g} s")
             self._socket.settimeout(left_s)
             try:
                 received = self._socket.recv(1 << 18)
             except TimeoutError as error:
-                raise RigTimeout(f"instrument {self.name}: {what}: no answer within {within_s:g} s") from error
+                raise RigTimeout(self._silence(what)) from error
             except OSError as error:
                 raise RigClosed(
                     f"instrument {self.name}: connection lost at {what}: {error.strerror or error}"
@@ -207,3 +220,6 @@ class LucidacConnection:
             if not received:
                 raise RigClosed(f"instrument {self.name}: connection closed at {what}")
             self._reader.feed(received)
+
+    def _silence(self, what: str) -> str:
+        return f"instrument {self.name}: {what}: no answer within {self._timeout_s:g} s; {_IS_IT_ONE}"
