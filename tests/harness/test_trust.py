@@ -513,15 +513,20 @@ def test_rigs_file_of_the_environment_is_a_file(
 # -------------------------------------------------------------------------------------------------- what may be trusted
 
 
+def lose_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the time-out of devices that no file describes: nobody answers them."""
+    for described in (SerialDevice, CanDevice):
+        defaults = described.__init__.__kwdefaults__
+        assert defaults
+        monkeypatch.setitem(defaults, "timeout_s", 0.1)
+
+
 @pytest.mark.parametrize("kind", [kind for kind in DEVICES if kind is not a_firmware])
 @pytest.mark.parametrize("through", ["--dut", "ANALOGRIG_DUT"])
 def test_device_that_the_command_line_or_the_environment_names_is_opened(
     kind: Callable[..., Bait], through: str, folder: Path, monkeypatch: pytest.MonkeyPatch, library: Path
 ) -> None:
-    for described in (SerialDevice, CanDevice):
-        defaults = described.__init__.__kwdefaults__
-        assert defaults
-        monkeypatch.setitem(defaults, "timeout_s", 0.1)  # nobody answers
+    lose_patience(monkeypatch)
     bait = kind(folder, monkeypatch, library)
     name = bait.name.replace("inproc:", "inproc:theirs/")
     if through == "--dut":

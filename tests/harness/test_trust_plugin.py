@@ -19,6 +19,7 @@ from tests.harness.test_trust import (
     device_file,
     instrument,
     library,
+    lose_patience,
     pytestmark,
     scenario_of,
     scenario_of_file,
@@ -104,6 +105,7 @@ def test_what_a_file_names_as_device_is_opened_in_pytest_only_if_it_is_allowed(
     library: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    lose_patience(monkeypatch)
     bait = kind(folder, monkeypatch, library)
     check(user, bait, arguments_of(route, bait, user))
 
