@@ -367,3 +367,10 @@ def test_peer_that_sends_frames_without_end_is_given_up(content: bytes, message:
             connection.carrier()
         connection.close()
         thread.join()
+
+
+def test_coefficient_that_rounds_to_nothing_is_refused() -> None:
+    patch = LinearPatch(Program.load("front"))
+    values = {name: row.value for name, row in patch.program.parameters.items()}
+    with pytest.raises(ConfigurationError, match="below half a step of 1/2048"):
+        patch.configuration({**values, "B": 1e-3}, [0.0, 0.0], SignalGenerator("sine and square"))

@@ -40,6 +40,8 @@ FULL_SCALE = 1.25
 """End of the converter's range in machine units, by the legacy firmware; values beyond it count as clipped."""
 
 _HALF_RANGE = 1 << 15
+_MOST_INITIAL = 1.001
+"""Largest state in machine units at a change: initial conditions end at 1, and the converter is noisy."""
 _EARLY_N = 1e-3
 """Time from an edge of the generator to its first sample, in samples: the elements settle in 50 ns."""
 
@@ -149,7 +151,7 @@ class LucidacInstrument(Instrument):
         The first sample of a run is the last one of the run before.
         """
         rate_hz, states = self.datasheet.rate_hz, len(patched.states)
-        cuts = box.take_schedule(samples, rate_hz)
+        cuts, late = box.take_schedule(samples, rate_hz)
         initial: NDArray[np.float64] = np.zeros(states)
         values, ends = [], []
         for i, (start, dials) in enumerate(cuts):
@@ -159,10 +161,17 @@ class LucidacInstrument(Instrument):
             self._connection.ask("config_command", module=module_of(configuration, self._mac), reset_before=True)
             self._calibrate()
             taken, at_end = self._connection.run(stop + 1 - start, int(rate_hz), states + 1)
+            for name, value in zip(patched.states, taken[-1, 1:], strict=True):
+                if start != cuts[-1][0] and abs(value) > _MOST_INITIAL:
+                    raise RigError(
+                        f"{self.name}: state {name} stands at {value:.3f} machine units at the"
+                        " change, and no run begins beyond 1: lower the levels of the excitation"
+                    )
             initial = np.clip(taken[-1, 1:], -1.0, 1.0)
             first = 1 if i else 0
             values.append(taken[first:])
             ends.append(at_end[first:])
+        box.set_all(late)
         return np.concatenate(values), np.concatenate(ends)
 
     def _calibrate(self) -> None:
@@ -221,12 +230,17 @@ class _Coefficients(PotBox):
     def schedule(self, changes: Sequence[DialChange]) -> None:
         self._changes = tuple(changes)
 
-    def take_schedule(self, samples: int, rate_hz: float) -> list[tuple[int, dict[str, float]]]:
-        """Samples at which runs begin, with their new dials; the schedule is empty then."""
+    def take_schedule(
+        self, samples: int, rate_hz: float
+    ) -> tuple[list[tuple[int, dict[str, float]]], dict[str, float]]:
+        """Samples at which runs begin, with their new dials, and dials that change after the last sample.
+
+        The schedule is empty then.
+        """
         cuts: dict[int, dict[str, float]] = {0: {}}
+        late: dict[str, float] = {}
         for delay_s, pot, dial in sorted(self._changes):
             sample = math.floor(delay_s * rate_hz)
-            if sample < samples - 1:
-                cuts.setdefault(sample, {})[pot] = dial
+            (cuts.setdefault(sample, {}) if sample < samples - 1 else late)[pot] = dial
         self._changes = ()
-        return sorted(cuts.items())
+        return sorted(cuts.items()), late

@@ -88,13 +88,9 @@ class LucidacConnection:
         :raises RecordIncomplete: samples are missing.
         """
         values, ends, taken = np.empty((samples, channels)), np.zeros((samples, channels), np.bool_), 0
-        spare = samples + _MOST_SPARE
         for message in self._messages_of_run(samples, rate_hz, channels):
             if message.WhichOneof("kind") == "run_data_message":
                 part, at_end = self._samples(message.run_data_message.data, channels)
-                spare -= len(part)
-                if spare < 0:
-                    raise RigError(f"instrument {self.name}: sends more than the {samples} samples that were asked for")
                 count = min(len(part), samples - taken)
                 values[taken : taken + count], ends[taken : taken + count] = part[:count], at_end[:count]
                 taken += count
@@ -131,11 +127,14 @@ class LucidacConnection:
             daq_config=pb.DaqConfig(num_channels=channels, sample_rate=rate_hz, sample_op=True),
         )
         within_s = self._timeout_s + op_ns * 1e-9
-        deadline_s = self._clock() + within_s
+        deadline_s, spare = self._clock() + within_s, samples + _MOST_SPARE
         while True:
             message = self._next("the run", deadline_s)
-            if message.WhichOneof("kind") == "run_data_message":
+            if message.WhichOneof("kind") == "run_data_message" and message.run_data_message.data.sample_count:
                 deadline_s = self._clock() + within_s
+                spare -= message.run_data_message.data.sample_count
+                if spare < 0:
+                    raise RigError(f"instrument {self.name}: sends more than the {samples} samples that were asked for")
             yield message
             change = message.run_state_change_message
             if change.new_ == pb.RunState.ERROR:

@@ -22,6 +22,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.hardware.lucidac_messages import protocol
 from analogrig.program import Program
 from analogrig_emulator.lucidac.configuration import (
+    ADC_CHANNELS,
     COEFFICIENT_STEPS,
     FAST,
     FIRST_IDENTITY,
@@ -45,6 +46,9 @@ _INPUT = 8
 
 _NEGLIGIBLE = 1e-12
 
+MOST_STATES = ADC_CHANNELS - 1
+"""States that the converter reads beside the input."""
+
 _LOG_STEP, _ROUNDING_STEPS = 1e-6, 3
 """Step of difference quotients, and number of Gauss-Newton steps: a rounding is small."""
 
@@ -63,8 +67,10 @@ class LinearPatch:
         states = list(program.equations.states)
         if not program.is_linear:
             raise ConfigurationError(f"{where}a LUCIDAC is patched with linear programs alone")
-        if len(states) > INTEGRATORS:
-            raise ConfigurationError(f"{where}has {len(states)} states, and a LUCIDAC has {INTEGRATORS} integrators")
+        if len(states) > MOST_STATES:
+            raise ConfigurationError(
+                f"{where}has {len(states)} states, and a LUCIDAC reads at most {MOST_STATES} beside the input"
+            )
         if program.channels[1] not in states:
             raise ConfigurationError(f"{where}its output {program.channels[1]!r} is no state, and has no integrator")
 
@@ -164,6 +170,11 @@ class LinearPatch:
                 upscaled = abs(factor) > 1.0
                 coefficient = factor / count / (UPSCALE if upscaled else 1.0)
                 rounded = round(coefficient * COEFFICIENT_STEPS) / COEFFICIENT_STEPS
+                if not rounded:
+                    raise ConfigurationError(
+                        f"program {self.program.name}: a coefficient of {coefficient:.2g} in the equation of"
+                        f" {self.states[i]} is below half a step of 1/{COEFFICIENT_STEPS}: change a value or a scale"
+                    )
                 yield from [LucidacLane(output, i, rounded, upscaled)] * count
 
 
