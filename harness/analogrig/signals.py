@@ -95,10 +95,11 @@ def raise_signals() -> Iterator[None]:
 def interruption(error: BaseException | None) -> KeyboardInterrupt | None:
     """Interruption that is or caused ``error``; None if there is none.
 
-    A module in C that is interrupted while it is imported raises an ImportError, caused by the interruption.
+    A module in C that is interrupted while it is imported raises an ImportError, caused by the interruption. A pool of
+    workers that is interrupted while it starts raises a RuntimeError as it joins a thread that has not begun.
     """
     while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or (error.__context__ if isinstance(error, ImportError) else None)
+        error = error.__cause__ or (error.__context__ if isinstance(error, ImportError | RuntimeError) else None)
     return error
 
 

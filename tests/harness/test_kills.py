@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 import signal
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
+from analogrig.signals import Interrupted, interruption
 from tests.harness.kills import CASES, SIGNALS, duration_s, instants, kill, prepared
 
 SEED, KILLS = 1995, 2
@@ -32,3 +34,13 @@ def test_killed_command_leaves_no_process_and_no_result_that_is_none(
     for after_s in instants(name, number, KILLS, SEED, durations_s[name]):
         sys.stdout.write(f"{name}, {number.name} after {after_s:.3f} s\n")
         kill(CASES[name], number, before, after_s)
+
+
+def test_thread_that_was_interrupted_before_it_began_is_an_interruption() -> None:
+    """What a pool of workers raises when a signal comes between its making and its start."""
+    with pytest.raises(RuntimeError, match="cannot join thread before it is started") as error:
+        try:
+            raise Interrupted("SIGTERM")
+        finally:
+            threading.Thread().join()
+    assert isinstance(interruption(error.value), Interrupted)
