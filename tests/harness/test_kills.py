@@ -38,9 +38,13 @@ def test_killed_command_leaves_no_process_and_no_result_that_is_none(
 
 def test_thread_that_was_interrupted_before_it_began_is_an_interruption() -> None:
     """What a pool of workers raises when a signal comes between its making and its start."""
-    with pytest.raises(RuntimeError, match="cannot join thread before it is started") as error:
+
+    def start() -> None:
         try:
             raise Interrupted("SIGTERM")
         finally:
             threading.Thread().join()
+
+    with pytest.raises(RuntimeError, match="cannot join thread before it is started") as error:
+        start()
     assert isinstance(interruption(error.value), Interrupted)
