@@ -37,7 +37,7 @@ def test_killed_command_leaves_no_process_and_no_result_that_is_none(
 
 
 def test_thread_that_was_interrupted_before_it_began_is_an_interruption() -> None:
-    """What a pool of workers raises when a signal comes between its making and its start."""
+    """A pool of workers raises so when a signal comes between its making and its start."""
 
     def start() -> None:
         try:
