@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from analogrig.run import Channel, Conditions, Run
 from analogrig_emulator import CHANNELS
 
 N_PER_CODE, M_PER_CODE = 2940.0 / 4096, 0.1996 / 4096
+
+_DTYPES = {"index": np.int64, "onset": np.int64, "kind": np.uint8, "change": np.uint8, "cause": np.uint8}
+"""Types of arrays by the second word of their names; others are float32."""
 
 ESTIMATOR = {"na": 2, "nb": 3, "nk": 0, "offset": True, "trigger": "cusum", "ceiling": 11.512925}
 
@@ -38,12 +42,6 @@ def made_run(
     :param misfits: of each the sample, the cause, the frequency in cycles per sample, and the strength.
     """
     n = len(force_n)
-    channels = {
-        "force": Channel(0.0, 10.0 / 4096, "N", 294.0, noise_lsb),
-        "displacement": Channel(0.0, 10.0 / 4096, "m", 0.01996, noise_lsb),
-        "velocity": Channel(-10.0, 20.0 / 4096, "m/s", 0.2, noise_lsb),
-        "net_force": Channel(-12.5, 25.0 / 4096, "N", 294.0, noise_lsb),
-    }
     codes = np.zeros((n, 4), np.uint16)
     codes[:, 0] = np.round(force_n / N_PER_CODE)
     flags = np.zeros((n, 4), bool)
@@ -54,7 +52,7 @@ def made_run(
         samples_asked=n if samples_asked is None else samples_asked,
         sample_period_s=5e-5,
         time_scale=200.0,
-        channels=channels,
+        channels=_channels(noise_lsb),
         segments=tuple(Segment(start, plant) for start, plant in plants),
         scenario={"name": "made", "expect": expect or {}},
         rig={"name": "by hand"},
@@ -62,7 +60,6 @@ def made_run(
         link="none",
         faults=faults,
     )
-    count = len(alarms)
     return Run(
         conditions=conditions,
         codes=codes,
@@ -71,18 +68,28 @@ def made_run(
         innovation=np.zeros(n, np.float32),
         statistic=np.zeros(n, np.float32),
         flags=np.zeros(n, np.uint8),
-        alarm_index=np.array(alarms, np.int64),
-        alarm_kind=np.full(count, 3, np.uint8),
-        alarm_statistic=np.full(count, 12.0, np.float32),
-        diagnosis_index=np.array([said[0] for said in diagnoses], np.int64),
-        diagnosis_change=np.array([said[1] for said in diagnoses], np.uint8),
-        diagnosis_onset=np.array([said[2] for said in diagnoses], np.int64),
-        diagnosis_extent=np.array([said[3] for said in diagnoses], np.float32),
-        misfit_index=np.array([said[0] for said in misfits], np.int64),
-        misfit_cause=np.array([said[1] for said in misfits], np.uint8),
-        misfit_frequency=np.array([said[2] for said in misfits], np.float32),
-        misfit_strength=np.array([said[3] for said in misfits], np.float32),
+        **_columns(("alarm_index", "alarm_kind", "alarm_statistic"), [(alarm, 3, 12.0) for alarm in alarms]),
+        **_columns(("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent"), diagnoses),
+        **_columns(("misfit_index", "misfit_cause", "misfit_frequency", "misfit_strength"), misfits),
     )
+
+
+def _channels(noise_lsb: float) -> dict[str, Channel]:
+    return {
+        "force": Channel(0.0, 10.0 / 4096, "N", 294.0, noise_lsb),
+        "displacement": Channel(0.0, 10.0 / 4096, "m", 0.01996, noise_lsb),
+        "velocity": Channel(-10.0, 20.0 / 4096, "m/s", 0.2, noise_lsb),
+        "net_force": Channel(-12.5, 25.0 / 4096, "N", 294.0, noise_lsb),
+    }
+
+
+def _columns(names: Sequence[str], rows: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """Arrays of a run, one for each name, from rows of what the device said."""
+    columns = list(zip(*rows, strict=True)) or [()] * len(names)
+    return {
+        name: np.array(column, _DTYPES.get(name.split("_")[1], np.float32))
+        for name, column in zip(names, columns, strict=True)
+    }
 
 
 def with_fault(run: Run, fault: str) -> Run:

@@ -53,12 +53,12 @@ def import_run(
     """
     frames = CapturedFrames(path)
     performance = rig.perform(scenario, 0)
-    decoder: CaptureDecoding
     try:
-        if device is None:
-            decoder = CaptureDecoder(FrameDictionary(dbc), frames)
-        else:
-            decoder = EcuDecoder(device, performance.of_device, frames, most_n=scenario.samples)
+        decoder: CaptureDecoding = (
+            CaptureDecoder(FrameDictionary(dbc), frames)
+            if device is None
+            else EcuDecoder(device, performance.of_device, frames, most_n=scenario.samples)
+        )
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
     captured = _select_run(decoder, frames, number)
@@ -69,11 +69,7 @@ def import_run(
         )
     answers = captured.answers(path)
     dut = {**captured.device(path), "most_lost_n": most_lost_n}
-    faults = (
-        *captured.faults,
-        *captured.capture_faults(path),
-        *([frames.end] if frames.end else []),
-    )
+    faults = (*captured.faults, *captured.capture_faults(path), *([frames.end] if frames.end else []))
     builder = RunBuilder(captured.extent, len(scenario.program.channels), Datasheet.recorded(dut))
     builder.begin_record()
     builder.add(_block(captured, len(scenario.program.channels)), answers)
