@@ -41,7 +41,7 @@ from analogrig.live.desk import RECORD_N, SteppedDesk
 from analogrig.live.faults import LINE_LABELS
 from analogrig.live.panel import bench_table, state_table
 from analogrig.live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
-from analogrig.live.session import ANOTHER_MODE, BLOCK_S, LiveSession, Saved
+from analogrig.live.session import ANOTHER_MODE, BLOCK_S, MOST_WAITING, LiveSession, Saved
 from analogrig.live.take import MOST_KEPT_CHANGES, Take
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
@@ -494,6 +494,38 @@ def test_turned_pots_of_an_unrecorded_take_need_bounded_memory(tmp_path: Path) -
     session = scripted_session((*turns, (2.0, SetPlaying(on=False))), tmp_path)
     assert len(session.take.changes) == MOST_KEPT_CHANGES
     assert session.take.segments()[-1].plant.parameters()["K"] == turns[-1][1].value == session.values["K"]
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "text"),
+    [("MOST_RECORDED_N", 5 * BLOCK_N, f"{5 * BLOCK_N} samples"), ("MAX_CHANGES", 3, "3 changes")],
+)
+def test_recording_ends_by_itself_at_its_limits(
+    limit: str, value: int, text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(f"analogrig.live.session.{limit}", value)
+    turns = [(0.02 * k, Turn("K", 18000.0 + 50.0 * k)) for k in range(1, 9)]
+    saved: list[Saved] = []
+    script = ((0.0, SetRecording(on=True)), *turns, (0.5, SetPlaying(on=False)))
+    session = scripted_session(script, tmp_path, on_saved=saved.append)
+    assert session.notices[0][1] == f"the recording has reached its limit of {text}"
+    assert len(saved) == 1
+    recorded = {"MOST_RECORDED_N": saved[0].samples, "MAX_CHANGES": len(Scenario.load(str(saved[0].scenario)).tweaks)}
+    assert recorded[limit] == value
+    assert not session.is_recording
+    assert session.values["K"] == turns[-1][1].value
+
+
+def test_too_many_commands_for_one_block_are_refused_together(tmp_path: Path) -> None:
+    def crowd(session: LiveSession) -> None:
+        before = session.ordered_values
+        with pytest.raises(ConfigurationError, match="too many commands at once: wait for the next block"):
+            session.do(*[Turn("K", 18000.0)] * (MOST_WAITING + 1))
+        assert session.ordered_values == before
+        session.do(*[Turn("K", 18000.0)] * MOST_WAITING)
+
+    session = scripted_session(((0.01, crowd), (0.05, SetPlaying(on=False))), tmp_path)
+    assert session.values["K"] == 18000.0
 
 
 def test_device_behind_a_link_is_played_through_its_pauses(tmp_path: Path) -> None:
