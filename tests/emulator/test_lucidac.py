@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -176,6 +178,20 @@ def test_impossible_configurations_are_refused_by_name(wrong: dict[str, object],
     with pytest.raises(CircuitError) as caught:
         Configuration(**wrong)  # type: ignore[arg-type]
     assert named in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"coefficient_steps": 0}, "coefficient_steps must be more than 0, not 0"),
+        ({"overload": float("nan")}, "overload must be more than 0, not nan"),
+        ({"adc_gain": -1.0}, "adc_gain must be at least 0 and below 1e6, not -1"),
+        ({"adc_noise_lsb": float("inf")}, "adc_noise_lsb must be at least 0 and below 1e6, not inf"),
+    ],
+)
+def test_impossible_parts_are_refused_by_name(wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(CircuitError, match=re.escape(named)):
+        LucidacParts(**wrong)
 
 
 @pytest.mark.parametrize("seed", [3, 11])

@@ -72,3 +72,20 @@ def test_file_that_is_read_is_not_overwritten(tmp_path: Path, capsys: pytest.Cap
     assert main(["patch", str(path), "--netlist", str(path)]) == 2
     assert str(path) in capsys.readouterr().err
     assert path.read_text() == MOTOR.read_text()
+
+
+def test_program_that_no_run_could_play_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A chain of 17 first-order lags has 68 states: integrators, inverters, and a pole in each amplifier of both."""
+    lags = range(1, 18)
+    path = tmp_path / "chain.toml"
+    path.write_text(
+        'name = "chain"\ndescription = "lags"\nspeed = 10\nchannels = ["u", "x1"]\nequations = """\n'
+        + "".join(f"x{k}' = ({f'x{k - 1}' if k > 1 else 'u'} - x{k}) / T\n" for k in lags)
+        + '"""\n[inputs]\nu = { unit = "V", full = 5.0, trial = [0.0, 4.0] }\n[states]\n'
+        + "".join(f'x{k} = {{ unit = "V" }}\n' for k in lags)
+        + '[parameters]\nT = { value = 1e-2, unit = "s" }\n'
+    )
+    assert main(["patch", str(path)]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == f"analogrig: {path}: the circuit has 68 states; the engine takes at most 64\n"
+    assert not captured.out

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RigError, SelfTestError
 from analogrig.hardware.self_test import Check, Findings, self_test
-from analogrig.hardware.square_wave import EdgeTimes, SquareWave, step_response
+from analogrig.hardware.square_wave import EdgeTimes, Response, SquareWave, step_response
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Block, Performance, Rig
@@ -567,3 +567,9 @@ def test_unmeasured_quantities_are_reported() -> None:
     findings = self_test(emulate(noise_lsb=60.0), 1)
     assert {check.title for check in findings.in_state("wrong")} == {"noise of force", "noise of displacement"}
     assert "skew" in {check.title for check in findings.in_state("not measured")}
+
+
+def test_output_without_a_response_has_no_parameters() -> None:
+    codes = np.where(np.arange(2000) // 50 % 2, 3900, 100).astype(np.uint16)
+    with pytest.raises(SelfTestError, match="does not respond to the input as a plant of second order does"):
+        Response.fit(np.zeros(2000), np.ones(2000, np.bool_), SquareWave.of(codes, 50.0), (0.25, 9.5), (30.0, 10.0))
