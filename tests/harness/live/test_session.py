@@ -506,7 +506,11 @@ def test_recording_ends_by_itself_at_its_limits(
     monkeypatch.setattr(f"analogrig.live.session.{limit}", value)
     turns = [(0.02 * k, Turn("K", 18000.0 + 50.0 * k)) for k in range(1, 9)]
     saved: list[Saved] = []
-    script = ((0.0, SetRecording(on=True)), *turns, (0.5, SetPlaying(on=False)))
+    script: tuple[tuple[float, Action], ...] = (
+        (0.0, SetRecording(on=True)),
+        *turns,
+        (0.5, SetPlaying(on=False)),
+    )
     session = scripted_session(script, tmp_path, on_saved=saved.append)
     assert session.notices[0][1] == f"the recording has reached its limit of {text}"
     assert len(saved) == 1
