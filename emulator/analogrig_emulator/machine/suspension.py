@@ -218,7 +218,7 @@ class SuspensionComputer:
 
     def _excite(self, excitation: Excitation | RecordedExcitation, window: tuple[int, int]) -> Edges:
         """Edges of a window; the machine follows a level that moves all the time instead."""
-        if isinstance(excitation, Excitation) and not excitation.is_smooth:
+        if not excitation.is_smooth:
             return excitation.edges(*window, self.sample_rate_hz)
         self.machine.follow({SOURCE: excitation.drive(*window, self.sample_rate_hz)})
         return Edges.none()

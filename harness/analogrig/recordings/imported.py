@@ -136,7 +136,8 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range")
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), **dataclasses.asdict(described)}
-    return _run(path, codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), scenario)
+    truth = _truth(path, samples, 1.0 / rate_hz, scenario)
+    return unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
 
 
 def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scenario) -> Run:
@@ -166,15 +167,14 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
     if not np.isin(clipped, (0.0, 1.0)).all():
         raise RecordingError(f"{path}: a flag of a clipped sample is neither 0 nor 1")
     description = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), "rig": dict(rig.description())}
-    return _run(
-        path,
+    return unanswered(
         codes.astype(np.uint16),
         clipped.astype(np.bool_),
         performance.channels,
         performance.sample_period_s,
         performance.time_scale,
         description,
-        scenario,
+        *_truth(path, len(codes), performance.sample_period_s, scenario),
     )
 
 
@@ -236,39 +236,53 @@ def _rate_hz(
     return 1.0 / period_s
 
 
-def _run(
-    path: Path,
+def _truth(
+    path: Path, samples: int, period_s: float, scenario: Scenario | None
+) -> tuple[Scenario, tuple[Segment, ...]]:
+    """Scenario and plant of a recording; without a scenario they are unknown.
+
+    :raises ConfigurationError: the recording is longer than the scenario.
+    """
+    if scenario is None:
+        return _unknown(path, samples, period_s), ()
+    if samples > scenario.samples:
+        raise ConfigurationError(
+            f"{path}: has {number_of(samples, 'sample')}, scenario {scenario.name} {scenario.samples}:"
+            " pass the scenario that was played"
+        )
+    return scenario, scenario.segments()
+
+
+def unanswered(
     codes: NDArray[np.uint16],
     clipped: NDArray[np.bool_],
     channels: Mapping[str, Channel],
     period_s: float,
     time_scale: float,
     rig: Mapping[str, Any],
-    scenario: Scenario | None,
+    scenario: Scenario,
+    segments: tuple[Segment, ...],
 ) -> Run:
-    """Recording without answers of a device."""
+    """Recording without answers of a device.
+
+    :param codes: (n, c), with ``clipped`` for the channels of the scenario's program.
+    :param segments: true plant; empty if it is unknown.
+    """
     samples = len(codes)
-    if scenario is not None and samples > scenario.samples:
-        raise ConfigurationError(
-            f"{path}: has {number_of(samples, 'sample')}, scenario {scenario.name} {scenario.samples}:"
-            " pass the scenario that was played"
-        )
-    segments: tuple[Segment, ...] = () if scenario is None else scenario.segments()
-    kept = scenario or _unknown(path, samples, period_s)
     return Run(
         conditions=Conditions(
             seed=0,
-            samples_asked=kept.samples,
+            samples_asked=scenario.samples,
             sample_period_s=period_s,
             time_scale=time_scale,
             channels=dict(channels),
             segments=segments,
-            scenario=kept.as_table(),
+            scenario=scenario.as_table(),
             rig=rig,
             dut={"name": "none", "kind": KIND, "datasheet": {"alarms": False}},
             link="none",
             faults=(UNSEEN,),
-            program=kept.program,
+            program=scenario.program,
         ),
         codes=codes,
         clipped=clipped,
