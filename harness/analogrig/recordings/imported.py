@@ -123,6 +123,8 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         raise RecordingError(f"{path}: the columns differ in length: {lengths}")
     if not (samples := count.pop()):
         raise RecordingError(f"{path}: has no row {described.first}")
+    if samples == 1:
+        raise RecordingError(f"{path}: has a single row: a recording needs two")
     if described.samples is not None and samples < described.samples:
         raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
     program = Program.load(DEFAULT_PROGRAM) if scenario is None else scenario.program
@@ -136,6 +138,7 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range")
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), **dataclasses.asdict(described)}
+    rig["blank_lines"] = found.blank_lines
     truth = _truth(path, samples, 1.0 / rate_hz, scenario)
     return unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
 
@@ -225,7 +228,9 @@ def _rate_hz(
         raise RecordingError(f"{path}: column {described.time}: instants are missing")
     period_s = float(instants_s[-1] - instants_s[0]) / (len(instants_s) - 1)
     if not 1e-9 <= period_s <= 1e6:
-        raise RecordingError(f"{path}: column {described.time}: a sample period of {period_s:g} s")
+        raise RecordingError(
+            f"{path}: column {described.time}: a sample period of {period_s:g} s: must be seconds that ascend"
+        )
     late = np.abs(instants_s - instants_s[0] - period_s * np.arange(len(instants_s))) / period_s
     if late.max() > _MOST_JITTER:
         worst = int(late.argmax())
