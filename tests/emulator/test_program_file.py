@@ -238,6 +238,18 @@ BAD: dict[str, tuple[Change, str]] = {
         equation("omega' = (torque + 1e7*d*omega) / J"),
         "the trial play grows without end: state i exceeds 1e.30 at .* s; the plant is unstable: correct a sign",
     ),
+    "input that cancels": (
+        equation("omega' = (torque - d*omega) / J", swapped("(u - R*i", "(u - u - R*i")),
+        "line 1: no input acts on i, omega, which stay at 0, where states start; add a term with an input",
+    ),
+    "name of 400 letters": (
+        equation("omega' = (torque - d*" + "x" * 400 + ") / J"),
+        "line 3: unknown name 'x{40}'; there are",
+    ),
+    "formula of many factors": (
+        equation("omega' = (torque - d*omega - 1e-9*((0.001*omega)**8)**8) / J", without_units),
+        r"line 3: term .{,60} of .{,60} (has|needs) a coefficient",
+    ),
     "plant that grows in the trial play": (
         equation("omega' = (torque + 1e2*d*omega) / J", swapped(", full = 300.0", "")),
         "the trial play grows without end: state i reaches .* at 0.1 s; the plant is unstable",

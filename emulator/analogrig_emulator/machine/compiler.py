@@ -69,6 +69,7 @@ _LEAST_COEFFICIENT = 2e-4
 _SLOW = 0.1
 """Coefficient with the largest capacitor below which an integrator gains by more speed."""
 
+_LONGEST_SHOWN = 50
 _MOST_CORNERS = 6
 _EXACT = 1e-9
 
@@ -234,10 +235,12 @@ def _check_driven(stages: Stages) -> None:
     while found := [row for row in rows if any(cord.source in driven for cord in row.cords)]:
         driven |= {row.name for row in found}
         rows = [row for row in rows if row.name not in driven]
-    if rows:
-        names = ", ".join(row.name for row in rows)
+    states = [row for row in rows if row.kind is StageKind.INTEGRATOR]
+    if states:
+        names = ", ".join(row.name for row in states)
+        stay = "stays" if len(states) == 1 else "stay"
         raise ProgramError(
-            f"{rows[0].place}: no input acts on {names}, which stay{'s' * (len(rows) == 1)} at 0, where states start; "
+            f"{states[0].place}: no input acts on {names}, which {stay} at 0, where states start; "
             "add a term with an input, or delete the line"
         )
 
@@ -555,11 +558,12 @@ class _Patcher:
         return PatchedCord(cord, top, sign, coefficient, gain, resistor, pot, ratio * abs(cord.number) / gain)
 
     def _check_coefficient(self, stage: PatchStage, cord: Cord, coefficient: float, most: float) -> None:
-        what = f"{stage.place}: term {cord.text} of {stage.name}"
+        name = _clipped(stage.name)
+        what = f"{stage.place}: term {_clipped(cord.text)} of {name}"
         if most > 10 * (1 + _EXACT):
             raise ProgramError(
                 f"{what} needs a coefficient of {most:.3g}, and there are 10; "
-                f"write full = {_rounded_up(self._fulls[stage.name] * most / 10):g} for {stage.name}"
+                f"write full = {_rounded_up(self._fulls[stage.name] * most / 10):g} for {name}"
             )
         if coefficient < _LEAST_COEFFICIENT:
             raise ProgramError(
@@ -576,11 +580,17 @@ class _Patcher:
             if most < _SLOW:
                 return f"the integrator is slow, at most {most:.2g} with 1 uF: write speed = {speed / most:.3g} or less"
         return (
-            f"delete the term, lower the full scale of {stage.name}, or let it move more in the trial (speed, period_s)"
+            f"delete the term, lower the full scale of {_clipped(stage.name)}, or let it move more in the trial "
+            "(speed, period_s)"
         )
 
 
 _LETTERS = {StageKind.PRODUCT: "X", StageKind.FUNCTION: "D"}
+
+
+def _clipped(formula: str) -> str:
+    """Formula for a message."""
+    return formula if len(formula) <= _LONGEST_SHOWN else f"{formula[:_LONGEST_SHOWN]}..."
 
 
 def _reserved(name: str) -> bool:
