@@ -69,7 +69,7 @@ _LEAST_COEFFICIENT = 2e-4
 _SLOW = 0.1
 """Coefficient with the largest capacitor below which an integrator gains by more speed."""
 
-_LONGEST_SHOWN = 50
+_LONGEST_SHOWN = 32
 _MOST_CORNERS = 6
 _EXACT = 1e-9
 
