@@ -134,6 +134,15 @@ def test_a_parameter_that_the_excitation_does_not_show_is_named(
     assert "+-" not in line
 
 
+def test_an_output_of_another_plant_is_a_caveat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez(tmp_path / "a.npz", u=multisine(800), y=1e-3 * np.cos(np.arange(800.0)))
+    command = ["import", str(tmp_path / "a.npz"), "--input", "u", "--output", "y", "--rate", "610"]
+    assert main([*command, "--out", str(tmp_path / "r.npz")]) == 0
+    command = ["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "silverbox"]
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 0
+    assert "caveat: the machine differs by more than the output moves" in capsys.readouterr().out
+
+
 def test_a_beginning_that_does_not_fit_names_the_cure(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -157,7 +157,8 @@ def _check_for_a_rig(arguments: argparse.Namespace, options: Sequence[str]) -> N
 
     for option in options:
         if getattr(arguments, option) not in (None, []):
-            raise ConfigurationError(f"--{option.replace('_', '-')} is for --recording")
+            others = "" if option in ("span", "check") else ", and for programs other than front and shock"
+            raise ConfigurationError(f"--{option.replace('_', '-')} is for --recording{others}")
 
 
 def _values(found: Calibration) -> list[str]:

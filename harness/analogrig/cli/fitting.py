@@ -110,6 +110,7 @@ def _fit(
         table |= {"recording": arguments.recording and str(arguments.recording), "rig": arguments.rig}
         table |= {"parameters": [vars(each) for each in twin.estimates], "fit": vars(twin.fit)}
         table |= {"reconstruction": twin.reconstruction, "other_rms": twin.other_rms}
+        table |= {"output_rms": twin.output_rms}
         table |= {"may_jump_between_samples": twin.may_jump_between_samples}
         table |= {"unseen": twin.unseen, "inseparable": twin.inseparable, "surplus": twin.surplus}
         table |= {"check": checked and vars(checked), "file": str(arguments.out) if is_twin else None}
@@ -139,6 +140,11 @@ def _reconstruction_line(twin: ProgramTwin, unit: str) -> str:
 def _caveats(twin: ProgramTwin) -> list[str]:
     """Reasons to doubt the values, with their cures, one line each."""
     lines = []
+    if twin.fit.rms > twin.output_rms:
+        lines.append(
+            f"caveat: the machine differs by more than the output moves ({twin.output_rms:.4g} rms): check program,"
+            " columns and units"
+        )
     if twin.may_jump_between_samples:
         lines.append(
             "caveat: the input jumps, and neither course of it fits much better: its edges may lie between the samples;"

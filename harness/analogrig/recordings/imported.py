@@ -32,6 +32,9 @@ KIND = "import"
 
 LEAST_BITS, MOST_BITS = 2, 16
 
+_LEAST_WIDTH, _MOST_MAGNITUDE = 1e-7, 1e8
+"""Limits of a converter's range, which a run can hold."""
+
 _MOST_JITTER = 0.02
 """Largest deviation of a time from the even grid, in sample periods."""
 
@@ -186,18 +189,21 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
 
     :raises RecordingError: they have no range.
     """
-    codes = 1 << bits
+    codes, where = 1 << bits, f"{path}: column {described.column}"
     if described.range is not None:
         low, high = described.range
     else:
         finite = np.abs(values[np.isfinite(values)])
-        most = float(finite.max(initial=0.0)) / (1.0 - 2.0 / codes)  # the last code stands for the largest value
         if not finite.size:
-            raise RecordingError(f"{path}: column {described.column}: holds no number")
-        if not 1e-9 < most < 1e8:
-            where = f"{path}: column {described.column}"
-            raise RecordingError(f"{where}: largest magnitude {most:g}: must be 1e-9 to 1e8; scale it")
-        low, high = -most, most
+            raise RecordingError(f"{where}: holds no number")
+        high = float(finite.max()) / (1.0 - 2.0 / codes)  # the last code stands for the largest value
+        low = -high
+    most = max(abs(low), abs(high))
+    if not (high - low > _LEAST_WIDTH and most < _MOST_MAGNITUDE):
+        what = f"largest magnitude {most:g}" if described.range is None else f"range [{low:g}, {high:g}]"
+        raise RecordingError(
+            f"{where}: {what}: a range must be wider than {_LEAST_WIDTH:g} and within +-{_MOST_MAGNITUDE:g}; scale it"
+        )
     return Channel(low, (high - low) / codes, described.unit, 1.0, 0.0, codes)
 
 

@@ -120,6 +120,8 @@ class ProgramTwin:
     estimates: tuple[FittedParameter, ...]
     """Fitted parameters. The standard errors hold for residuals like white noise; others deserve larger ones."""
     fit: Residual
+    output_rms: float
+    """Rms of the recorded output about its mean, which a machine of the right program undercuts by far."""
     plays: int
     reconstruction: Reconstruction
     """Course of the input between its samples with which the machine was played."""
@@ -338,6 +340,7 @@ class _ProgramFit:
             values=every,
             estimates=estimates,
             fit=plant.difference(every, self._span, reconstruction),
+            output_rms=float(self._y.std()),
             plays=plant.plays,
             reconstruction=reconstruction,
             other_rms=other_rms,
