@@ -333,6 +333,7 @@ BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     "no such column": ("a.csv", b"a,b\n1,2\n", "no column is called 'u'; there are a, b"),
     "two of one name": ("a.csv", b"u,u,y\n1,2,3\n", "2 columns are called 'u'"),
     "word for a number": ("a.csv", b"u,y\n1,2\n3,four\n", "line 3, column y: 'four' is no number"),
+    "number with an underscore": ("a.csv", b"u,y\n1,2\n3,1_0\n", "line 3, column y: '1_0' is no number"),
     "short row": ("a.csv", b"u,y\n1,2\n3\n", "line 3, column y: the line has no such cell"),
     "decimal commas": ("a.csv", b"u,y\n0,5,1,5\n", "line 2 has 4 cells, the first line 2: cells with decimal commas"),
     "no number at all": ("a.csv", b"u,y\n1,\n2,\n", "column y: holds no number"),

@@ -137,6 +137,8 @@ def _number(cell: str, delimiter: str) -> float:
     text = cell.strip()
     if not text:
         return float("nan")
+    if "_" in text:
+        raise ValueError(text)  # Python would read 1_0 as 10
     return float(text.replace(",", ".") if delimiter != "," else text)
 
 
