@@ -224,7 +224,10 @@ def test_plan_adds_up_changes_of_parameters_that_share_a_pot() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"J": 1e-6}, "pot J: coefficient .* is beyond the track .*; J = 1e-06 cannot be set on program dc-motor"),
+        (
+            {"J": 1e-6},
+            "J = 1e-06 cannot be set on program dc-motor, whose J is at least 5e-05: pot J: coefficient .* is beyond",
+        ),
         ({"J": -1.0}, "pot J: J is -1 .*positive"),
         ({"J": float("nan")}, "pot J: J is nan .*positive"),
         ({"Q": 1.0}, "unknown setting 'Q'; there are R, L, k, J, d, P1_dial"),

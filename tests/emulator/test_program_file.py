@@ -35,6 +35,16 @@ J = { value = 8e-5, unit = "kg m^2" }
 d = { value = 2e-4, unit = "N m s/rad", pot = false }
 """
 
+SLOW = """
+name = "oven"
+speed = 1
+channels = ["u", "y"]
+equations = "y' = (u - y) / T"
+inputs.u.full = 10.0
+states.y.full = 10.0
+parameters.T.value = 3000.0
+"""
+
 Change = Callable[[str], str]
 
 
@@ -222,11 +232,31 @@ BAD: dict[str, tuple[Change, str]] = {
             with_row("states", "z = {}"),
             with_row("parameters", "tau = { value = 1 }"),
         ),
-        "states.z: z stays at 0 in the trial play; give its full scale",
+        "line 4: no input acts on z, which stays at 0, where states start; add a term with an input",
     ),
     "state that grows without bound": (
         equation("omega' = (torque + 1e7*d*omega) / J"),
-        "trial play: state .* grows without bound; correct a sign",
+        "the trial play grows without end: state i exceeds 1e.30 at .* s; the plant is unstable: correct a sign",
+    ),
+    "input that cancels": (
+        equation("omega' = (torque - d*omega) / J", swapped("(u - R*i", "(u - u - R*i")),
+        "line 1: no input acts on i, omega, which stay at 0, where states start; add a term with an input",
+    ),
+    "name of 400 letters": (
+        equation("omega' = (torque - d*" + "x" * 400 + ") / J"),
+        "line 3: unknown name 'x{40}'; there are",
+    ),
+    "formula of many factors": (
+        equation("omega' = (torque - d*omega - 1e-9*((0.001*omega)**8)**8) / J", without_units),
+        r"line 3: term .{,60} of .{,60} (has|needs) a coefficient",
+    ),
+    "plant that grows in the trial play": (
+        equation("omega' = (torque + 1e2*d*omega) / J", swapped(", full = 300.0", "")),
+        "the trial play grows without end: state i reaches .* at 0.1 s; the plant is unstable",
+    ),
+    "machine slower than the plant": (
+        lambda _: SLOW,
+        "line 1: .* the integrator is slow, at most .* with 1 uF: write speed = .* or less",
     ),
     "coefficient beyond 10": (
         lambda text: equation("omega' = (torque - d*omega) / J")(text) + "\n[signals]\ntorque = { full = 0.05 }\n",

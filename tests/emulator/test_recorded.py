@@ -17,6 +17,7 @@ from analogrig_emulator import (
     Edges,
     Engine,
     EngineError,
+    Excitation,
     ExcitationError,
     Mode,
     RecordedExcitation,
@@ -152,3 +153,18 @@ def test_wrong_drives_are_refused() -> None:
     engine = Engine(system, ["out"], RATE_HZ, drives={"IN": Drive.band_limited(np.zeros(3))})
     with pytest.raises(EngineError, match="no input is called 'IN'"):
         engine.run(3, {"IN": Edges(np.zeros(1, np.int64), np.ones(1))})
+
+
+def test_a_held_recording_is_the_square_wave_that_it_samples() -> None:
+    computer = SuspensionComputer(load_program(PROGRAMS / "duffing.toml"))
+    square = Excitation(low_v=1.0, high_v=5.0, frequency_hz=500.0)
+    held = RecordedExcitation(square_levels(square, computer.sample_rate_hz), is_held=True)
+    one, other = (np.concatenate(list(computer.play(each, 400))) for each in (square, held))
+    assert np.abs(one - other).max() < 1e-6
+
+
+def square_levels(square: Excitation, rate_hz: float) -> Volts:
+    """Level of a square wave from each of 400 samples on."""
+    edges = square.edges(0, 400 * TICKS_PER_SAMPLE, rate_hz)
+    samples = np.arange(400, dtype=np.int64) * TICKS_PER_SAMPLE
+    return np.asarray(edges.levels_v[np.searchsorted(edges.ticks, samples, "right") - 1])

@@ -4,38 +4,63 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.config import fixtures
-from analogrig_emulator import RecordedExcitation, SuspensionComputer, load_program
+from analogrig_emulator import Excitation, RecordedExcitation, SuspensionComputer, load_program
 
-RATE_HZ = 10e6 / 2**14
+RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0}
 SAMPLES = 2000
 TRUE = {"rate": 410.0, "gain": 470.0, "damping": 35.0, "square": 60.0, "cube": 1400.0, "offset": 4e-3}
+
+
+def multisine(samples: int = SAMPLES) -> NDArray[np.float64]:
+    """Random phases up to 0.15 of the sample rate, 0.05 rms."""
+    rng = np.random.default_rng(3)
+    spectrum = np.where(
+        np.arange(samples // 2 + 1) < 0.3 * samples, np.exp(2j * np.pi * rng.random(samples // 2 + 1)), 0
+    )
+    u = np.fft.irfft(spectrum)
+    return np.asarray(u * (0.05 / u.std()))
+
+
+def record(folder: Path, name: str, values: dict[str, float], played: RecordedExcitation | Excitation) -> Path:
+    """Recording of the first two channels of a program, with noise of 5e-5 of the output's full scale."""
+    rate_hz = RATES_HZ[name]
+    program = load_program(fixtures() / "programs" / f"{name}.toml")
+    computer = SuspensionComputer(program, sample_rate_hz=rate_hz * program.equations.speed)
+    computer.set(**values)
+    volts = np.concatenate([block[:, :2] for block in computer.play(played, SAMPLES)])
+    volts[:, 1] += 5e-4 * np.random.default_rng(3).normal(size=SAMPLES)
+    u, y = (volts[:, at] * program.scales.full(each) / 10.0 for at, each in enumerate(program.channels[:2]))
+    np.savez(folder / "measured.npz", u=u, y=y)
+    command = ["import", str(folder / "measured.npz"), "--input", "u", "--output", "y", "--rate", str(rate_hz)]
+    units = [program.equations.quantities[each].unit for each in program.channels[:2]]
+    for side, unit in zip(("input", "output"), units, strict=True):
+        command += [f"--{side}-unit", unit.text if unit else "V"]
+    assert main([*command, "--out", str(folder / "recording.npz")]) == 0
+    return folder / "recording.npz"
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recording of a silverbox with other values than the program file's."""
-    folder = tmp_path_factory.mktemp("measured")
-    program = load_program(fixtures() / "programs" / "silverbox.toml")
-    computer = SuspensionComputer(program, sample_rate_hz=RATE_HZ)
-    computer.set(**TRUE)
-    rng = np.random.default_rng(3)
-    spectrum = np.where(
-        np.arange(SAMPLES // 2 + 1) < 0.3 * SAMPLES, np.exp(2j * np.pi * rng.random(SAMPLES // 2 + 1)), 0
-    )
-    u = np.fft.irfft(spectrum)
-    u *= 0.05 / u.std()
-    (y_v,) = (block[:, 1] for block in computer.play(RecordedExcitation(u * 10.0 / 0.2), SAMPLES))
-    y = y_v * 0.4 / 10.0 + 2e-5 * rng.normal(size=SAMPLES)
-    np.savez(folder / "measured.npz", u=u, y=y)
-    command = ["import", str(folder / "measured.npz"), "--input", "u", "--output", "y", "--rate", str(RATE_HZ)]
-    assert main([*command, "--out", str(folder / "recording.npz")]) == 0
-    return folder / "recording.npz"
+    played = RecordedExcitation(multisine() * 10.0 / 0.2)
+    return record(tmp_path_factory.mktemp("measured"), "silverbox", TRUE, played)
+
+
+def fit(recording: Path, program: str, capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, Any]:
+    """What calibrate tells of a recording."""
+    command = ["calibrate", "--recording", str(recording), "--program", program, "--json", *options]
+    capsys.readouterr()
+    assert main([*command, "--out", str(recording.parent / "fitted.toml")]) == 0
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return told
 
 
 def test_a_fit_finds_the_values_of_the_machine_and_keeps_them(
@@ -49,11 +74,100 @@ def test_a_fit_finds_the_values_of_the_machine_and_keeps_them(
     for parameter in told["parameters"]:
         error = abs(parameter["value"] - TRUE[parameter["name"]])
         assert error < 5.0 * parameter["standard_error"] < 0.05 * parameter["value"]
+    assert told["reconstruction"] == "band-limited" and told["other_rms"] > 5.0 * told["fit"]["rms"]
     assert told["fit"]["rms"] == pytest.approx(2e-5, rel=0.2)
     assert told["check"]["rms"] == pytest.approx(2e-5, rel=0.3)
     kept = load_program(twin)
     assert kept.values == {each["name"]: each["value"] for each in told["parameters"]}
     assert kept.equations.channels == ("u", "y")
+
+
+FRONT = {"M": 105.0, "B": 2800.0, "K": 23000.0}
+MOTOR = {"R": 1.3, "L": 4.4e-3, "k": 0.075, "J": 9e-5, "d": 2.3e-4}
+
+
+@pytest.mark.parametrize("kind", ["held", "square"])
+def test_an_input_that_is_held_between_samples_gives_no_bias(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    levels_v = 5.0 + 60.0 * multisine()
+    if kind == "square":
+        levels_v = np.where(np.arange(SAMPLES) % 100 < 50, 9.0, 1.0)
+    measured = record(tmp_path, "front", FRONT, RecordedExcitation(levels_v, is_held=True))
+    told = fit(measured, "front", capsys)
+    assert told["reconstruction"] == "held" and not told["may_jump_between_samples"]
+    for each in told["parameters"]:
+        assert each["value"] == pytest.approx(FRONT[each["name"]], rel=2e-3)
+    (mass, *_) = fit(measured, "front", capsys, "--reconstruction", "band-limited")["parameters"]
+    assert abs(mass["value"] / FRONT["M"] - 1.0) > 0.02
+
+
+def test_edges_between_the_samples_are_a_caveat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    square = Excitation(low_v=1.0, high_v=9.0, frequency_hz=20e3 / 97.3, clock="free")
+    told = fit(record(tmp_path, "front", FRONT, square), "front", capsys)
+    assert told["may_jump_between_samples"]
+
+
+def test_parameters_that_act_alike_are_named_until_enough_are_fixed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    measured = record(tmp_path, "dc-motor", MOTOR, RecordedExcitation(4.0 + 60.0 * multisine()))
+    told = fit(measured, "dc-motor", capsys)
+    assert told["inseparable"] == ["R", "L", "k", "J", "d"] and told["surplus"] == 2 and not told["unseen"]
+    assert all(each["standard_error"] is None for each in told["parameters"])
+    told = fit(measured, "dc-motor", capsys, "--fix", "R=1.3", "--fix", "d=2.3e-4")
+    assert not told["inseparable"] and len(told["parameters"]) == 3
+    for each in told["parameters"]:
+        assert abs(each["value"] - MOTOR[each["name"]]) < 5.0 * each["standard_error"] < 0.05 * each["value"]
+    assert load_program(tmp_path / "fitted.toml").values["R"] == 1.3
+
+
+def test_a_parameter_that_the_excitation_does_not_show_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    measured = record(tmp_path, "silverbox", TRUE, RecordedExcitation(0.5 * multisine()))
+    command = ["calibrate", "--recording", str(measured), "--program", "silverbox"]
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 0
+    told = capsys.readouterr().out
+    assert "square, cube: hardly act on the output here" in told
+    assert "cube" in (line := next(line for line in told.splitlines() if "not determined" in line and "cube" in line))
+    assert "+-" not in line
+
+
+def test_an_output_of_another_plant_is_a_caveat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez(tmp_path / "a.npz", u=multisine(800), y=1e-3 * np.cos(np.arange(800.0)))
+    command = ["import", str(tmp_path / "a.npz"), "--input", "u", "--output", "y", "--rate", "610"]
+    assert main([*command, "--out", str(tmp_path / "r.npz")]) == 0
+    command = ["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "silverbox"]
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 0
+    assert "caveat: the machine differs by more than the output moves" in capsys.readouterr().out
+
+
+def test_a_beginning_that_does_not_fit_names_the_cure(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["calibrate", "--recording", str(recording), "--program", "silverbox", "--span", "700:2000"]
+    assert main([*command, "--settle", "0", "--out", str(tmp_path / "twin.toml")]) == 0
+    assert "the recording did not begin at rest; pass a --settle above 0" in capsys.readouterr().out
+    assert main([*command, "--settle", "300", "--out", str(tmp_path / "twin.toml")]) == 0
+    assert "--settle" not in capsys.readouterr().out
+
+
+def test_a_program_is_fitted_to_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    twin = tmp_path / "twin.toml"
+    assert main(["calibrate", "--rig", "emulator-real", "--program", "pendulum", "--json", "--out", str(twin)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["reconstruction"] == "held" and told["check"]["rms"] < 2.0 * told["fit"]["rms"] < 0.03
+    true = load_program(fixtures() / "programs" / "pendulum.toml").values
+    assert load_program(twin).values == pytest.approx(true, rel=0.04)
+
+
+def test_a_plant_that_changes_in_the_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--scenario", "pendulum", "--dut", "inproc", "--out", str(tmp_path / "run")]) in {0, 1}
+    command = ["calibrate", "--recording", str(tmp_path / "run" / "run.npz"), "--program", "pendulum"]
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 2
+    assert "sample 1000: the plant changes in the recording; pass a span" in capsys.readouterr().err
+    assert main([*command, "--span", "0:1000", "--out", str(tmp_path / "twin.toml")]) == 0
 
 
 def test_a_poor_twin_is_not_kept(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,7 +191,10 @@ def test_a_poor_twin_is_not_kept(recording: Path, tmp_path: Path, capsys: pytest
         (["--program", "nosuch"], "no program is called 'nosuch'"),
         (["--program", "dc-motor"], "omega of program dc-motor is in rad/s"),
         (["--program", "pendulum"], "of program pendulum is in"),
-        (["--pots", "dial"], "--pots is for --rig"),
+        (["--pots", "dial"], "--pots is for a rig with front or shock"),
+        (["--fix", "mass"], "program silverbox has no parameter 'mass' on a pot; there are rate, gain"),
+        (["--fix", "gain=much"], "--fix gain=much: 'much' is no number"),
+        (["--fix", "gain=4"], "gain = 4: must be within its range, 300 to 800"),
         (["--out", "twin.npz"], "must be a .toml file"),
     ],
 )
@@ -90,7 +207,7 @@ def test_wrong_options_are_one_line(
     assert status == 2 and complaint in told and told.count("\n") == 1
 
 
-@pytest.mark.parametrize("options", [["--span", "0:9"], ["--check", "0:9"], ["--most-rms", "1"]])
+@pytest.mark.parametrize("options", [["--span", "0:9"], ["--check", "0:9"], ["--most-rms", "1"], ["--fix", "M"]])
 def test_options_of_recordings_are_refused_for_rigs(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", *options]) == 2
     assert f"{options[0]} is for --recording" in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 import struct
 import sys
 import zipfile
@@ -107,8 +108,13 @@ def write_parquet(path: Path, u: Values, y: Values) -> None:
     parquet.write_table(pa.table({"u": u, "y": y, "t": instants, "note": ["text"] * len(u)}), path)
 
 
+def write_spaces(path: Path, u: Values, y: Values) -> None:
+    np.savetxt(path, np.stack([u, y], axis=1), header="u   y", comments="")
+
+
 WRITERS: dict[str, Callable[[Path, Values, Values], None]] = {
     "a.csv": write_csv,
+    "a.txt": write_spaces,
     "a.npy": write_npy,
     "a.npz": write_npz,
     "five.mat": write_mat_5,
@@ -310,14 +316,24 @@ def _larger_mat() -> bytes:
 
 HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
 PICKLED = np.array([{"a": 1}, None], dtype=object)
+OBJECTS = np.array([({"a": 1}, 2.0), (None, 3.0)], dtype=[("u", object), ("y", float)])
 
 BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     "suffix": ("a.xls", b"", "the suffix must be one of .csv"),
     "empty csv": ("a.csv", b"", "holds no line of text"),
-    "binary csv": ("a.csv", bytes(range(256)) * 20, "no column is called 'u'"),
+    "binary csv": ("a.csv", bytes(range(256)) * 20, "holds bytes of zero: UTF-16, or no text; save it as text"),
+    "UTF-16": ("a.csv", "u,y\n1,2\n3,4\n".encode("utf-16"), "is UTF-16 text: save it as UTF-8"),
+    "UTF-16 without a mark": ("a.csv", "u,y\n1,2\n3,4\n".encode("utf-16-le"), "holds bytes of zero: UTF-16"),
+    "Latin-1": ("a.csv", "u [°],y\n1,2\n3,4\n".encode("latin-1"), "the file is no UTF-8: save it as UTF-8"),
+    "workbook": ("a.csv", b"PK\x03\x04" + bytes(60), "is a workbook or an archive: export its table as CSV"),
+    "compressed csv": ("a.csv", b"\x1f\x8b" + bytes(60), "is compressed: unpack it"),
+    "text above the header": ("a.csv", b"Logger 7\nu,y\n1,2\n3,4\n", "--skip-lines N leaves out text above the header"),
+    "tiny signal": ("a.csv", b"u,y\n1e-8,1\n-1e-8,2\n", "largest magnitude 1.00003e-08: a range must be wider"),
+    "one row": ("a.csv", b"u,y\n1,2\n", "has a single row: a recording needs two"),
     "no such column": ("a.csv", b"a,b\n1,2\n", "no column is called 'u'; there are a, b"),
     "two of one name": ("a.csv", b"u,u,y\n1,2,3\n", "2 columns are called 'u'"),
     "word for a number": ("a.csv", b"u,y\n1,2\n3,four\n", "line 3, column y: 'four' is no number"),
+    "number with an underscore": ("a.csv", b"u,y\n1,2\n3,1_0\n", "line 3, column y: '1_0' is no number"),
     "short row": ("a.csv", b"u,y\n1,2\n3\n", "line 3, column y: the line has no such cell"),
     "decimal commas": ("a.csv", b"u,y\n0,5,1,5\n", "line 2 has 4 cells, the first line 2: cells with decimal commas"),
     "no number at all": ("a.csv", b"u,y\n1,\n2,\n", "column y: holds no number"),
@@ -325,27 +341,36 @@ BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     "long cell": ("a.csv", b"u,y\n1," + b"9" * 60_000 + b"x\n", "line 2, column y"),
     "many columns": ("a.csv", b",".join(b"c%d" % k for k in range(5000)) + b"\n", "more than 4096 columns"),
     "header alone": ("a.csv", b"u,y\n", "has no row 0"),
-    "no signal": ("a.csv", b"u,y\n0,0\n0,0\n", "largest magnitude 0: must be 1e-9 to 1e8; scale it"),
-    "overflow": ("a.csv", b"u,y\n1e300,1\n1,1\n", "must be 1e-9 to 1e8; scale it"),
-    "no npy": ("a.npy", b"no array", "damaged, or no NumPy file"),
-    "npy of objects": ("a.npy", lambda: _npy(PICKLED), "damaged, or no NumPy file"),
+    "no signal": ("a.csv", b"u,y\n0,0\n0,0\n", "largest magnitude 0: a range must be wider than 1e-07"),
+    "overflow": ("a.csv", b"u,y\n1e300,1\n1,1\n", "and within +-1e+08; scale it"),
+    "no npy": ("a.npy", b"no array", "holds no array of NumPy, perhaps a pickle"),
+    "npy of objects": ("a.npy", lambda: _npy(OBJECTS), "u holds Python objects, which are not loaded; save numbers"),
+    "pickle": ("a.npy", pickle.dumps({"u": 1}), "perhaps a pickle, which is not loaded; write it with numpy.save"),
     "npy of 1e12": (
         "a.npy",
         npy_bytes("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"),
-        "NumPy",
+        "0 has 1000000000000 samples, more than 10000000",
     ),
     "npy header": ("a.npy", npy_bytes("__import__('os').abort()"), "damaged, or no NumPy file"),
     "npy of text": ("a.npy", lambda: _npy(np.array([("a", "b")], dtype="U1,U1")), "no column is called 'u'"),
     "no npz": ("a.npz", b"PK\x03\x04 no archive", "damaged, or no NumPy file"),
-    "npz of objects": ("a.npz", lambda: npz_bytes(u=PICKLED, y=PICKLED), "no column is called 'u'"),
+    "npz of objects": (
+        "a.npz",
+        lambda: npz_bytes(u=PICKLED, y=PICKLED),
+        "u holds Python objects, which are not loaded",
+    ),
     "npz of 1e12": (
         "a.npz",
         zip_bytes("u.npy", npy_bytes(HUGE)),
         "larger than its member",
     ),
-    "npz bomb": ("a.npz", zip_bytes("u.npy", bytes(20_000_000)), "damaged, or no NumPy file"),
+    "npz bomb": ("a.npz", zip_bytes("u.npy", bytes(20_000_000)), "holds no array of NumPy"),
     "npz lengths": ("a.npz", lambda: npz_bytes(u=np.ones(5), y=np.ones(4)), "differ in length: u 5, y 4"),
-    "npz of complex": ("a.npz", lambda: npz_bytes(u=np.ones(5) * 1j, y=np.ones(4)), "no column is called 'u'"),
+    "npz of complex": (
+        "a.npz",
+        lambda: npz_bytes(u=np.ones(5) * 1j, y=np.ones(5)),
+        "u holds no real numbers, but complex",
+    ),
     "no mat": ("a.mat", b"MATLAB 5.0 " * 40, "damaged, or no MATLAB file"),
     "mat of 1e9": ("a.mat", _larger_mat, "more than 10000000"),
     "mat of structs": ("a.mat", lambda: mat_bytes(u={"a": 1.0}, y={"a": 1.0}), "no column is called 'u'"),
@@ -379,6 +404,41 @@ def test_a_wrong_file_is_one_line(defect: str, tmp_path: Path, capsys: pytest.Ca
     assert not out.exists()
 
 
+def test_too_many_lines_are_refused_before_they_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(column_reader, "MAX_SAMPLES", 1000)
+    monkeypatch.setattr(column_reader, "_cells", None)
+    (tmp_path / "a.csv").write_text("u,y\n" + "1,2\n" * 1001)
+    with pytest.raises(column_reader.ColumnError, match=r"has more than 1000 samples; cut it into files"):
+        column_reader.read(tmp_path / "a.csv", ["u", "y"])
+
+
+@pytest.mark.parametrize(
+    ("text", "caveat"),
+    [
+        ("u,y\n1,2\n\n3,4\n\n\n5,6\n\n", "caveat: 3 blank lines between rows skipped: check that no sample"),
+        ("u,y\n1,2\n3,2\n", "caveat: displacement is constant: no plant can be identified"),
+    ],
+)
+@pytest.mark.usefixtures("in_this_process")
+def test_doubtful_data_are_imported_with_a_caveat(
+    text: str, caveat: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(tmp_path / "out.npz")]
+    assert main(["import", str(tmp_path / "a.csv"), *named]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")]
+    assert len(told) == 1 and told[0].startswith(caveat)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_fields_of_structured_arrays_are_columns(tmp_path: Path) -> None:
+    rows = np.zeros(5, [("u", "f8"), ("more", [("y", "f4"), ("three", "i2", (3,))])])
+    rows["more"]["y"], rows["more"]["three"][:, 2] = 3.0, 7
+    np.savez(tmp_path / "a.npz", data=rows)
+    found = read_columns(tmp_path / "a.npz", ["data.u", "data.more.y", "data.more.three[2]"])
+    assert [column[0] for column in found.columns.values()] == [0.0, 3.0, 7.0]
+
+
 DEEP = "[" * 2000 + "]" * 2000
 
 BAD_SETTINGS = {
@@ -386,6 +446,7 @@ BAD_SETTINGS = {
     "unknown key": ("speed = 3", [], "unknown key 'speed'"),
     "table": ("input = 3", [], "must be a table"),
     "range": ('[input]\ncolumn = "u"\nrange = [1.0, -1.0]', [], "range must ascend"),
+    "narrow range": ("", ["--input-range", "5", "5.00000001", "--rate", "1"], "range [5, 5]: a range must be wider"),
     "bits": ("bits = 24", [], "bits must be 2 to 16"),
     "rate": ("rate_hz = nan", [], "rate_hz"),
     "rate twice": ('rate_hz = 1.0\ntime = "t"', [], "state the rate twice"),
@@ -434,13 +495,13 @@ def test_a_reader_that_crashes_is_reported(tmp_path: Path, monkeypatch: pytest.M
         read_columns(tmp_path / "a.csv")
 
 
-def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.mat").write_bytes(b"\x89HDF\r\n\x1a\n")
     for module, name in (("h5py", "a.mat"), ("pyarrow", "a.parquet"), ("asammdf", "a.mf4")):
         monkeypatch.setitem(sys.modules, module, None)
         (tmp_path / name).touch()
         found = column_reader.answer({"file": str(tmp_path / name), "wanted": ["u"], "skip_lines": 0, "out": ""})
-        assert f"need {module}: pip install 'analogrig[import]'" in found["error"]
+        assert f"need {module}: pip install {module}" in found["error"]
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -23,6 +23,7 @@ from analogrig_emulator.errors import CircuitError, PotError
 _PLACES = 5000
 """Number of places with a noise of their own on a continuous track."""
 
+_ROUNDING = 1e-9
 END_FRACTION = 1e-6
 """Part of the track between wiper and terminal at an end stop, so that no leg is a short circuit."""
 
@@ -61,10 +62,11 @@ def coefficient_under_load(dial: float, track_ohm: float, load_ohm: float) -> fl
 def dial_for(coefficient: float, track_ohm: float, load_ohm: float, name: str = "pot") -> float:
     """Dial for a coefficient under load: the inverse of coefficient_under_load.
 
-    Raises PotError naming the pot when the coefficient is not within 0..1.
+    Raises PotError naming the pot when the coefficient is not within 0..1, but for rounding.
     """
-    if not 0.0 <= coefficient <= 1.0:
+    if not 0.0 <= coefficient <= 1.0 + _ROUNDING:
         raise PotError(f"pot {name}: coefficient {coefficient:.6g} is beyond the track (0 to 1)")
+    coefficient = min(coefficient, 1.0)
     # The positive root of c a k^2 + (1 - c a) k - c = 0 with a = Rp/RL, in the form that does not cancel.
     ca = coefficient * track_ohm / load_ohm
     return 2.0 * coefficient / ((1.0 - ca) + math.sqrt((1.0 - ca) ** 2 + 4.0 * ca * coefficient))

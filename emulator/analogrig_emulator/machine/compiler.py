@@ -66,6 +66,10 @@ _ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 _LEAST_COEFFICIENT = 2e-4
 """One winding of a pot's 5000."""
 
+_SLOW = 0.1
+"""Coefficient with the largest capacitor below which an integrator gains by more speed."""
+
+_LONGEST_SHOWN = 32
 _MOST_CORNERS = 6
 _EXACT = 1e-9
 
@@ -218,9 +222,27 @@ def compile_program(equations: Equations) -> PatchedProgram:
     Raises ProgramError naming the term that cannot be patched, and what to change.
     """
     stages = stages_of(equations)
+    _check_driven(stages)
     reach = reaches(stages)
     fulls = _Scaling(stages, reach).fulls()
     return _Patcher(stages, reach, fulls).program()
+
+
+def _check_driven(stages: Stages) -> None:
+    """Raise ProgramError for a state on which no input and no constant acts: it starts at 0 and stays there."""
+    driven = {REFERENCE, *stages.equations.inputs}
+    rows = list(stages.stages)
+    while found := [row for row in rows if any(cord.source in driven for cord in row.cords)]:
+        driven |= {row.name for row in found}
+        rows = [row for row in rows if row.name not in driven]
+    states = [row for row in rows if row.kind is StageKind.INTEGRATOR]
+    if states:
+        names = ", ".join(row.name for row in states)
+        stay = "stays" if len(states) == 1 else "stay"
+        raise ProgramError(
+            f"{states[0].place}: no input acts on {names}, which {stay} at 0, where states start; "
+            "add a term with an input, or delete the line"
+        )
 
 
 @dataclass
@@ -536,21 +558,39 @@ class _Patcher:
         return PatchedCord(cord, top, sign, coefficient, gain, resistor, pot, ratio * abs(cord.number) / gain)
 
     def _check_coefficient(self, stage: PatchStage, cord: Cord, coefficient: float, most: float) -> None:
-        what = f"{stage.place}: term {cord.text} of {stage.name}"
+        name = _clipped(stage.name)
+        what = f"{stage.place}: term {_clipped(cord.text)} of {name}"
         if most > 10 * (1 + _EXACT):
             raise ProgramError(
                 f"{what} needs a coefficient of {most:.3g}, and there are 10; "
-                f"write full = {_rounded_up(self._fulls[stage.name] * most / 10):g} for {stage.name}"
+                f"write full = {_rounded_up(self._fulls[stage.name] * most / 10):g} for {name}"
             )
         if coefficient < _LEAST_COEFFICIENT:
             raise ProgramError(
                 f"{what} has a coefficient of {coefficient:.2g}, below one winding of a pot ({_LEAST_COEFFICIENT:g}); "
-                f"delete the term, lower the full scale of {stage.name}, "
-                "or let it move more in the trial (speed, period_s)"
+                f"{self._cure_of_small(stage)}"
             )
+
+    def _cure_of_small(self, stage: PatchStage) -> str:
+        """Cure of a coefficient that is too small: an integrator that is slow as a whole needs more speed."""
+        speed = self._stages.equations.speed
+        if stage.kind is StageKind.INTEGRATOR:
+            rates = [self._ratio(stage, cord) * extremes(self._stages, cord, stage.place)[1] for cord in stage.cords]
+            most = speed * max(rates) * INPUT_OHM * _CAPACITORS_FARAD[0]
+            if most < _SLOW:
+                return f"the integrator is slow, at most {most:.2g} with 1 uF: write speed = {speed / most:.3g} or less"
+        return (
+            f"delete the term, lower the full scale of {_clipped(stage.name)}, or let it move more in the trial "
+            "(speed, period_s)"
+        )
 
 
 _LETTERS = {StageKind.PRODUCT: "X", StageKind.FUNCTION: "D"}
+
+
+def _clipped(formula: str) -> str:
+    """Formula for a message."""
+    return formula if len(formula) <= _LONGEST_SHOWN else f"{formula[:_LONGEST_SHOWN]}..."
 
 
 def _reserved(name: str) -> bool:

@@ -447,7 +447,7 @@ class _Reader:
                 formula = parse_formula(_text("formula", text))
                 for used in formula.names():
                     if used not in units and used not in CONSTANTS:
-                        raise ProgramError(f"unknown name {used!r}{suggestion(used, units)}")
+                        raise ProgramError(f"unknown name {used[:40]!r}{suggestion(used, units)}")
                 units[name] = self.parameters[name].unit
                 _check_unit(name, units[name], formula.unit(units, {}))
                 found[name] = formula
@@ -482,7 +482,7 @@ class _Reader:
         for line in lines:
             for name in line.formula.names():
                 if name not in known:
-                    raise ProgramError(f"{line.place}: unknown name {name!r}{suggestion(name, known)}")
+                    raise ProgramError(f"{line.place}: unknown name {name[:40]!r}{suggestion(name, known)}")
                 used.add(name)
         for key, names in (("inputs", self.inputs), ("parameters", self.parameters)):
             for name in names:

@@ -218,7 +218,7 @@ class SuspensionComputer:
 
     def _excite(self, excitation: Excitation | RecordedExcitation, window: tuple[int, int]) -> Edges:
         """Edges of a window; the machine follows a level that moves all the time instead."""
-        if isinstance(excitation, Excitation) and not excitation.is_smooth:
+        if not excitation.is_smooth:
             return excitation.edges(*window, self.sample_rate_hz)
         self.machine.follow({SOURCE: excitation.drive(*window, self.sample_rate_hz)})
         return Edges.none()
@@ -265,7 +265,28 @@ class SuspensionComputer:
         except PotError as cause:
             named = self.program.pots[pot].settings
             texts = [f"{name} = {values[name]:g}" for name in named if settings is None or name in settings]
-            raise PotError(f"{cause}; {', '.join(texts)} cannot be set on program {self.program.name}") from cause
+            limit = self._limit(pot, values) if len(named) == 1 else ""
+            raise PotError(
+                f"{', '.join(texts)} cannot be set on program {self.program.name}{limit}: {cause}"
+            ) from cause
+
+    def _limit(self, pot: str, values: Mapping[str, float]) -> str:
+        """Limit of the one parameter that turns a pot, in words; empty if it follows no power law."""
+        (name,) = self.program.pots[pot].settings
+        value = values[name]
+        if not 0.0 < value < math.inf:
+            return ""
+        here, doubled = (self.program.pot_coefficient(pot, dict(values) | {name: each}) for each in (value, 2 * value))
+        power = math.log2(doubled / here)
+        if not power or abs(power - round(power)) > _EXACT:
+            return ""
+        limit = value * here ** (-1.0 / power)
+        digit = 10.0 ** (math.floor(math.log10(limit)) - 3)
+        within = math.floor(limit / digit + _EXACT) if power > 0 else math.ceil(limit / digit - _EXACT)
+        return f", whose {name} is at {'most' if power > 0 else 'least'} {within * digit:.4g}"
+
+
+_EXACT = 1e-9
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ _POINTS = 200
 _MOST_EVALUATIONS = 20_000
 _TOLERANCE = 1e-5
 _LARGEST = 1e30
+_MOST_GROWTH = 100.0
+"""Largest peak in the second period, in that of the first: four integrators in series grow 16 times."""
 _States = NDArray[np.float64]
 """(states, settings)"""
 
@@ -90,9 +92,9 @@ def _played(
     for half in range(_HALF_PERIODS):
         known = parameters | {name: each[half] for name, each in levels.items()}
         stretch = solve(slopes, known, state, instants_s)
-        _check_bounded(equations, every, stretch)
         state = stretch[-1]
         stretches.append(stretch)
+        _check_bounded(equations, every, stretches)
     inputs = {name: np.repeat(each, _POINTS) for name, each in levels.items()}
     return inputs, np.concatenate(stretches)
 
@@ -106,16 +108,31 @@ def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _check_bounded(equations: Equations, every: Sequence[Mapping[str, float]], stretch: NDArray[np.float64]) -> None:
-    for place, values in enumerate(every):
-        for name, column in zip(equations.states, stretch[:, :, place].T, strict=True):
-            if not (np.abs(column) < _LARGEST).all():
-                changed = [f"{key} = {value:g}" for key, value in values.items() if value != equations.values[key]]
-                where = f" with {', '.join(changed)}" if changed else ""
-                raise ProgramError(
-                    f"trial play: state {name} grows without bound{where}; correct a sign or a value, "
-                    "or a divisor that comes near zero"
-                )
+def _check_bounded(
+    equations: Equations, every: Sequence[Mapping[str, float]], stretches: Sequence[NDArray[np.float64]]
+) -> None:
+    """Raise ProgramError for a state that overflows, or peaks far higher in each period than in the one before."""
+    peaks = np.array([np.abs(stretch).max(axis=0) for stretch in stretches])  # (halves, states, settings)
+    with np.errstate(all="ignore"):
+        grows = ~(peaks[-1] < _LARGEST)
+        if len(peaks) == _HALF_PERIODS:
+            grows |= peaks[-1] > _MOST_GROWTH * peaks[1]
+    if not grows.any():
+        return
+    at, place = (int(each[0]) for each in np.nonzero(grows))
+    name, values = list(equations.states)[at], every[place]
+    changed = [f"{key} = {value:g}" for key, value in values.items() if value != equations.values[key]]
+    where = f" with {', '.join(changed)}" if changed else ""
+    column = np.abs(np.concatenate(stretches)[:, at, place])
+    last = int(np.flatnonzero(column < _LARGEST)[-1])
+    reached = f"reaches {column[last]:.3g}"
+    if last + 1 < len(column):
+        last, reached = last + 1, f"exceeds {_LARGEST:g}"
+    at_s = 0.5 * equations.period_s * (last // _POINTS + last % _POINTS / (_POINTS - 1))
+    raise ProgramError(
+        f"the trial play grows without end: state {name} {reached} at {at_s:.3g} s{where}; the plant is unstable: "
+        "correct a sign or a value, or a divisor that comes near zero"
+    )
 
 
 def _check_rest(stages: Stages, values: Mapping[str, float]) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.fitting import fit_recording
+from analogrig.cli.fitting import fit_recording, fit_rig
 from analogrig.cli.options import FILE, add_command, add_json, add_rig, add_seed, count, files_read, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
 
@@ -17,7 +18,7 @@ MOST_LSB = 1.0
 """Largest rms difference between rig and twin, on data that the fit has not seen."""
 
 PROGRAMS = ("front", "shock")
-"""Programs with which rigs are fitted."""
+"""Programs for which the components of a rig are fitted; for others, the parameters of the program."""
 
 _SHOWN_AS = {"": (100.0, "%"), "V": (1e3, "mV"), "s": (1e6, "us"), "LSB": (1.0, "LSB")}
 """Scale and unit in which an estimate is shown, by its own unit."""
@@ -30,6 +31,7 @@ def add(commands: Any) -> None:
         "fit the emulator to a rig's recordings, and keep it as the rig's twin",
         "calibrate --rig emulator-real --out build/twin.toml",
         "calibrate --rig bench --op-amp 741 --components polyester",
+        "calibrate --rig lucidac --program dc-motor --fix R --out build/motor.toml",
         "calibrate --recording build/silverbox.npz --program silverbox --span 40000:130000 --check 0:40000",
     )
     add_rig(command)
@@ -44,7 +46,8 @@ def add(commands: Any) -> None:
         "--program",
         default="front",
         metavar="PROGRAM",
-        help="program of the computer: front or shock, or with --recording any program file (default: %(default)s)",
+        help="program of the computer, or a program file; its parameters are fitted, but with front and shock on a rig"
+        " the components (default: %(default)s)",
     )
     command.add_argument(
         "--recording", type=Path, metavar=FILE, help="fit the program's parameters to this recording instead of a rig"
@@ -53,6 +56,18 @@ def add(commands: Any) -> None:
     command.add_argument("--check", metavar="FIRST:END", help="samples of the recording to compare only")
     command.add_argument(
         "--settle", type=count, metavar="N", help="samples at the start of either that are not compared (default: 200)"
+    )
+    command.add_argument(
+        "--fix",
+        action="append",
+        default=[],
+        metavar="NAME[=VALUE]",
+        help="parameter that is known and not fitted; repeat for more (default value: the program's)",
+    )
+    command.add_argument(
+        "--reconstruction",
+        choices=("band-limited", "held"),
+        help="course of the input between the samples of the recording (default: the one that fits better)",
     )
     command.add_argument(
         "--most-rms", type=float, metavar="X", help="largest rms difference of a twin to keep, in the output's unit"
@@ -90,7 +105,9 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
     if arguments.recording is not None:
         return fit_recording(arguments)
-    _check_for_a_rig(arguments)
+    if arguments.program not in PROGRAMS:
+        return _fit_rig(arguments)
+    _check_for_a_rig(arguments, ("span", "check", "settle", "most_rms", "fix", "reconstruction"))
     move_aside(arguments.out, files_read(arguments))
     plays, recordings = [*scenarios(arguments.program), check_scenario(arguments.program)], []
     show_progress = progress_line("recordings")
@@ -123,15 +140,25 @@ def _run(arguments: argparse.Namespace) -> int:
     return PASSED if is_twin else FAILED
 
 
-def _check_for_a_rig(arguments: argparse.Namespace) -> None:
-    """:raises ConfigurationError: an option or program is for recordings alone."""
+def _fit_rig(arguments: argparse.Namespace) -> int:
+    """Fit the parameters of a program to a rig."""
+    from analogrig.errors import RigError
+
+    _check_for_a_rig(arguments, ("span", "check"))
+    try:
+        return fit_rig(arguments)
+    except RigError as error:
+        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
+
+
+def _check_for_a_rig(arguments: argparse.Namespace, options: Sequence[str]) -> None:
+    """:raises ConfigurationError: one of these options is given."""
     from analogrig.errors import ConfigurationError
 
-    for option in ("span", "check", "settle", "most_rms"):
-        if getattr(arguments, option) is not None:
-            raise ConfigurationError(f"--{option.replace('_', '-')} is for --recording")
-    if arguments.program not in PROGRAMS:
-        raise ConfigurationError(f"--program {arguments.program}: a rig is fitted with {' or '.join(PROGRAMS)}")
+    for option in options:
+        if getattr(arguments, option) not in (None, []):
+            others = "" if option in ("span", "check") else ", and for programs other than front and shock"
+            raise ConfigurationError(f"--{option.replace('_', '-')} is for --recording{others}")
 
 
 def _values(found: Calibration) -> list[str]:

@@ -1,4 +1,4 @@
-"""``analogrig calibrate --recording``: a program becomes the twin of measured data."""
+"""``analogrig calibrate`` of a program: it becomes the twin of measured data, or of a rig that plays it."""
 
 from __future__ import annotations
 
@@ -10,47 +10,109 @@ from typing import TYPE_CHECKING
 from analogrig.cli.terminal import FAILED, PASSED, show, show_result, show_work
 
 if TYPE_CHECKING:
-    from analogrig.hardware.calibration.recorded import FittedParameter, Residual
+    from analogrig.hardware.calibration.recorded import (
+        FittedParameter,
+        ProgramTwin,
+        Reconstruction,
+        RecordedPlant,
+        Residual,
+        Span,
+    )
+    from analogrig.run import Run
 
 
 def fit_recording(arguments: argparse.Namespace) -> int:
     """Fit a program to a recording, and keep it as a program file with the fitted values."""
     from analogrig.config import locate
-    from analogrig.errors import ConfigurationError
-    from analogrig.hardware.calibration.recorded import SETTLING_N, RecordedPlant, fit_program
     from analogrig.output import move_aside
-    from analogrig.rigs.emulator import ComputerDescription
     from analogrig.run import Run
-    from analogrig.storage import replace_file
-    from analogrig_emulator import load_program
 
-    if arguments.pots is not None:
-        raise ConfigurationError("--pots is for --rig: the pots of a twin of a recording are continuous")
     file = locate("programs", arguments.program)
     move_aside(arguments.out, (file, arguments.recording))
     run = Run.load(arguments.recording)
+    plant = _plant(file, run, arguments)
+    span = plant.span(*_span(arguments, "span", run.samples), _settling_n(arguments))
+    check = plant.span(*_span(arguments, "check", run.samples), _settling_n(arguments)) if arguments.check else None
+    return _fit(arguments, file, plant, span, (plant, check) if check else None)
+
+
+def fit_rig(arguments: argparse.Namespace) -> int:
+    """Fit a program to two recordings of a rig, of which one is only compared, and keep it likewise."""
+    from analogrig.cli.options import files_read, trust_of
+    from analogrig.config import locate
+    from analogrig.hardware.calibration.averages import record_program
+    from analogrig.output import move_aside
+    from analogrig.program import Program
+    from analogrig.rigs.description import open_rig
+
+    file, program = locate("programs", arguments.program), Program.load(arguments.program)
+    move_aside(arguments.out, (file, *files_read(arguments)))
+    with open_rig(arguments.rig, allow=trust_of(arguments)) as rig, show_work("recording"):
+        fitted, check = (
+            _plant(file, record_program(rig, program, part, arguments.seed), arguments) for part in range(2)
+        )
+    span, check_span = (each.span(0, each.run.samples, _settling_n(arguments)) for each in (fitted, check))
+    return _fit(arguments, file, fitted, span, (check, check_span), "held")
+
+
+def _plant(file: Path, run: Run, arguments: argparse.Namespace) -> RecordedPlant:
+    from analogrig.errors import ConfigurationError
+    from analogrig.hardware.calibration.recorded import RecordedPlant
+    from analogrig.rigs.emulator import ComputerDescription
+    from analogrig_emulator import load_program
+
+    if arguments.pots is not None:
+        raise ConfigurationError("--pots is for a rig with front or shock: the pots of this twin are continuous")
     computer = ComputerDescription(op_amp=arguments.op_amp, components=arguments.components or "nominal")
-    plant = RecordedPlant(load_program(file), run, computer, arguments.seed)
-    settling_n = SETTLING_N if arguments.settle is None else arguments.settle
-    span = plant.span(*_span(arguments, "span", run.samples), settling_n)
-    check = plant.span(*_span(arguments, "check", run.samples), settling_n) if arguments.check else None
+    return RecordedPlant(load_program(file), run, computer, arguments.seed)
+
+
+def _settling_n(arguments: argparse.Namespace) -> int:
+    from analogrig.hardware.calibration.recorded import SETTLING_N
+
+    return SETTLING_N if arguments.settle is None else int(arguments.settle)
+
+
+def _fit(
+    arguments: argparse.Namespace,
+    file: Path,
+    plant: RecordedPlant,
+    span: Span,
+    check: tuple[RecordedPlant, Span] | None,
+    reconstruction: Reconstruction | None = None,
+) -> int:
+    """Fit a program to a span, and keep it unless it differs too much from the samples that are only compared.
+
+    :param reconstruction: default course of the input between its samples; None: the one that fits better.
+    """
+    from analogrig.hardware.calibration.recorded import fit_program
+    from analogrig.storage import replace_file
+
+    fixed = dict(_fixed(text, plant.program.values) for text in arguments.fix)
     with show_work("fitting"):
-        twin = fit_program(plant, span)
-        checked = plant.difference(twin.values, check) if check else None
-    unit = run.conditions.channels["displacement"].unit
+        twin = fit_program(plant, span, reconstruction=arguments.reconstruction or reconstruction, fixed=fixed)
+        checked = check and check[0].difference(twin.values, check[1], twin.reconstruction)
+    unit = plant.output_unit
     is_twin = arguments.most_rms is None or (checked or twin.fit).rms <= arguments.most_rms
     lines = [
         *(_parameter_line(each) for each in twin.estimates),
         f"samples {span.first} to {span.end - 1}, fitted: {_words(twin.fit, unit)}",
     ]
     if check and checked:
-        lines.append(f"samples {check.first} to {check.end - 1}, not fitted: {_words(checked, unit)}")
+        lines.append(f"samples {check[1].first} to {check[1].end - 1}, not fitted: {_words(checked, unit)}")
+    lines += [_reconstruction_line(twin, unit), *_caveats(twin)]
+    lines += _settling_lines(twin.fit, checked, _settling_n(arguments))
     if is_twin:
         with replace_file(arguments.out) as out:
             out.write(_program_toml(file, twin.values, lines, arguments).encode("utf-8"))
     if arguments.json:
-        table = {"program": str(file), "recording": str(arguments.recording), "unit": unit, "plays": twin.plays}
+        table = {"program": str(file), "unit": unit, "plays": twin.plays}
+        table |= {"recording": arguments.recording and str(arguments.recording), "rig": arguments.rig}
         table |= {"parameters": [vars(each) for each in twin.estimates], "fit": vars(twin.fit)}
+        table |= {"reconstruction": twin.reconstruction, "other_rms": twin.other_rms}
+        table |= {"output_rms": twin.output_rms}
+        table |= {"may_jump_between_samples": twin.may_jump_between_samples}
+        table |= {"unseen": twin.unseen, "inseparable": twin.inseparable, "surplus": twin.surplus}
         table |= {"check": checked and vars(checked), "file": str(arguments.out) if is_twin else None}
         show_result(table, arguments)
     else:
@@ -60,7 +122,66 @@ def fit_recording(arguments: argparse.Namespace) -> int:
 
 
 def _parameter_line(each: FittedParameter) -> str:
+    if each.standard_error is None:
+        return f"{each.name:12} {each.value:12.6g} not determined"
     return f"{each.name:12} {each.value:12.6g} +- {each.standard_error:9.3g} {each.unit:10} {each.place}"
+
+
+def _reconstruction_line(twin: ProgramTwin, unit: str) -> str:
+    from analogrig.hardware.calibration.recorded import RECONSTRUCTIONS
+
+    line = f"input between the samples: {twin.reconstruction}"
+    if twin.other_rms is None:
+        return line
+    (other,) = (each for each in RECONSTRUCTIONS if each != twin.reconstruction)
+    return f"{line} ({other}: within {twin.other_rms:.4g} {unit} rms)"
+
+
+def _caveats(twin: ProgramTwin) -> list[str]:
+    """Reasons to doubt the values, with their cures, one line each."""
+    lines = []
+    if twin.fit.rms > twin.output_rms:
+        lines.append(
+            f"caveat: the machine differs by more than the output moves ({twin.output_rms:.4g} rms): check program,"
+            " columns and units"
+        )
+    if twin.may_jump_between_samples:
+        lines.append(
+            "caveat: the input jumps, and neither course of it fits much better: its edges may lie between the samples;"
+            " record faster, or on the generator's clock"
+        )
+    if twin.unseen:
+        names = ", ".join(twin.unseen)
+        lines.append(f"caveat: {names}: hardly act on the output here; use another excitation, or pass --fix NAME")
+    if twin.inseparable:
+        names = ", ".join(twin.inseparable)
+        lines.append(
+            f"caveat: {names}: act alike on the output; pass --fix NAME=VALUE for {twin.surplus} of them, or use"
+            " another excitation or output"
+        )
+    return lines
+
+
+def _settling_lines(fit: Residual, checked: Residual | None, settling_n: int) -> list[str]:
+    for what, each in (("fitted", fit), ("other", checked)):
+        if each is not None and not each.is_settled:
+            line = (
+                f"caveat: the first tenth of the {what} samples differs {each.beginning:.2g} times as much as the rest:"
+                f" the recording did not begin at rest; pass a --settle above {settling_n}"
+            )
+            return [line]
+    return []
+
+
+def _fixed(text: str, values: Mapping[str, float]) -> tuple[str, float]:
+    """Name and value of an option NAME=VALUE; without a value that of the program."""
+    from analogrig.errors import ConfigurationError
+
+    name, equals, value = text.partition("=")
+    try:
+        return name, float(value) if equals else values.get(name, 0.0)
+    except ValueError:
+        raise ConfigurationError(f"--fix {text[:60]}: {value[:40]!r} is no number") from None
 
 
 def _words(difference: Residual, unit: str) -> str:
@@ -89,7 +210,7 @@ def _program_toml(file: Path, values: Mapping[str, float], lines: Sequence[str],
         table["parameters"][name]["value"] = value
     made_by = provenance(Identity.here(arguments.command_line, arguments.started))
     heading = [
-        f"Program {arguments.program} as fitted to {arguments.recording}.",
+        f"Program {arguments.program} as fitted to {arguments.recording or f'the rig {arguments.rig!r}'}.",
         *lines,
         *(f"{name}: {' '.join(value.split())}" for name, value in made_by),
     ]

@@ -136,7 +136,25 @@ def _as_json(run: Run, arguments: argparse.Namespace) -> dict[str, Any]:
         "rate_hz": 1.0 / conditions.sample_period_s,
         "channels": {name: vars(channel) for name, channel in conditions.channels.items()},
         "truth": bool(conditions.segments),
+        "caveats": _caveats(run),
     }
+
+
+def _caveats(run: Run) -> list[str]:
+    """Reasons to doubt a recording, one line each."""
+    import numpy as np
+
+    from analogrig.wording import number_of
+
+    names = run.conditions.program.channels
+    lines = [
+        f"caveat: {name.replace('_', ' ')} is constant: no plant can be identified"
+        for name in run.conditions.program.measured
+        if np.ptp(run.codes[~run.clipped[:, names.index(name)], names.index(name)]) == 0
+    ]
+    if blank := run.conditions.rig.get("blank_lines"):
+        lines.append(f"caveat: {number_of(blank, 'blank line')} between rows skipped: check that no sample is missing")
+    return lines
 
 
 def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
@@ -148,4 +166,4 @@ def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
         low, high = (volts * channel.unit_per_v for volts in (channel.low_v, high))
         lines.append(f"{name.replace('_', ' ')}: {channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}")
     known = f"that of scenario {conditions.scenario['name']}" if conditions.segments else "unknown: UNJUDGED"
-    return [*lines, f"truth: {known}", f"next: analogrig replay {arguments.out} --dut inproc"]
+    return [*lines, *_caveats(run), f"truth: {known}", f"next: analogrig replay {arguments.out} --dut inproc"]

@@ -3,7 +3,7 @@
 It runs in a process of its own with bounded memory and time, because a damaged or hostile file may exhaust the memory
 or crash the library that reads it. Nothing in a file is executed: no pickles, no formulas, no links to other files.
 REQUEST is a JSON object: ``file``; ``wanted``, the columns to read; ``skip_lines``; ``out``, the .npz to write them to.
-The answer is a JSON object on standard output: ``names`` and ``rate_hz``, or ``error``.
+The answer is a JSON object on standard output: ``names``, ``rate_hz`` and ``blank_lines``, or ``error``.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import resource
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +39,17 @@ MOST_COLUMNS = 4096
 
 _LONGEST_LINE = 1 << 16
 _MOST_NAME = 120
-_EXTRA = "pip install 'analogrig[import]'"
+_CHUNK_BYTES = 1 << 20
 _DELIMITERS = (",", ";", "\t")
+_SPACES = " "
+"""Delimiter of cells that stand apart by any number of spaces."""
+_NO_TEXT = {
+    b"\xff\xfe": "is UTF-16 text: save it as UTF-8",
+    b"\xfe\xff": "is UTF-16 text: save it as UTF-8",
+    b"PK\x03\x04": "is a workbook or an archive: export its table as CSV",
+    b"\x1f\x8b": "is compressed: unpack it",
+}
+"""Files that are no delimited text, by their first bytes."""
 
 Column = NDArray[np.float64]
 
@@ -56,6 +65,15 @@ class Table:
     columns: dict[str, Callable[[], Column]] = field(default_factory=dict)
     rate_hz: float | None = None
     """Sample rate that the file states; None if it states none."""
+
+    def add_typed(self, name: str, dtype: np.dtype[Any], shape: Sequence[int], load: Callable[[], Any]) -> None:
+        """Add an array of NumPy, or each field of a structured one as ``name.field``; texts are left out."""
+        for field_name in dtype.names or ():
+            each = dtype[field_name]
+            label = f"{name}.{field_name}" if name else field_name
+            self.add_typed(label, each.base, (*shape, *each.shape), partial(_field_of, load, field_name))
+        if dtype.kind in "buifcO":
+            self.add(name, shape, load if not dtype.hasobject else partial(_refuse_objects, name))
 
     def add(self, name: str, shape: Sequence[int], load: Callable[[], Any]) -> None:
         """Add an array as one column, or as the columns ``name[0]``, ``name[1]``, ... along its longest axis.
@@ -77,6 +95,16 @@ class Table:
         if len(self.columns) == MOST_COLUMNS:
             raise ColumnError(f"more than {MOST_COLUMNS} columns")
         self.columns[name] = load
+
+
+def _field_of(load: Callable[[], Any], name: str) -> Any:
+    return load()[name]
+
+
+def _refuse_objects(name: str) -> Any:
+    raise ColumnError(
+        f"{name[:_MOST_NAME] or 'the array'} holds Python objects, which are not loaded; save numbers, as float64"
+    )
 
 
 def _row_of(name: str, load: Callable[[], Any], j: int) -> Column:
@@ -109,6 +137,8 @@ def _number(cell: str, delimiter: str) -> float:
     text = cell.strip()
     if not text:
         return float("nan")
+    if "_" in text:
+        raise ValueError(text)  # Python would read 1_0 as 10
     return float(text.replace(",", ".") if delimiter != "," else text)
 
 
@@ -121,44 +151,103 @@ def _are_numbers(cells: Sequence[str], delimiter: str) -> bool:
         return False
 
 
-def read_text(path: Path, wanted: Sequence[str], skip_lines: int) -> tuple[list[str], dict[str, Column]]:
-    """Names and wanted columns of delimited text; without a header the names are 0, 1, ...
+def read_text(path: Path, wanted: Sequence[str], skip_lines: int) -> tuple[list[str], dict[str, Column], int]:
+    """Names and wanted columns of delimited text, and the blank lines between its rows.
+
+    Without a header the names are 0, 1, ...
 
     :raises ColumnError: a line has no such cell, or no number there.
     """
+    _check_text(path, skip_lines)
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         lines = enumerate(_lines(file), 1)
-        rest = ((k, line) for k, line in islice(lines, skip_lines, None) if line.strip() and line[0] != "#")
-        first = next(rest, None)
+        rest = ((k, line) for k, line in islice(lines, skip_lines, None) if line[0] != "#")
+        first = next((each for each in rest if each[1].strip()), None)
         if first is None:
             raise ColumnError("holds no line of text")
         delimiter = max(_DELIMITERS, key=first[1].count)
-        cells = [cell.strip() for cell in next(csv.reader([first[1]], delimiter=delimiter))]
+        delimiter = delimiter if delimiter in first[1] else _SPACES
+        cells = [cell.strip() for cell in _cells(first[1], delimiter)]
         has_header = not _are_numbers(cells, delimiter)
         names = cells if has_header else [str(j) for j in range(len(cells))]
         while names and not names[-1]:
             names.pop()
         if len(names) > MOST_COLUMNS:
             raise ColumnError(f"more than {MOST_COLUMNS} columns")
+        if missing := [name for name in wanted if name not in names]:
+            raise ColumnError(f"{_unknown(missing[0], names)}{_cure_of_names(names)}")
         places = [_place(name, names) for name in wanted]
-        found = [array.array("d") for _ in wanted]
-        for number, line in (rest if has_header else chain([first], rest)) if wanted else ():
-            if len(found[0]) == MAX_SAMPLES:
-                raise ColumnError(f"has more than {MAX_SAMPLES} samples")
-            row = next(csv.reader([line], delimiter=delimiter))
-            if len(row) > len(names) and any(cell.strip() for cell in row[len(names) :]):
-                raise ColumnError(
-                    f"line {number} has {len(row)} cells, the first line {len(names)}: cells with decimal commas need"
-                    " another separator, such as semicolons"
-                )
-            for place, column in zip(places, found, strict=True):
-                try:
-                    column.append(_number(row[place], delimiter))
-                except (IndexError, ValueError):
-                    where = f"line {number}, column {names[place][:_MOST_NAME]}"
-                    why = f"{row[place][:40]!r} is no number" if place < len(row) else "the line has no such cell"
-                    raise ColumnError(f"{where}: {why}; mend or delete the line") from None
-    return names, {name: np.frombuffer(column) for name, column in zip(wanted, found, strict=True)}
+        found: list[array.array[float]] = []
+        blank_lines = 0
+        if wanted:
+            found, blank_lines = _read_rows(rest if has_header else chain([first], rest), names, places, delimiter)
+    return names, {name: np.frombuffer(column) for name, column in zip(wanted, found, strict=True)}, blank_lines
+
+
+def _read_rows(
+    lines: Iterable[tuple[int, str]], names: Sequence[str], places: Sequence[int], delimiter: str
+) -> tuple[list[array.array[float]], int]:
+    """Numbers at these places of every line, and the blank lines between the first and the last.
+
+    :raises ColumnError: a line has no such cell, or no number there.
+    """
+    found = [array.array("d") for _ in places]
+    blank_lines = blank_here = 0
+    for number, line in lines:
+        if not line.strip():
+            blank_here += bool(found[0])
+            continue
+        blank_lines, blank_here = blank_lines + blank_here, 0
+        if len(found[0]) == MAX_SAMPLES:
+            raise ColumnError(_too_many(MAX_SAMPLES))
+        row = _cells(line, delimiter)
+        if len(row) > len(names) and any(cell.strip() for cell in row[len(names) :]):
+            raise ColumnError(
+                f"line {number} has {len(row)} cells, the first line {len(names)}: cells with decimal commas need"
+                " another separator, such as semicolons"
+            )
+        for place, column in zip(places, found, strict=True):
+            try:
+                column.append(_number(row[place], delimiter))
+            except (IndexError, ValueError):
+                where = f"line {number}, column {names[place][:_MOST_NAME]}"
+                why = f"{row[place][:40]!r} is no number" if place < len(row) else "the line has no such cell"
+                raise ColumnError(f"{where}: {why}; mend or delete the line") from None
+    return found, blank_lines
+
+
+def _check_text(path: Path, skip_lines: int) -> None:
+    """Refuse at once what is no text, or has too many lines: to parse it would take a minute.
+
+    :raises ColumnError: it is such a file.
+    """
+    rows = -skip_lines
+    with path.open("rb") as file:
+        start = file.read(_CHUNK_BYTES)
+        for first_bytes, what in _NO_TEXT.items():
+            if start.startswith(first_bytes):
+                raise ColumnError(what)
+        if b"\0" in start[:4096]:
+            raise ColumnError("holds bytes of zero: UTF-16, or no text; save it as text in UTF-8")
+        for chunk in chain([start], iter(partial(file.read, _CHUNK_BYTES), b"")):
+            rows += chunk.count(b"\n") - sum(chunk.count(blank) for blank in (b"\n\n", b"\n\r", b"\n#"))
+            if rows > MAX_SAMPLES + 1:
+                raise ColumnError(_too_many(MAX_SAMPLES))
+
+
+def _too_many(samples: int) -> str:
+    return f"has more than {samples} samples; cut it into files of fewer lines"
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    return line.split() if delimiter == _SPACES else next(csv.reader([line], delimiter=delimiter))
+
+
+def _cure_of_names(names: Sequence[str]) -> str:
+    """Cure if names suggest a wrong first line or a wrong encoding."""
+    if any("\ufffd" in name for name in names):
+        return "; the file is no UTF-8: save it as UTF-8"
+    return "; --skip-lines N leaves out text above the header"
 
 
 def _place(name: str, names: Sequence[str]) -> int:
@@ -180,13 +269,17 @@ def _unknown(name: str, names: Sequence[str]) -> str:
 
 def open_npy(path: Path) -> Table:
     """Table of an array: the fields of a structured one, or the columns 0, 1, ... of one with two dimensions."""
-    values = np.load(path, mmap_mode="r", allow_pickle=False)  # a map cannot be larger than its file
+    with path.open("rb") as file:
+        shape, dtype = _npy_header(file)
     table = Table()
-    if values.dtype.names:
-        for name in values.dtype.names:
-            table.add(name, values[name].shape, partial(values.__getitem__, name))
+
+    def load() -> Any:
+        return np.load(path, mmap_mode="r", allow_pickle=False)  # a map cannot be larger than its file
+
+    if dtype.names:
+        table.add_typed("", dtype, shape, load)
         return table
-    table.add("0" if sum(size != 1 for size in values.shape) <= 1 else "", values.shape, lambda: values)
+    table.add_typed("0" if sum(size != 1 for size in shape) <= 1 else "", dtype, shape, load)
     return Table({name.strip("[]"): load for name, load in table.columns.items()})
 
 
@@ -198,16 +291,17 @@ def open_npz(path: Path) -> Table:
         with archive.open(info) as member:
             shape, dtype = _npy_header(member)
         name = info.filename.removesuffix(".npy")
-        if dtype.kind not in "buif":
-            continue
-        if np.prod(shape, dtype=float) * dtype.itemsize > info.file_size:
+        if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > info.file_size:
             raise ColumnError(f"{name[:_MOST_NAME]} declares the shape {shape}, larger than its member of the archive")
-        table.add(name, shape, partial(_npz_member, archive, info))
+        table.add_typed(name, dtype, shape, partial(_npz_member, archive, info))
     return table
 
 
 def _npy_header(member: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    version = np.lib.format.read_magic(member)
+    start = member.read(len(np.lib.format.magic(1, 0)))
+    if not start.startswith(np.lib.format.MAGIC_PREFIX):
+        raise ColumnError("holds no array of NumPy, perhaps a pickle, which is not loaded; write it with numpy.save")
+    version = tuple(start[-2:])
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(member)
     return shape, dtype
@@ -247,7 +341,7 @@ def _open_hdf5(path: Path) -> Table:
     try:
         import h5py
     except ImportError:
-        raise ColumnError(f"MATLAB files of version 7.3 need h5py: {_EXTRA}") from None
+        raise ColumnError("MATLAB files of version 7.3 need h5py: pip install h5py") from None
     file = h5py.File(path, "r")
     table = Table()
     for name in islice(file, MOST_COLUMNS + 1):
@@ -267,7 +361,7 @@ def open_mf4(path: Path) -> Table:
     try:
         from asammdf import MDF
     except ImportError:
-        raise ColumnError(f"measurement files need asammdf: {_EXTRA}") from None
+        raise ColumnError("measurement files need asammdf: pip install asammdf") from None
     measurement = MDF(path, raise_on_multiple_occurrences=False)
     table = Table()
     for name, places in islice(measurement.channels_db.items(), MOST_COLUMNS + 1):
@@ -298,7 +392,7 @@ def open_parquet(path: Path) -> Table:
     try:
         from pyarrow import parquet, types
     except ImportError:
-        raise ColumnError(f"Parquet files need pyarrow: {_EXTRA}") from None
+        raise ColumnError("Parquet files need pyarrow: pip install pyarrow") from None
     file = parquet.ParquetFile(path)
     table = Table()
     for kind in file.schema_arrow:
@@ -350,28 +444,42 @@ FORMATS: Mapping[str, tuple[str, Callable[[Path], Table] | None]] = {
 """Name and opening of each format by suffix; delimited text has none."""
 
 
-def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> tuple[list[str], dict[str, Column], float | None]:
-    """Names of all columns, the wanted ones, and the sample rate that the file states.
+class Columns(NamedTuple):
+    """Columns of a file."""
+
+    names: list[str]
+    """Names of all of them."""
+    columns: dict[str, Column]
+    """The wanted ones."""
+    rate_hz: float | None = None
+    """Sample rate that the file states."""
+    blank_lines: int = 0
+    """Blank lines between rows of text."""
+
+
+def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
+    """Columns of a file.
 
     :raises ColumnError: a wanted column is not there, or cannot be read.
     """
     opening = FORMATS[path.suffix.lower()][1]
     if opening is None:
-        return (*read_text(path, wanted, skip_lines), None)
+        names, columns, blank_lines = read_text(path, wanted, skip_lines)
+        return Columns(names, columns, None, blank_lines)
     table = opening(path)
     names = list(table.columns)
     for name in wanted:
         _place(name, names)
-    return names, {name: table.columns[name]() for name in wanted}, table.rate_hz
+    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz)
 
 
 def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Answer to a request: ``names`` and ``rate_hz``, or ``error``."""
+    """Answer to a request, as the module describes it."""
     path = Path(asked["file"])
     try:
-        names, columns, rate_hz = read(path, asked["wanted"], asked["skip_lines"])
-        if columns:
-            named: dict[str, Any] = {str(i): column for i, column in enumerate(columns.values())}
+        found = read(path, asked["wanted"], asked["skip_lines"])
+        if found.columns:
+            named: dict[str, Any] = {str(i): column for i, column in enumerate(found.columns.values())}
             np.savez(asked["out"], **named)
     except ColumnError as error:
         return {"error": str(error)}
@@ -380,7 +488,7 @@ def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
     except Exception as error:  # noqa: BLE001 - the libraries raise anything on damaged files
         cause = re.sub(r"\s+", " ", str(error))[:200] or type(error).__name__
         return {"error": f"damaged, or no {FORMATS[path.suffix.lower()][0]} file: {cause}"}
-    return {"names": names, "rate_hz": rate_hz}
+    return {"names": found.names, "rate_hz": found.rate_hz, "blank_lines": found.blank_lines}
 
 
 def main(request: str) -> None:

@@ -32,6 +32,9 @@ KIND = "import"
 
 LEAST_BITS, MOST_BITS = 2, 16
 
+_LEAST_WIDTH, _MOST_MAGNITUDE = 1e-7, 1e8
+"""Limits of a converter's range, which a run can hold."""
+
 _MOST_JITTER = 0.02
 """Largest deviation of a time from the even grid, in sample periods."""
 
@@ -123,6 +126,8 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         raise RecordingError(f"{path}: the columns differ in length: {lengths}")
     if not (samples := count.pop()):
         raise RecordingError(f"{path}: has no row {described.first}")
+    if samples == 1:
+        raise RecordingError(f"{path}: has a single row: a recording needs two")
     if described.samples is not None and samples < described.samples:
         raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
     program = Program.load(DEFAULT_PROGRAM) if scenario is None else scenario.program
@@ -136,7 +141,9 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range")
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), **dataclasses.asdict(described)}
-    return _run(path, codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), scenario)
+    rig["blank_lines"] = found.blank_lines
+    truth = _truth(path, samples, 1.0 / rate_hz, scenario)
+    return unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
 
 
 def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scenario) -> Run:
@@ -166,15 +173,14 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
     if not np.isin(clipped, (0.0, 1.0)).all():
         raise RecordingError(f"{path}: a flag of a clipped sample is neither 0 nor 1")
     description = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), "rig": dict(rig.description())}
-    return _run(
-        path,
+    return unanswered(
         codes.astype(np.uint16),
         clipped.astype(np.bool_),
         performance.channels,
         performance.sample_period_s,
         performance.time_scale,
         description,
-        scenario,
+        *_truth(path, len(codes), performance.sample_period_s, scenario),
     )
 
 
@@ -183,18 +189,21 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
 
     :raises RecordingError: they have no range.
     """
-    codes = 1 << bits
+    codes, where = 1 << bits, f"{path}: column {described.column}"
     if described.range is not None:
         low, high = described.range
     else:
         finite = np.abs(values[np.isfinite(values)])
-        most = float(finite.max(initial=0.0)) / (1.0 - 2.0 / codes)  # the last code stands for the largest value
         if not finite.size:
-            raise RecordingError(f"{path}: column {described.column}: holds no number")
-        if not 1e-9 < most < 1e8:
-            where = f"{path}: column {described.column}"
-            raise RecordingError(f"{where}: largest magnitude {most:g}: must be 1e-9 to 1e8; scale it")
-        low, high = -most, most
+            raise RecordingError(f"{where}: holds no number")
+        high = float(finite.max()) / (1.0 - 2.0 / codes)  # the last code stands for the largest value
+        low = -high
+    most = max(abs(low), abs(high))
+    if not (high - low > _LEAST_WIDTH and most < _MOST_MAGNITUDE):
+        what = f"largest magnitude {most:g}" if described.range is None else f"range [{low:g}, {high:g}]"
+        raise RecordingError(
+            f"{where}: {what}: a range must be wider than {_LEAST_WIDTH:g} and within +-{_MOST_MAGNITUDE:g}; scale it"
+        )
     return Channel(low, (high - low) / codes, described.unit, 1.0, 0.0, codes)
 
 
@@ -225,7 +234,9 @@ def _rate_hz(
         raise RecordingError(f"{path}: column {described.time}: instants are missing")
     period_s = float(instants_s[-1] - instants_s[0]) / (len(instants_s) - 1)
     if not 1e-9 <= period_s <= 1e6:
-        raise RecordingError(f"{path}: column {described.time}: a sample period of {period_s:g} s")
+        raise RecordingError(
+            f"{path}: column {described.time}: a sample period of {period_s:g} s: must be seconds that ascend"
+        )
     late = np.abs(instants_s - instants_s[0] - period_s * np.arange(len(instants_s))) / period_s
     if late.max() > _MOST_JITTER:
         worst = int(late.argmax())
@@ -236,39 +247,53 @@ def _rate_hz(
     return 1.0 / period_s
 
 
-def _run(
-    path: Path,
+def _truth(
+    path: Path, samples: int, period_s: float, scenario: Scenario | None
+) -> tuple[Scenario, tuple[Segment, ...]]:
+    """Scenario and plant of a recording; without a scenario they are unknown.
+
+    :raises ConfigurationError: the recording is longer than the scenario.
+    """
+    if scenario is None:
+        return _unknown(path, samples, period_s), ()
+    if samples > scenario.samples:
+        raise ConfigurationError(
+            f"{path}: has {number_of(samples, 'sample')}, scenario {scenario.name} {scenario.samples}:"
+            " pass the scenario that was played"
+        )
+    return scenario, scenario.segments()
+
+
+def unanswered(
     codes: NDArray[np.uint16],
     clipped: NDArray[np.bool_],
     channels: Mapping[str, Channel],
     period_s: float,
     time_scale: float,
     rig: Mapping[str, Any],
-    scenario: Scenario | None,
+    scenario: Scenario,
+    segments: tuple[Segment, ...],
 ) -> Run:
-    """Recording without answers of a device."""
+    """Recording without answers of a device.
+
+    :param codes: (n, c), with ``clipped`` for the channels of the scenario's program.
+    :param segments: true plant; empty if it is unknown.
+    """
     samples = len(codes)
-    if scenario is not None and samples > scenario.samples:
-        raise ConfigurationError(
-            f"{path}: has {number_of(samples, 'sample')}, scenario {scenario.name} {scenario.samples}:"
-            " pass the scenario that was played"
-        )
-    segments: tuple[Segment, ...] = () if scenario is None else scenario.segments()
-    kept = scenario or _unknown(path, samples, period_s)
     return Run(
         conditions=Conditions(
             seed=0,
-            samples_asked=kept.samples,
+            samples_asked=scenario.samples,
             sample_period_s=period_s,
             time_scale=time_scale,
             channels=dict(channels),
             segments=segments,
-            scenario=kept.as_table(),
+            scenario=scenario.as_table(),
             rig=rig,
             dut={"name": "none", "kind": KIND, "datasheet": {"alarms": False}},
             link="none",
             faults=(UNSEEN,),
-            program=kept.program,
+            program=scenario.program,
         ),
         codes=codes,
         clipped=clipped,

@@ -151,7 +151,11 @@ class Played:
         """
         found = step_responses(self.run)
         if not found:
-            return Finding(holds=False, why="not judged: the program is not linear, or the device reports no model")
+            return Finding(
+                holds=False,
+                why="not judged: the program is not linear, its input reaches its output at once, or the device reports"
+                " no model",
+            )
         off = [
             f"{response_text(each)} at sample {each.end}"
             for each in found

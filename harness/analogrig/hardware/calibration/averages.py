@@ -1,4 +1,7 @@
-"""Recordings of square waves on a rig, each with its own pots, levels and frequency; their averages and their noise."""
+"""Recordings of a rig: square waves, each with its own pots, levels and frequency; their averages and their noise.
+
+Programs other than front and shock are recorded under random steps.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,12 @@ from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigError
 from analogrig.program import Program
-from analogrig.rigs.rig import Rig
-from analogrig.run import INPUT, OUTPUT, Channel
+from analogrig.recordings.imported import unanswered
+from analogrig.rigs.rig import Block, Performance, Rig
+from analogrig.run import INPUT, OUTPUT, Channel, Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
+from analogrig_emulator.machine.compiler import MACHINE_V
 
 Vector = NDArray[np.float64]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -28,6 +33,13 @@ SETTLING_N = 400
 
 RATE_HZ = 20e3
 """Sample rate of the card. The periods below are whole numbers of its samples."""
+
+_PROGRAM_SAMPLES = 4000
+_LEAST_BITS_HZ, _MOST_BITS_HZ, _BITS_PER_PERIOD = 1e3, 5e3, 18
+"""Random steps: a half period of the trial play holds as many bits as the longest run of equal ones."""
+_FIRST_BITS = (0, 300)
+_MARGIN = 0.1
+"""Distance from the levels of the trial play: random steps drive a resonance further than a square wave."""
 
 FORCE, DISPLACEMENT = range(2)
 """Columns of a recording: input and output of the program."""
@@ -117,6 +129,52 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
     :raises ConfigurationError: the rig cannot play it.
     :raises RigError: the rig failed, has caveats or gaps, or an amplifier was overloaded.
     """
+    performance, blocks, standing = _play(rig, scenario, seed)
+    channels = {name: performance.channels[name] for name in scenario.program.measured}
+    codes = np.concatenate([block.codes[:, _COLUMNS] for block in blocks]).astype(np.float64)
+    if not rig.computes_circuit:  # whose volts are without noise
+        low_v, lsb_v = (np.array([getattr(channel, name) for channel in channels.values()]) for name in _GRID)
+        codes = (np.concatenate([block.volts[:, _COLUMNS] for block in blocks]) - low_v) / lsb_v
+    return SquareWaveRecording(
+        dataclasses.replace(scenario, set={**scenario.set, **standing}),
+        performance.sample_period_s,
+        channels,
+        codes,
+        np.concatenate([block.clipped[:, _COLUMNS] for block in blocks]),
+    )
+
+
+def record_program(rig: Rig, program: Program, part: int, seed: int) -> Run:
+    """Play a program on the rig under random steps, and return its samples as a recording without a device.
+
+    :param part: 0 or 1; the steps of one differ from those of the other.
+    :raises ConfigurationError, RigError: as for ``record``.
+    """
+    (driven, quantity), *_ = program.equations.inputs.items()
+    full = program.circuit.scales.full(driven)
+    low_v, high_v = (MACHINE_V * level / full for level in quantity.trial)
+    margin_v = _MARGIN * (high_v - low_v)
+    bits_hz = _BITS_PER_PERIOD * program.equations.speed / program.equations.period_s
+    excitation = Excitation(
+        shape="prbs",
+        low_v=low_v + margin_v,
+        high_v=high_v - margin_v,
+        frequency_hz=min(max(bits_hz, _LEAST_BITS_HZ), _MOST_BITS_HZ),
+        seed=_FIRST_BITS[part],
+    )
+    scenario = Scenario(samples=_PROGRAM_SAMPLES, excitation=excitation, program=program, name="calibration")
+    performance, blocks, standing = _play(rig, scenario, seed)
+    codes, clipped = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("codes", "clipped"))
+    played = dataclasses.replace(scenario, set=dict(standing))
+    rates = performance.sample_period_s, performance.time_scale
+    return unanswered(codes, clipped, performance.channels, *rates, rig.description(), played, played.segments())
+
+
+def _play(rig: Rig, scenario: Scenario, seed: int) -> tuple[Performance, list[Block], Mapping[str, float]]:
+    """Play a scenario whose samples can be fitted, and return the values at which the pots stood too.
+
+    :raises RigError: the rig failed, has caveats or gaps, or an amplifier was overloaded.
+    """
     performance = rig.perform(scenario, seed)
     blocks = list(performance.blocks)
     hindsight = performance.hindsight()
@@ -127,18 +185,7 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
         obstacles.append("the samples have a gap")
     if obstacles:
         raise RigError(f"scenario {scenario.name}: {obstacles[0]}: nothing can be fitted")
-    channels = {name: performance.channels[name] for name in scenario.program.measured}
-    codes = np.concatenate([block.codes[:, _COLUMNS] for block in blocks]).astype(np.float64)
-    if not rig.computes_circuit:  # whose volts are without noise
-        low_v, lsb_v = (np.array([getattr(channel, name) for channel in channels.values()]) for name in _GRID)
-        codes = (np.concatenate([block.volts[:, _COLUMNS] for block in blocks]) - low_v) / lsb_v
-    return SquareWaveRecording(
-        dataclasses.replace(scenario, set={**scenario.set, **hindsight.standing}),
-        performance.sample_period_s,
-        channels,
-        codes,
-        np.concatenate([block.clipped[:, _COLUMNS] for block in blocks]),
-    )
+    return performance, blocks, hindsight.standing
 
 
 class Averages(NamedTuple):

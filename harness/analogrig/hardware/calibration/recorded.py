@@ -1,7 +1,7 @@
 """Twin of measured data: the parameters of a program, linear or not, fitted to a recording by playing its input.
 
-The machine is played with the recorded input, band-limited between the samples, and its output is compared with the
-recorded one in a simulation that never sees the measured output.
+The machine is played with the recorded input, and its output is compared with the recorded one in a simulation that
+never sees the measured output. Between the samples the input is band-limited or held, whichever fits better.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,6 @@ from analogrig.errors import ConfigurationError
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import (
-    CHANNELS,
     MULTIPLIER_GRADES,
     EngineError,
     PatchedProgram,
@@ -34,9 +35,29 @@ _LEAST_N = 100
 MOST_FITS = 50
 """Largest number of steps of the fit."""
 
+Reconstruction = Literal["band-limited", "held"]
+RECONSTRUCTIONS: tuple[Reconstruction, ...] = ("band-limited", "held")
+"""Courses of the input between its samples: that before an anti-alias filter, and that after a converter."""
+
 _MACHINE_V = 10.0
 _STEP = 1e-3
 """Relative step of the numerical derivatives."""
+_LEAST_SINGULAR = 5e-5
+"""Least singular value of the sensitivities, as part of the largest, that is no numerical error (1.5e-5)."""
+_UNKNOWN = 5.0
+"""Standard error of a logarithm in a direction below that."""
+_MOST_ERROR = 0.5
+"""Largest standard error of a direction of logarithms that the samples determine."""
+_LEAST_ERROR = 0.1
+"""Least standard error that a direction beyond that gives a parameter which the samples leave open."""
+_JUMP = 0.5
+"""Least step of the input from one sample to the next, as part of its range, that is a jump."""
+_ALIKE_RMS = 1.5
+"""Largest ratio of the rms of two courses of the input that explain the output alike."""
+_BEGINNING = 0.1
+"""Part of the compared samples that is their beginning."""
+_MOST_AT_BEGINNING = 3.0
+"""Largest rms there, in that of the others, of a machine that has settled."""
 
 Progress = Callable[[int], None]
 """Callback after each play, with the number of plays so far."""
@@ -60,6 +81,20 @@ class Residual:
 
     rms: float
     largest: float
+    beginning: float
+    """Rms of the first tenth of the samples that are compared, over that of the others."""
+
+    @classmethod
+    def of(cls, left: NDArray[np.float64]) -> Residual:
+        """Summary of differences (n,)."""
+        begins = math.ceil(_BEGINNING * len(left))
+        first, others = (float(np.sqrt(np.mean(part**2))) for part in (left[:begins], left[begins:]))
+        return cls(float(np.sqrt(np.mean(left**2))), float(np.abs(left).max()), first / others if others else 1.0)
+
+    @property
+    def is_settled(self) -> bool:
+        """True if the beginning fits like the rest."""
+        return self.beginning <= _MOST_AT_BEGINNING
 
 
 @dataclass(frozen=True)
@@ -68,7 +103,8 @@ class FittedParameter:
 
     name: str
     value: float
-    standard_error: float
+    standard_error: float | None
+    """None: the samples do not determine the value."""
     unit: str
     """Empty if the program states none."""
     place: str
@@ -84,7 +120,21 @@ class ProgramTwin:
     estimates: tuple[FittedParameter, ...]
     """Fitted parameters. The standard errors hold for residuals like white noise; others deserve larger ones."""
     fit: Residual
+    output_rms: float
+    """Rms of the recorded output about its mean, which a machine of the right program undercuts by far."""
     plays: int
+    reconstruction: Reconstruction
+    """Course of the input between its samples with which the machine was played."""
+    other_rms: float | None
+    """Rms of the other course, for which the parameters were fitted too; None if the caller chose."""
+    may_jump_between_samples: bool = False
+    """True if the input jumps, and neither course explains the output much better than the other."""
+    unseen: tuple[str, ...] = ()
+    """Parameters that hardly act on the output in these samples."""
+    inseparable: tuple[str, ...] = ()
+    """Parameters whose effects on the output are alike."""
+    surplus: int = 0
+    """Number of ``inseparable`` that must be known for the others to follow."""
 
 
 class RecordedPlant:
@@ -102,8 +152,9 @@ class RecordedPlant:
         if len(equations.inputs) != 1 or not outputs:
             raise ConfigurationError(f"program {program.name}: a twin needs one input, and an output on a channel")
         self.program, self.run = program, run
+        self._measured = run.conditions.program.measured
         self.input, self.output = next(iter(equations.inputs)), outputs[0]
-        for name, quantity in zip(CHANNELS, (self.input, self.output), strict=False):
+        for name, quantity in zip(self._measured, (self.input, self.output), strict=True):
             unit, measured = equations.quantities[quantity].unit, run.conditions.channels[name].unit
             if unit is not None and unit.text != measured:
                 raise ConfigurationError(
@@ -120,6 +171,7 @@ class RecordedPlant:
             program, opamp=computer.op_amp, components=components, sample_rate_hz=rate_hz, offset_v=0.0
         )
         self._at = equations.channels.index(self.output)
+        self.output_unit = run.conditions.channels[self._measured[1]].unit
         self.plays = 0
 
     def span(self, first: int, end: int, settling_n: int = SETTLING_N) -> Span:
@@ -134,9 +186,14 @@ class RecordedPlant:
             raise ConfigurationError(
                 f"samples {first} to {end}: a span needs {2 * max(settling_n, 1)}: {settling_n} settle the machine"
             )
-        rows = slice(first, end)
+        if changes := [start for start, _, _ in self.run.segments if first < start < end]:
+            raise ConfigurationError(
+                f"sample {changes[0]}: the plant changes in the recording; pass a span that ends there, such as"
+                f" {first}:{changes[0]}"
+            )
+        rows, every = slice(first, end), self.run.conditions.program.channels
         (u, u_clipped), (y, y_clipped) = (
-            (self.run.channel(name)[rows], self.run.clipped[rows, CHANNELS.index(name)]) for name in CHANNELS[:2]
+            (self.run.channel(name)[rows], self.run.clipped[rows, every.index(name)]) for name in self._measured
         )
         if u_clipped.any():
             lacking = first + int(u_clipped.argmax())
@@ -149,80 +206,210 @@ class RecordedPlant:
             )
         return Span(first, end, u, y, valid)
 
-    def simulate(self, values: Mapping[str, float], span: Span) -> NDArray[np.float64]:
+    def simulate(
+        self, values: Mapping[str, float], span: Span, reconstruction: Reconstruction = "band-limited"
+    ) -> NDArray[np.float64]:
         """Output of the machine in its unit, (n,), played from rest with the input of a span.
 
+        :param values: by parameter; those without a pot keep theirs.
         :raises PotError, EngineError: the machine cannot be set so, or is unstable.
         """
         self.plays += 1
         scales = self.program.scales
-        self._computer.set(**values)
-        played = RecordedExcitation(span.u * _MACHINE_V / scales.full(self.input))
+        self._computer.set(**{name: value for name, value in values.items() if name in self.program.values})
+        played = RecordedExcitation(span.u * _MACHINE_V / scales.full(self.input), reconstruction == "held")
         volts = np.concatenate([block[:, self._at] for block in self._computer.play(played, span.end - span.first)])
         return np.asarray(volts * scales.full(self.output) / _MACHINE_V)
 
-    def difference(self, values: Mapping[str, float], span: Span) -> Residual:
+    def difference(
+        self, values: Mapping[str, float], span: Span, reconstruction: Reconstruction = "band-limited"
+    ) -> Residual:
         """Difference between the machine and a span."""
-        left = (self.simulate(values, span) - span.y)[span.valid]
-        return Residual(float(np.sqrt(np.mean(left**2))), float(np.abs(left).max(initial=0.0)))
+        return Residual.of((self.simulate(values, span, reconstruction) - span.y)[span.valid])
 
 
-def fit_program(plant: RecordedPlant, span: Span, progress: Progress | None = None) -> ProgramTwin:
+def fit_program(
+    plant: RecordedPlant,
+    span: Span,
+    progress: Progress | None = None,
+    *,
+    reconstruction: Reconstruction | None = None,
+    fixed: Mapping[str, float] = MappingProxyType({}),
+) -> ProgramTwin:
     """Fit every parameter that has a range, within it, to a span.
 
-    :raises ConfigurationError: no parameter has a range, or the machine is unstable with the program's values.
+    :param reconstruction: course of the input between its samples; None: the one that fits better.
+    :param fixed: values of parameters that are not fitted.
+    :raises ConfigurationError: no parameter is left to fit, a fixed one is unknown or beyond its range, or the machine
+        is unstable with the program's values.
     """
-    from scipy.optimize import least_squares
+    fit = _ProgramFit(plant, span, fixed, progress)
+    found, other_rms = fit.minimum(fit.start, reconstruction or "band-limited"), None
+    chosen = reconstruction or "band-limited"
+    if reconstruction is None:
+        other_rms = fit.rms_after_a_step(found, "held")
+        if other_rms < fit.rms(found):
+            held = fit.minimum(found.x, "held")
+            if held.cost < found.cost:
+                found, other_rms, chosen = held, fit.rms(found), "held"
+    slopes = fit.slopes(found.x, chosen)
+    return fit.twin(found, slopes, chosen, other_rms)
 
-    rows = plant.program.equations.parameters
-    names = [name for name in plant.program.values if rows[name].low < rows[name].high]
-    if not names:
-        raise ConfigurationError(f"program {plant.program.name}: no parameter has a range to fit it in")
-    start = np.array([rows[name].value for name in names])
-    low, high = (np.log(np.array([getattr(rows[name], side) for name in names]) / start) for side in ("low", "high"))
-    valid_y = span.y[span.valid]
-    scale = float(valid_y.std()) or 1.0
 
-    def values_at(logs: NDArray[np.float64]) -> dict[str, float]:
-        return dict(zip(names, (start * np.exp(logs)).tolist(), strict=True))
+class _ProgramFit:
+    """Least squares in the logarithms of the parameters, and residuals in standard deviations of the output."""
 
-    def residuals(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __init__(self, plant: RecordedPlant, span: Span, fixed: Mapping[str, float], progress: Progress | None) -> None:
+        program = plant.program
+        rows = program.equations.parameters
+        _check_fixed(program, fixed)
+        names = [name for name in program.values if rows[name].low < rows[name].high and name not in fixed]
+        if not names:
+            raise ConfigurationError(f"program {program.name}: no parameter has a range to fit it in")
+        self._plant, self._span, self._fixed, self._progress = plant, span, dict(fixed), progress
+        self._names, self._rows = names, rows
+        self._origin = np.array([rows[name].value for name in names])
+        self._bounds = [
+            np.log(np.array([getattr(rows[name], side) for name in names]) / self._origin) for side in ("low", "high")
+        ]
+        self._y = span.y[span.valid]
+        self._scale = float(self._y.std()) or 1.0
+        low, high = self._bounds
+        outside = 1e-9  # least_squares wants the start strictly within
+        self.start = np.clip(np.zeros(len(names)), low + outside, high - outside)
+
+    def minimum(self, start: NDArray[np.float64], reconstruction: Reconstruction) -> Any:
+        """Result of scipy's least_squares."""
+        from scipy.optimize import least_squares
+
+        return least_squares(
+            lambda logs: self._residuals(logs, reconstruction),
+            start,
+            bounds=self._bounds,
+            diff_step=_STEP,
+            xtol=1e-6,
+            ftol=1e-8,
+            x_scale="jac",
+            max_nfev=MOST_FITS,
+        )
+
+    def rms(self, found: Any) -> float:
+        """Rms difference at a minimum, in the unit of the output."""
+        return self._scale * math.sqrt(2.0 * found.cost / len(self._y))
+
+    def rms_after_a_step(self, found: Any, reconstruction: Reconstruction) -> float:
+        """Rms difference that one step of Gauss and Newton from a minimum promises for another reconstruction."""
+        left = self._residuals(found.x, reconstruction)
+        step, *_ = np.linalg.lstsq(found.jac, left)
+        return self._scale * float(np.sqrt(np.mean((left - found.jac @ step) ** 2)))
+
+    def slopes(self, logs: NDArray[np.float64], reconstruction: Reconstruction) -> NDArray[np.float64]:
+        """Derivatives (n, parameters) of the residuals by central differences."""
+        low, high = self._bounds
+        columns = []
+        for at in range(len(logs)):
+            ends = []
+            for side in (-_STEP, _STEP):
+                moved = logs.copy()
+                moved[at] = np.clip(moved[at] + side, low[at], high[at])
+                ends.append((moved[at], self._residuals(moved, reconstruction)))
+            (before, less), (after, more) = ends
+            columns.append((more - less) / (after - before))
+        return np.stack(columns, axis=1)
+
+    def twin(
+        self, found: Any, slopes: NDArray[np.float64], reconstruction: Reconstruction, other_rms: float | None
+    ) -> ProgramTwin:
+        """Values at a minimum with their standard errors, as far as the samples determine them."""
+        plant, values = self._plant, self._values_at(found.x)
+        deviation = math.sqrt(2.0 * found.cost / max(1, len(self._y) - len(values)))
+        errors, is_unseen, is_alike, surplus = _determined(slopes, deviation)
+        names = np.array(self._names)
+        estimates = tuple(
+            FittedParameter(
+                name,
+                values[name],
+                float(error * values[name]) if is_known else None,
+                unit.text if (unit := self._rows[name].unit) is not None else "",
+                _place(values[name], self._rows[name].low, self._rows[name].high),
+            )
+            for name, error, is_known in zip(self._names, errors, ~(is_unseen | is_alike), strict=True)
+        )
+        every = dict(plant.program.equations.values) | self._fixed | values
+        return ProgramTwin(
+            values=every,
+            estimates=estimates,
+            fit=plant.difference(every, self._span, reconstruction),
+            output_rms=float(self._y.std()),
+            plays=plant.plays,
+            reconstruction=reconstruction,
+            other_rms=other_rms,
+            may_jump_between_samples=(
+                other_rms is not None
+                and other_rms < _ALIKE_RMS * self.rms(found)
+                and float(np.abs(np.diff(self._span.u)).max()) > _JUMP * float(np.ptp(self._span.u))
+            ),
+            unseen=tuple(names[is_unseen].tolist()),
+            inseparable=tuple(names[is_alike].tolist()),
+            surplus=surplus,
+        )
+
+    def _values_at(self, logs: NDArray[np.float64]) -> dict[str, float]:
+        return dict(zip(self._names, (self._origin * np.exp(logs)).tolist(), strict=True))
+
+    def _residuals(self, logs: NDArray[np.float64], reconstruction: Reconstruction) -> NDArray[np.float64]:
+        plant, span = self._plant, self._span
         try:
-            left = (plant.simulate(values_at(logs), span)[span.valid] - valid_y) / scale
+            played = plant.simulate(self._fixed | self._values_at(logs), span, reconstruction)
+            left = (played[span.valid] - self._y) / self._scale
         except EngineError as error:
             if not logs.any():
                 raise ConfigurationError(f"program {plant.program.name}: {error}") from error
-            left = np.full(len(valid_y), 1e3)
-        if progress is not None:
-            progress(plant.plays)
+            left = np.full(len(self._y), 1e3)
+        if self._progress is not None:
+            self._progress(plant.plays)
         return np.asarray(left)
 
-    outside = 1e-9  # least_squares wants the start strictly within
-    found = least_squares(
-        residuals,
-        np.clip(np.zeros(len(names)), low + outside, high - outside),
-        bounds=(low, high),
-        diff_step=_STEP,
-        xtol=1e-6,
-        ftol=1e-8,
-        x_scale="jac",
-        max_nfev=MOST_FITS,
+
+def _check_fixed(program: PatchedProgram, fixed: Mapping[str, float]) -> None:
+    """:raises ConfigurationError: a name is no parameter of a pot, or a value lies beyond its range."""
+    for name, value in fixed.items():
+        if name not in program.values:
+            raise ConfigurationError(
+                f"program {program.name} has no parameter {name[:40]!r} on a pot; there are {', '.join(program.values)}"
+            )
+        row = program.equations.parameters[name]
+        if not row.low <= value <= row.high:
+            raise ConfigurationError(f"{name} = {value:g}: must be within its range, {row.low:g} to {row.high:g}")
+
+
+class _Determined(NamedTuple):
+    """Standard errors of logarithms (p,), and the parameters that the samples leave open."""
+
+    errors: NDArray[np.float64]
+    is_unseen: NDArray[np.bool_]
+    is_alike: NDArray[np.bool_]
+    surplus: int
+    """Number of directions in which those that are alike hardly act."""
+
+
+def _determined(slopes: NDArray[np.float64], deviation: float) -> _Determined:
+    """Singular values of the sensitivities to logarithms, for which an error of 0.5 is one of 50 %."""
+    norms = np.sqrt((slopes**2).sum(axis=0))
+    resolved = _LEAST_SINGULAR * norms.max()
+    is_unseen = norms < max(resolved, deviation / _MOST_ERROR)
+    _, singular, rows = np.linalg.svd(slopes[:, ~is_unseen], full_matrices=False)
+    by_direction = np.where(
+        singular < resolved, _UNKNOWN, np.minimum(deviation / np.maximum(singular, resolved), _UNKNOWN)
     )
-    values = values_at(found.x)
-    information = found.jac.T @ found.jac
-    variance = 2.0 * found.cost / max(1, len(valid_y) - len(names))
-    errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information)) * variance, 0.0)) * np.array(list(values.values()))
-    units = [unit.text if (unit := rows[name].unit) is not None else "" for name in names]
-    estimates = tuple(
-        FittedParameter(name, values[name], float(error), unit, _place(values[name], rows[name].low, rows[name].high))
-        for name, error, unit in zip(names, errors, units, strict=True)
-    )
-    return ProgramTwin(
-        values=dict(plant.program.equations.values) | values,
-        estimates=estimates,
-        fit=plant.difference(values, span),
-        plays=plant.plays,
-    )
+    is_open = by_direction > _MOST_ERROR
+    parts = (rows * by_direction[:, None]) ** 2
+    errors, is_alike = np.zeros(len(norms)), np.zeros(len(norms), np.bool_)
+    errors[~is_unseen] = np.sqrt(parts.sum(axis=0))
+    is_alike[~is_unseen] = np.sqrt(parts[is_open].sum(axis=0)) >= _LEAST_ERROR
+    if np.count_nonzero(is_alike) == 1:  # it is like no other
+        return _Determined(errors, is_unseen | is_alike, np.zeros_like(is_alike), 0)
+    return _Determined(errors, is_unseen, is_alike, int(np.count_nonzero(is_open)))
 
 
 def _place(value: float, low: float, high: float) -> str:
