@@ -34,10 +34,7 @@ from analogrig.links.wire import Clock
 from analogrig.program import Program
 from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
 from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
-from analogrig_emulator.lucidac.wiring import UNIT_V
-
-FULL_SCALE = 1.25
-"""End of the converter's range in machine units, by the legacy firmware; values beyond it count as clipped."""
+from analogrig_emulator.lucidac.wiring import FULL_SCALE, UNIT_V
 
 _HALF_RANGE = 1 << 15
 _MOST_INITIAL = 1.001
