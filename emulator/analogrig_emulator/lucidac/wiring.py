@@ -73,7 +73,8 @@ class LucidacParts:
     coefficient_steps: steps from 0 to 1; 11 bits and sign by the manual, the size of a step is assumed.
     gain_step, offset_step, multiplier_step: resolution of the calibration, the offset in machine units. most_gain:
     largest correction of a lane's gain; by the legacy firmware a lane that needs more keeps the correction it has.
-    overload: level of the overload flags, in machine units. full_scale: end of the converter's range. adc_gain, adc_offset: its errors, uniform within +-. adc_noise_lsb: rms noise of 16 bits.
+    overload: level of the overload flags, in machine units. full_scale: end of the converter's range. adc_gain,
+    adc_offset: its errors, uniform within +-. adc_noise_lsb: rms noise of 16 bits.
     cables: port of the front panel at which each output of the signal generator is plugged in: "sine", "square",
     "dac0", "dac1". writes_in_op: True if coefficients may be written while the machine operates.
     """
@@ -206,7 +207,7 @@ class LucidacCircuit:
     @property
     def _summers(self) -> list[int]:
         of_multipliers = {j for k in self._multipliers for j in multiplier_inputs(k)}
-        identities = {output - FIRST_IDENTITY + INTEGRATORS for output in self._outputs_used if output >= FIRST_IDENTITY}
+        identities = {INTEGRATORS + each - FIRST_IDENTITY for each in self._outputs_used if each >= FIRST_IDENTITY}
         return sorted(of_multipliers | identities)
 
     # ---- netlist
