@@ -1,4 +1,4 @@
-"""Deviation of the manufacturer's examples on a calibrated LUCIDAC, by the bandwidth of its op-amps.
+"""Deviation of the manufacturer's examples from the ideal solution: what its client gets, and by op-amps.
 
 python -m tests.benchmarks.bandwidth_lucidac
 """
@@ -9,6 +9,9 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from analogrig.hardware.simulator.served_lucidac import specimen
 from analogrig.scenario import DEFAULT_SEED
 from analogrig_emulator.lucidac.machine import Lucidac
 from analogrig_emulator.lucidac.wiring import LucidacParts
@@ -26,17 +29,38 @@ def machine(bandwidth_mhz: float) -> Lucidac:
 
 
 def main() -> None:
+    with tempfile.TemporaryDirectory() as name, serving("--as", "lucidac") as served:
+        folder = Path(name)
+        run_examples(served.port, folder)
+        show_client(folder)
+        show_bandwidths(folder)
+
+
+def show_client(folder: Path) -> None:
+    """Show the deviations in machine units: of the same machine before calibration, and of the client's data."""
+    print(f"{'machine units':20}{'before':>9}{'after calibration':>19}")
+    largest = 0.0
+    for name, example in EXAMPLES.items():
+        patch, uncalibrated = read_configuration(folder, name), specimen(DEFAULT_SEED)
+        uncalibrated.configure(patch)
+        before = deviation(example, patch, play(uncalibrated, example))
+        after = deviation(example, patch, np.load(folder / f"{name}.npz")["data"].T)
+        largest = max(largest, after)
+        print(f"{name:20}{before:9.4f}{after:19.4f}", flush=True)
+    print(f"{len(EXAMPLES)} examples of the manufacturer's client: at most {largest:.4f} of a machine unit off")
+
+
+def show_bandwidths(folder: Path) -> None:
+    """Show the deviations in % of a machine unit, by the bandwidth of the op-amps."""
     print(f"{'% of a machine unit':20}" + "".join(f"{mhz:5} MHz" for mhz in BANDWIDTHS_MHZ))
-    with tempfile.TemporaryDirectory() as folder, serving("--as", "lucidac") as served:
-        run_examples(served.port, Path(folder))
-        for name, example in EXAMPLES.items():
-            patch, found = read_configuration(Path(folder), name), []
-            for bandwidth_mhz in BANDWIDTHS_MHZ:
-                each = machine(bandwidth_mhz)
-                each.configure(patch)
-                each.calibrate(gain=True, offset=True)
-                found.append(100.0 * deviation(example, patch, play(each, example)))
-            print(f"{name:20}" + "".join(f"{value:9.2f}" for value in found), flush=True)
+    for name, example in EXAMPLES.items():
+        patch, found = read_configuration(folder, name), []
+        for bandwidth_mhz in BANDWIDTHS_MHZ:
+            each = machine(bandwidth_mhz)
+            each.configure(patch)
+            each.calibrate(gain=True, offset=True)
+            found.append(100.0 * deviation(example, patch, play(each, example)))
+        print(f"{name:20}" + "".join(f"{value:9.2f}" for value in found), flush=True)
 
 
 if __name__ == "__main__":
