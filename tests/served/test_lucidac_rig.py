@@ -569,6 +569,10 @@ def test_peer_that_sends_frames_without_end_is_given_up(content: bytes, message:
         thread.join()
 
 
+def test_silence_of_a_device_that_has_told_its_kind_raises_no_doubt(instrument: LucidacInstrument) -> None:
+    assert instrument._connection._silence("the run").endswith("the run: no answer within 30 s")
+
+
 def test_coefficient_that_rounds_to_nothing_is_refused() -> None:
     patch = LinearPatch(Program.load("front"))
     values = {name: row.value for name, row in patch.program.parameters.items()}
