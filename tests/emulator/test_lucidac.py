@@ -211,6 +211,7 @@ def test_impossible_configurations_are_refused_by_name(wrong: dict[str, object],
     [
         ({"coefficient_steps": 0}, "coefficient_steps must be more than 0, not 0"),
         ({"overload": float("nan")}, "overload must be more than 0, not nan"),
+        ({"most_gain": 1.0}, "most_gain must be at least 0 and below 1, not 1"),
         ({"adc_gain": -1.0}, "adc_gain must be at least 0 and below 1e6, not -1"),
         ({"adc_noise_lsb": float("inf")}, "adc_noise_lsb must be at least 0 and below 1e6, not inf"),
     ],
