@@ -24,5 +24,5 @@ def ngspice_error_lsb(ngspice: NgSpice, seed: int) -> float:
     start_v = dict(zip(charging.states, charging.rest(np.zeros(0)).state.tolist(), strict=True))
     deck = Deck(machine.wiring.circuit(), SAMPLES, initial_v=start_v)
     nodes = list(dict.fromkeys(machine.wiring.computing_nodes.values()))
-    text = deck.text(nodes, Accuracy(reltol=1e-8, vntol_v=1e-10, trtol=0.03, max_step_s=2e-6, method="gear"))
+    text = deck.text(nodes, Accuracy(reltol=1e-8, vntol_v=1e-9, trtol=0.03, max_step_s=2e-6, method="gear"))
     return float(np.abs(deck.volts(nodes) - ngspice(text, nodes, SAMPLES)).max()) / LSB_V

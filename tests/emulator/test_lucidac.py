@@ -116,15 +116,41 @@ def test_coefficients_written_during_a_run_act_from_the_next_block_on() -> None:
     assert len(values) == 40_000 and np.abs(values - expected).max() < 1e-4
 
 
+def specimen(seed: int, patch: Configuration) -> Lucidac:
+    parts = LucidacParts()
+    machine = Lucidac(replace(parts, components=replace(parts.components, seed=seed)))
+    machine.configure(patch)
+    return machine
+
+
 def test_specimens_differ_by_seed_and_repeat_by_seed() -> None:
     def of(seed: int) -> Values:
-        parts = LucidacParts()
-        machine = Lucidac(replace(parts, components=replace(parts.components, seed=seed)))
-        machine.configure(configuration(SINE, ic0=-1.0))
-        return played(machine, 200)
+        return played(specimen(seed, configuration(SINE, ic0=-1.0)), 200)
 
     assert (of(1) == of(1)).all()
     assert np.abs(of(1) - of(2)).max() > 1e-3
+
+
+def test_lane_that_needs_too_large_a_correction_is_left_as_it_is() -> None:
+    """Errors of resistors may turn the sign of a coefficient of one step, which no gain corrects."""
+    lanes = {0: LucidacLane(15, 0, 1 / 2048), 1: LucidacLane(15, 1, -2 / 2048), 2: LucidacLane(15, 2, 0.5)}
+    patch, left = configuration(lanes, (0, 1, 2), constant=1.0), 0
+    for seed in range(10):
+        machine = specimen(seed, patch)
+        machine.calibrate(gain=True, offset=True)
+        gains = machine.wiring.trims.gains
+        assert 2 in gains and all(abs(gain - 1.0) <= 0.1 for gain in gains.values())
+        left += len(lanes) - len(gains)
+    assert left > 5
+
+
+def test_calibration_of_the_gain_replaces_the_correction_of_the_client() -> None:
+    patch = configuration({0: LucidacLane(15, 0, -0.1, gain_correction=1.25)}, (0,), constant=1.0)
+    for gain, slope in ((False, 0.125), (True, 0.1)):
+        machine = Lucidac(EXACT)
+        machine.configure(patch)
+        machine.calibrate(gain=gain, offset=True)
+        assert played(machine, 51)[-1, 0] == pytest.approx(5.0 * slope, rel=2e-3)
 
 
 def test_overload_is_flagged_and_halts_the_run_where_that_is_wanted() -> None:
@@ -185,6 +211,7 @@ def test_impossible_configurations_are_refused_by_name(wrong: dict[str, object],
     [
         ({"coefficient_steps": 0}, "coefficient_steps must be more than 0, not 0"),
         ({"overload": float("nan")}, "overload must be more than 0, not nan"),
+        ({"most_gain": 1.0}, "most_gain must be at least 0 and below 1, not 1"),
         ({"adc_gain": -1.0}, "adc_gain must be at least 0 and below 1e6, not -1"),
         ({"adc_noise_lsb": float("inf")}, "adc_noise_lsb must be at least 0 and below 1e6, not inf"),
     ],

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
+from analogrig.hardware import by_hand
 from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import Pots
@@ -153,3 +154,13 @@ def test_wrong_instant_is_contradicted_for_any_displacement(error_n: int) -> Non
         f"the pot scheduled for sample {5000 + moving + error_n} (K 19600) moved at {5000 + moving}"
         f" ({5000 + moving} to {5000 + moving}) by the samples"
     )
+
+
+def test_change_far_from_its_scheduled_instant_is_none_that_the_samples_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long records are searched near the instant alone."""
+    monkeypatch.setattr(by_hand, "_NEAR_N", 600)
+    stiff = FRONT.scaled("K", 0.8)
+    signals = taken(3000, PotChange(2400, {"K": stiff.parameters()["K"]}))
+    (said,) = contradictions(signals, [asked(1500, {}, FRONT, stiff)], first=0)
+    assert said.endswith("nothing in the samples 902 to 2098 shows that the plant has changed")
+    assert contradictions(signals, [asked(2400, {}, FRONT, stiff)], first=0) == []

@@ -175,6 +175,18 @@ def test_instrument_in_use_is_locked(bench: str) -> None:
         next(third.perform(SHORT, 1).blocks)
 
 
+@pytest.mark.parametrize("host", ["localhost", "LOCALHOST", "127.1"])
+def test_instrument_is_locked_under_each_name_of_its_host(tmp_path: Path, host: str) -> None:
+    with serving_in_thread() as instrument:
+        names = [str(instrument.rigs_file(tmp_path)), f"redpitaya://{host}:{instrument.port}"]
+        same = tmp_path / "same.toml"
+        same.write_text(Path(names[0]).read_text().replace(f"redpitaya://{instrument.address}", names[1]))
+        with open_allowed(names[0]) as first, open_allowed(str(same)) as second:
+            next(first.perform(SHORT, 1).blocks)
+            with pytest.raises(RigClosed, match=f"{host}:{instrument.port}: in use by another process or rig"):
+                next(second.perform(SHORT, 1).blocks)
+
+
 def test_run_after_a_failed_one_passes(tmp_path: Path) -> None:
     with serving_in_thread('acquisition.drop_out="zeros"', "acquisition.drop_out_record=2") as instrument:
         file = instrument.rigs_file(tmp_path)

@@ -19,6 +19,7 @@ from typing import Any
 from analogrig.config import locate
 from analogrig.hardware.simulator.served import ServedDescription
 from analogrig.hardware.simulator.server import Server
+from analogrig.hardware.simulator.tcp_server import TcpServer
 from analogrig.program import Program
 from analogrig.scenario import DEFAULT_SEED
 from tests.harness.processes import LONG_S
@@ -142,7 +143,13 @@ def ended(served: ServedByProcess, statuses: Sequence[int] = (0,)) -> str:
 @contextmanager
 def serving_in_thread(*defects: str, rig: str = "emulator", program: str = "front") -> Iterator[Served]:
     """Serve a rig with defects in a thread of this process until the end of the block: sooner than another process."""
-    server = Server(ServedDescription.load(rig, defects).set_up(Program.load(program), DEFAULT_SEED))
+    with in_thread(Server(ServedDescription.load(rig, defects).set_up(Program.load(program), DEFAULT_SEED))) as served:
+        yield served
+
+
+@contextmanager
+def in_thread(server: TcpServer) -> Iterator[Served]:
+    """Run a server in a thread of this process until the end of the block."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()

@@ -6,23 +6,29 @@ import itertools
 import os
 import re
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
 from analogrig.hardware import lucidac_messages
 from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, framed, protocol
-from analogrig.hardware.simulator.served_lucidac import CHUNK_VALUES, MAC, specimen
+from analogrig.hardware.simulator.served_lucidac import CHUNK_VALUES, MAC, LucidacServer, specimen
+from analogrig.hardware.simulator.tcp_server import Client
 from analogrig.scenario import DEFAULT_SEED
 from analogrig_emulator.lucidac.configuration import COEFFICIENT_STEPS
+from analogrig_emulator.lucidac.machine import Lucidac
+from tests.harness.processes import LONG_S
 from tests.served.hostile_lucidac import nested, varint
 from tests.served.lucidac_deviations import deviation, play, read_configuration, run_examples
 from tests.served.lucidac_examples import EXAMPLES
-from tests.served.serving import Served, serving
+from tests.served.serving import Served, in_thread, serving
 
 CLIENT = os.environ.get("LUCIDAC_CLIENT", sys.executable)
 """Python with the manufacturer's package: make lucidac-next sets one with its newest version."""
@@ -142,6 +148,12 @@ class Talk:
             "start_run_command", run=pb.Run(id="r"), run_config=run, daq_config=pb.DaqConfig(sample_rate=rate_hz)
         )
 
+    def reset_when_free(self, **fields: Any) -> None:
+        """Reset the machine as soon as no run keeps it busy."""
+        deadline_s = time.monotonic() + LONG_S
+        while self.ask("reset_command", **fields).WhichOneof("kind") == "busy_response":
+            assert time.monotonic() < deadline_s
+
     def samples(self) -> tuple[int, list[str]]:
         """Number of samples of a run, and its states."""
         pb, count, states = protocol(), 0, []
@@ -212,8 +224,61 @@ def test_machine_is_busy_for_others_during_a_run_and_free_when_its_client_is_gon
         assert other.ask("stop_run_command").WhichOneof("kind") == "success_message"
         assert other.samples()[1][-1] == "DONE"
         other.start(62_500 * 600, 62_500)
-    while talk.ask("reset_command").WhichOneof("kind") == "busy_response":
-        pass
+    talk.reset_when_free()
+
+
+class Held(Lucidac):
+    """Machine whose run computes its only block, with an overload, once it is released."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.computes, self.released = threading.Event(), threading.Event()
+
+    def play(self, samples: int, rate_hz: float, *, halt_on_overload: bool = False) -> Iterator[NDArray[np.int16]]:
+        del rate_hz, halt_on_overload
+        self.computes.set()
+        self.released.wait(LONG_S)
+        self.overloads["M0", 0] = True
+        yield np.zeros((samples, 0), np.int16)
+
+
+class Noticing(LucidacServer):
+    """Server that tells when it has noticed that a client is gone."""
+
+    def __init__(self, machine: Lucidac) -> None:
+        super().__init__(machine)
+        self.noticed = threading.Event()
+
+    def release(self, client: Client) -> None:
+        super().release(client)
+        self.noticed.set()
+
+
+def test_machine_stays_busy_until_the_thread_of_a_cancelled_run_has_ended() -> None:
+    server = Noticing(machine := Held())
+    with in_thread(server) as served, Talk(served) as talk:
+        with Talk(served) as gone:
+            gone.start(1, 1000)
+            assert machine.computes.wait(LONG_S)
+        assert server.noticed.wait(LONG_S)
+        for _ in range(10):  # the run's task has its turns to end
+            talk.ask("extract_command")
+        assert talk.ask("reset_command").WhichOneof("kind") == "busy_response"
+        machine.released.set()
+        talk.reset_when_free(overload_reset=True)
+        assert not talk.ask("get_overload_status_command").get_overload_status_response.status.global_overload
+
+
+def test_stop_ends_a_paced_run_before_its_next_samples_are_due() -> None:
+    """The first sample of this run would come after 1000 s."""
+    machine = Lucidac()
+    with in_thread(LucidacServer(machine, time.monotonic)) as served, Talk(served) as talk:
+        talk.configure(*ramp(0.0))
+        pb = protocol()
+        config = pb.RunConfig(op_time=pb.Time(value=2000))
+        talk.ask("start_run_command", run=pb.Run(id="r"), run_config=config, daq_config=pb.DaqConfig(sample_rate=1))
+        assert talk.ask("stop_run_command").WhichOneof("kind") == "success_message"
+        assert talk.samples()[0] == 0
 
 
 def test_coefficients_can_be_written_in_op_by_the_client_of_the_run_where_the_parameter_says_so() -> None:

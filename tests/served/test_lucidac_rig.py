@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +18,14 @@ import pytest
 from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
 from analogrig.catalogue import Change
 from analogrig.cli import main
-from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused
+from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused, RigTimeout
+from analogrig.hardware import lucidac_connection
 from analogrig.hardware.calibration.averages import record, scenarios
 from analogrig.hardware.calibration.fit import calibrate
 from analogrig.hardware.instrument import DialChange
 from analogrig.hardware.lucidac import LucidacInstrument
 from analogrig.hardware.lucidac_connection import LucidacConnection
-from analogrig.hardware.lucidac_messages import frame, protocol
+from analogrig.hardware.lucidac_messages import FrameReader, frame, protocol
 from analogrig.hardware.lucidac_patch import LinearPatch
 from analogrig.hardware.real import RealRig
 from analogrig.hardware.self_test import self_test
@@ -32,7 +35,7 @@ from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig.rigs.description import describe
 from analogrig.scenario import DEFAULT_SEED, PotChange
-from analogrig_emulator import Capacitor, Excitation, SuspensionComputer
+from analogrig_emulator import Capacitor, Excitation, PotTurn, SuspensionComputer
 from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
 from analogrig_emulator.lucidac.wiring import FAST_FARAD
 from tests.served.serving import Served, serving
@@ -128,25 +131,64 @@ def test_calibration_finds_the_drawn_capacitors(served: Served, tmp_path: Path) 
     assert found.explains_all and found.chi_square > found.freedom - 5.0 * (2.0 * found.freedom) ** 0.5
 
 
-def test_record_is_the_program_on_an_ideal_computer_before_and_after_a_change(instrument: LucidacInstrument) -> None:
+def test_record_is_the_program_on_an_ideal_computer_through_its_changes(instrument: LucidacInstrument) -> None:
+    """Changes come where displacement and velocity are large: a wrong state at the beginning of a run shows."""
     assert instrument.pots is not None
-    computer = SuspensionComputer("front", opamp="ideal")
-    instrument.pots.schedule([DialChange(200.05 / 20e3, "K", 0.5)])
+    turns = [PotTurn(109, {"K_dial": 0.5}), PotTurn(216, {"M_dial": 0.5})]
+    instrument.pots.schedule([DialChange((n + 0.05) / 20e3, "KM"[i], 0.5) for i, (n, _, _) in enumerate(turns)])
     record = instrument.record(400)
-    instrument.pots.set_one("K", computer.dials["K"])
-    first = np.concatenate(list(computer.play(dataclasses.replace(SQUARE, low_v=0.1, high_v=9.9), 201)))
-    np.testing.assert_allclose(5.0 * record.volts[:201], first[:, :2], atol=0.015)  # dials rest on no windings here
-    again = instrument.record(400)
-    assert np.abs(5.0 * (record.volts - again.volts)[202:, 1]).max() > 0.1
-    assert np.abs(5.0 * (record.volts - again.volts)[:, 0]).max() < 0.01
-    assert not record.clipped.any() and not again.repeats
+    computer = SuspensionComputer("front", opamp="ideal")
+    ideal = np.concatenate(list(computer.play(dataclasses.replace(SQUARE, low_v=0.1, high_v=9.9), 400, turns)))[:, :2]
+    np.testing.assert_allclose(5.0 * record.volts, ideal, atol=0.02)  # coefficients have steps
+    assert not record.clipped.any() and not record.repeats
 
 
-def test_overload_names_the_element(instrument: LucidacInstrument) -> None:
+def test_change_after_the_last_sample_acts_on_the_next_record(instrument: LucidacInstrument) -> None:
     assert instrument.pots is not None
-    instrument.pots.set({"M": 0.99, "B": 0.01, "K": 0.01}, "", recording=False)
-    with pytest.raises(RigError, match=r"overload of .*/0/M0/[01]: rescale the program"):
+    before = instrument.record(100)
+    instrument.pots.schedule([DialChange(99.05 / 20e3, "K", 0.5)])
+    np.testing.assert_allclose(instrument.record(100).volts, before.volts, atol=0.002)
+    assert np.abs(instrument.record(100).volts - before.volts)[:, 1].max() > 0.02
+
+
+def test_overload_names_the_element_and_the_run(instrument: LucidacInstrument) -> None:
+    """The first run is well: it is not named."""
+    assert instrument.pots is not None
+    dials = {"M": 0.99, "B": 0.01, "K": 0.01}
+    instrument.pots.schedule([DialChange(100.05 / 20e3, pot, dial) for pot, dial in dials.items()])
+    with pytest.raises(RigError, match=r"overload of .*/0/M0/[01] in samples 100 to 1999: rescale the program"):
         instrument.record(2000)
+
+
+def test_state_from_which_no_run_begins_is_one_line(
+    instrument: LucidacInstrument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between 1 and the level of the overload flags."""
+    values = np.full((101, 3), 0.5)
+    values[-1, 2] = 1.02
+    monkeypatch.setattr(instrument._connection, "run", lambda *_: (values, np.zeros(values.shape, np.bool_)))
+    assert instrument.pots is not None
+    instrument.pots.schedule([DialChange(100.05 / 20e3, "K", 0.5)])
+    with pytest.raises(RigError, match="stands at 1.020 machine units at the change, and no run begins beyond 1"):
+        instrument.record(200)
+    values[-1, 2] = 1.0009
+    instrument.pots.schedule([DialChange(100.05 / 20e3, "K", 0.6)])
+    assert len(instrument.record(201).volts) == 201
+    values[-1, 2] = 1.02
+    assert len(instrument.record(101).volts) == 101  # no run begins after the last one
+
+
+def test_configuration_of_another_client_is_noticed_before_the_run(
+    served: Served, instrument: LucidacInstrument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interfere() -> None:
+        other = LucidacConnection("127.0.0.1", served.port, 30.0)
+        other.ask("config_command", module=protocol().Module(), reset_before=True)
+        other.close()
+
+    monkeypatch.setattr(instrument, "_calibrate", interfere)
+    with pytest.raises(RigError, match="another client has changed the configuration: let only one work with"):
+        instrument.record(10)
 
 
 def test_generator_sleeps_between_records(served: Served, instrument: LucidacInstrument) -> None:
@@ -319,6 +361,15 @@ def test_unreachable_device_is_one_line() -> None:
         LucidacInstrument.open(f"127.0.0.1:{port}", 30.0)
 
 
+def test_address_of_version_6_is_shown_in_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("refused")
+
+    monkeypatch.setattr(socket, "create_connection", refuse)
+    with pytest.raises(RigClosed, match=r"instrument \[::1\]:5732: cannot be reached: refused"):
+        LucidacInstrument.open("[::1]", 30.0)
+
+
 def test_data_of_another_form_is_refused(served: Served) -> None:
     connection = LucidacConnection("127.0.0.1", served.port, 30.0)
     pb = protocol()
@@ -345,6 +396,155 @@ def test_data_of_another_form_is_refused(served: Served) -> None:
     connection.close()
 
 
+class Peer:
+    """Device that answers each command as ``answers`` does, and notes the kinds of the commands."""
+
+    def __init__(self, answers: Callable[[Any], Iterable[Any]]) -> None:
+        self.heard: list[str] = []
+        self._answers = answers
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._thread = threading.Thread(target=self._serve)
+
+    def __enter__(self) -> LucidacConnection:
+        self._thread.start()
+        self._connection = LucidacConnection("127.0.0.1", self._listening.getsockname()[1], 0.5)
+        return self._connection
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.close()
+        self._thread.join()
+        self._listening.close()
+
+    def _serve(self) -> None:
+        reader = FrameReader()
+        with contextlib.suppress(OSError), self._listening.accept()[0] as client:
+            while data := client.recv(65536):
+                reader.feed(data)
+                while (content := reader.next()) is not None:
+                    command = protocol().Envelope.FromString(content).message_v1
+                    self.heard.append(str(command.WhichOneof("kind")))
+                    for answer in self._answers(command):
+                        client.sendall(frame(answer))
+
+
+def entered(state: str) -> Any:
+    pb = protocol()
+    return pb.MessageV1(run_state_change_message=pb.RunStateChangeMessage(new_=pb.RunState.Value(state)))
+
+
+def a_run_with(*messages: Any) -> Callable[[Any], Iterator[Any]]:
+    """Answers of a device whose run sends these messages and then operates until it is stopped."""
+    pb = protocol()
+
+    def answers(command: Any) -> Iterator[Any]:
+        if command.HasField("start_run_command"):
+            yield pb.MessageV1(id=command.id, start_run_response=pb.StartRunResponse())
+            yield from (entered("OP"), *messages)
+        elif command.HasField("stop_run_command"):
+            yield from (pb.MessageV1(id=command.id, success_message=pb.SuccessMessage()), entered("DONE"))
+        elif command.HasField("extract_command"):
+            yield pb.MessageV1(id=command.id, extract_response=pb.ExtractResponse())
+
+    return answers
+
+
+def samples(count: int) -> Any:
+    pb = protocol()
+    data = pb.DaqData(data=bytes(2 * count), sample_count=count, channel_stride=1, channels=[pb.AdcChannel(gain=1.0)])
+    data.type.integer.bitwidth = 16
+    return pb.MessageV1(run_data_message=pb.RunDataMessage(data=data))
+
+
+@pytest.mark.parametrize(
+    ("messages", "failure", "why"),
+    [
+        ([], RigTimeout, "the run: no answer within 0.5 s"),
+        ([samples(0)] * 20, RigTimeout, "the run: no answer within 0.5 s"),
+        ([protocol().MessageV1(run_data_message=protocol().RunDataMessage())], RigError, "a form that was not asked"),
+        ([samples(10_000), samples(10_000)], RigError, "sends more than the 10 samples"),
+        ([protocol().MessageV1(ping_command=protocol().PingCommand())], KeyboardInterrupt, "by the user"),
+    ],
+    ids=["silent", "empty data", "malformed", "too many", "interrupted"],
+)
+def test_run_that_is_given_up_is_stopped(
+    messages: list[Any], failure: type[BaseException], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = Peer(a_run_with(*messages))
+    with peer as connection:
+        if failure is KeyboardInterrupt:
+            interrupt_at(connection, "ping_command", monkeypatch)
+        with pytest.raises(failure, match=why):
+            connection.run(10, 1000, 1)
+        connection.ask("extract_command")
+    assert peer.heard == ["start_run_command", "stop_run_command", "extract_command"]
+
+
+def test_device_that_ignores_the_stop_costs_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lucidac_connection, "_STOP_S", 0.2)
+    run = a_run_with()
+    peer = Peer(lambda command: [] if command.HasField("stop_run_command") else run(command))
+    with peer as connection, pytest.raises(RigTimeout, match="the run: no answer within 0.5 s"):
+        connection.run(10, 1000, 1)
+    assert peer.heard == ["start_run_command", "stop_run_command"]
+
+
+def interrupt_at(connection: LucidacConnection, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise KeyboardInterrupt where the connection gets a message of a kind."""
+    following = connection._next
+
+    def interrupting(what: str, deadline_s: float) -> Any:
+        message = following(what, deadline_s)
+        if message.WhichOneof("kind") == kind:
+            raise KeyboardInterrupt("by the user")
+        return message
+
+    monkeypatch.setattr(connection, "_next", interrupting)
+
+
+def test_only_data_with_samples_extend_the_time_out(
+    instrument: LucidacInstrument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connection, clock, deadlines = instrument._connection, itertools.count(), []
+    sent = iter([samples(0), samples(0), samples(4), entered("DONE")])
+
+    def following(_: str, deadline_s: float) -> Any:
+        deadlines.append(deadline_s)
+        return next(sent)
+
+    monkeypatch.setattr(connection, "ask", lambda *_, **__: None)
+    monkeypatch.setattr(connection, "_clock", lambda: float(next(clock)))
+    monkeypatch.setattr(connection, "_next", following)
+    assert len(connection.run(4, 1000, 1)[0]) == 4
+    assert deadlines[0] == deadlines[1] == deadlines[2] < deadlines[3]
+
+
+def test_run_of_another_client_is_not_stopped() -> None:
+    pb = protocol()
+    peer = Peer(lambda command: [pb.MessageV1(id=command.id, busy_response=pb.DeviceBusyMessage())])
+    with peer as connection, pytest.raises(RigRefused, match="busy with another client's run"):
+        connection.run(10, 1000, 1)
+    assert peer.heard == ["start_run_command"]
+
+
+def test_configuration_is_read_back_without_what_a_calibration_changes() -> None:
+    """A device that refuses tells nothing."""
+    pb, asked = protocol(), itertools.count()
+
+    def answers(command: Any) -> Iterator[Any]:
+        number = next(asked)
+        element = pb.CoefConfig.Element(factor=0.5 if number < 2 else 0.25, gain_correction=1.0 + 0.01 * number)
+        items = [
+            pb.Item(coef_config=pb.CoefConfig(elements=[element])),
+            pb.Item(mul_config=pb.MulConfig(calibration=[pb.MulConfig.Calibration(gain=number)])),
+        ]
+        told = {"extract_response": pb.ExtractResponse(module=pb.Module(items=items))}
+        yield pb.MessageV1(id=command.id, **told if number < 3 else {"error_message": pb.ErrorMessage()})
+
+    with Peer(answers) as connection:
+        first, second, third, fourth = (connection.configuration() for _ in range(4))
+    assert first == second != third and fourth == {}
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -367,6 +567,10 @@ def test_peer_that_sends_frames_without_end_is_given_up(content: bytes, message:
             connection.carrier()
         connection.close()
         thread.join()
+
+
+def test_silence_of_a_device_that_has_told_its_kind_raises_no_doubt(instrument: LucidacInstrument) -> None:
+    assert instrument._connection._silence("the run").endswith("the run: no answer within 30 s")
 
 
 def test_coefficient_that_rounds_to_nothing_is_refused() -> None:

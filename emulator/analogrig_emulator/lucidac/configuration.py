@@ -23,7 +23,6 @@ from analogrig_emulator.errors import CircuitError
 
 INTEGRATORS = 8
 MULTIPLIERS = 4
-IDENTITIES = 4
 OUTPUTS = 16
 LANES = 32
 PORTS = 8
@@ -43,6 +42,16 @@ _MOST_HZ = 1e6
 def constant_output(lane: int) -> int:
     """Output that the constant replaces on a lane."""
     return 15 if lane < LANES // 2 else 14
+
+
+def multiplier_inputs(multiplier: int) -> tuple[int, int]:
+    """Inputs of a multiplier."""
+    return INTEGRATORS + 2 * multiplier, INTEGRATORS + 2 * multiplier + 1
+
+
+def rounded_coefficient(factor: float, steps: int = COEFFICIENT_STEPS) -> float:
+    """Coefficient that the converter of a lane gives."""
+    return round(factor * steps) / steps
 
 
 @dataclass(frozen=True)

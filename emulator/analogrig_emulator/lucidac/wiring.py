@@ -38,14 +38,20 @@ from analogrig_emulator.lucidac.configuration import (
     FIRST_IDENTITY,
     FIRST_PORT_LANE,
     INTEGRATORS,
+    MULTIPLIERS,
     OUTPUTS,
     PORTS,
     Configuration,
     LucidacLane,
+    multiplier_inputs,
+    rounded_coefficient,
 )
 
 UNIT_V = 2.0
 """Volts of one machine unit, by the manual."""
+
+FULL_SCALE = 1.25
+"""End of the converter's range in machine units, by the legacy firmware."""
 
 SUM_OHM = 10e3
 FAST_FARAD, SLOW_FARAD = 10e-9, 1e-6
@@ -65,9 +71,10 @@ class LucidacParts:
     computing: op-amp of integrators and summers. lane: op-amp of a lane, without a pole: the bandwidth of lanes counts
     with that of the summers. multiplier: bandwidth and limits. components: spread of the parts, by its seed.
     coefficient_steps: steps from 0 to 1; 11 bits and sign by the manual, the size of a step is assumed.
-    gain_step, offset_step, multiplier_step: resolution of the calibration, the offset in machine units.
-    overload: level of the overload flags, in machine units. full_scale: end of the converter's range, by the legacy
-    firmware. adc_gain, adc_offset: its errors, uniform within +-. adc_noise_lsb: rms noise of 16 bits.
+    gain_step, offset_step, multiplier_step: resolution of the calibration, the offset in machine units. most_gain:
+    largest correction of a lane's gain; by the legacy firmware a lane that needs more keeps the correction it has.
+    overload: level of the overload flags, in machine units. full_scale: end of the converter's range. adc_gain,
+    adc_offset: its errors, uniform within +-. adc_noise_lsb: rms noise of 16 bits.
     cables: port of the front panel at which each output of the signal generator is plugged in: "sine", "square",
     "dac0", "dac1". writes_in_op: True if coefficients may be written while the machine operates.
     """
@@ -94,8 +101,9 @@ class LucidacParts:
     gain_step: float = 2.0**-16
     offset_step: float = 2.0**-17
     multiplier_step: float = 2.0**-14
+    most_gain: float = 0.1
     overload: float = 1.05
-    full_scale: float = 1.25
+    full_scale: float = FULL_SCALE
     adc_gain: float = 2e-3
     adc_offset: float = 2e-3
     adc_noise_lsb: float = 1.0
@@ -103,10 +111,12 @@ class LucidacParts:
     writes_in_op: bool = False
 
     def __post_init__(self) -> None:
-        steps = ("coefficient_steps", "gain_step", "offset_step", "multiplier_step", "overload", "full_scale")
-        for name in steps:
+        sizes = ("coefficient_steps", "gain_step", "offset_step", "multiplier_step", "overload", "full_scale")
+        for name in sizes:
             if not getattr(self, name) > 0:
                 raise CircuitError(f"{name} must be more than 0, not {getattr(self, name):g}")
+        if not 0 <= self.most_gain < 1:
+            raise CircuitError(f"most_gain must be at least 0 and below 1, not {self.most_gain:g}")
         for name in ("adc_gain", "adc_offset", "adc_noise_lsb"):
             if not 0 <= getattr(self, name) < 1e6:
                 raise CircuitError(f"{name} must be at least 0 and below 1e6, not {getattr(self, name):g}")
@@ -116,13 +126,13 @@ class LucidacParts:
 
     def quantised(self, factor: float) -> float:
         """Coefficient that the converter of a lane gives."""
-        return round(factor * self.coefficient_steps) / self.coefficient_steps
+        return rounded_coefficient(factor, self.coefficient_steps)
 
 
 @dataclass(frozen=True)
 class Trims:
     """Corrections that a calibration found: gains by lane, currents in A by input, initial conditions in V by
-    integrator, the errors left to multipliers by number."""
+    integrator, the errors left to multipliers by number. A gain replaces the correction that the client set."""
 
     gains: Mapping[int, float] = field(default_factory=dict)
     offsets_a: Mapping[int, float] = field(default_factory=dict)
@@ -183,7 +193,11 @@ class LucidacCircuit:
     def _multipliers(self) -> list[int]:
         """Multipliers with an input in use, or whose output is."""
         used = self.configuration.used
-        return [k for k in range(4) if {INTEGRATORS + k} & self._outputs_used or {8 + 2 * k, 9 + 2 * k} & used]
+        return [
+            k
+            for k in range(MULTIPLIERS)
+            if INTEGRATORS + k in self._outputs_used or not used.isdisjoint(multiplier_inputs(k))
+        ]
 
     @property
     def _outputs_used(self) -> set[int]:
@@ -192,8 +206,8 @@ class LucidacCircuit:
 
     @property
     def _summers(self) -> list[int]:
-        of_multipliers = {j for k in self._multipliers for j in (8 + 2 * k, 9 + 2 * k)}
-        identities = {output - 4 for output in self._outputs_used if output >= FIRST_IDENTITY}
+        of_multipliers = {j for k in self._multipliers for j in multiplier_inputs(k)}
+        identities = {INTEGRATORS + each - FIRST_IDENTITY for each in self._outputs_used if each >= FIRST_IDENTITY}
         return sorted(of_multipliers | identities)
 
     # ---- netlist
@@ -214,7 +228,8 @@ class LucidacCircuit:
             yield Resistor(f"RM{j}", f"s{j}", f"n{j}", SUM_OHM)
             yield OpAmp(f"US{j}", GROUND, f"s{j}", f"n{j}", self.parts.computing)
         for k in self._multipliers:
-            yield Multiplier(f"M{k}", f"n{8 + 2 * k}", f"n{9 + 2 * k}", f"o{8 + k}", UNIT_V, self.parts.multiplier)
+            x, y = multiplier_inputs(k)
+            yield Multiplier(f"M{k}", f"n{x}", f"n{y}", f"o{INTEGRATORS + k}", UNIT_V, self.parts.multiplier)
 
     def _references(self) -> Iterator[Element]:
         constant = self.configuration.constant
@@ -245,7 +260,7 @@ class LucidacCircuit:
         kind, number = element.name[:2], element.name[2:]
         if kind == "RS" and isinstance(element, Resistor):
             lane = self.configuration.lanes[int(number)]
-            ohm = element.ohm / (self.trims.gains.get(int(number), 1.0) * lane.gain_correction)
+            ohm = element.ohm / self.trims.gains.get(int(number), lane.gain_correction)
             lifted = charging and lane.target < INTEGRATORS
             yield replace(element, ohm=ohm, b=GROUND if lifted else element.b)
             return
@@ -291,14 +306,22 @@ class _Calibration:
     specimen: Mapping[str, Element]
 
     def gains(self) -> dict[int, float]:
-        step, lanes = self.wiring.parts.gain_step, self.wiring.configuration.lanes
-        return {number: 1.0 + step * round((1.0 / self._gain(number) - 1.0) / step) for number in lanes}
+        """Corrections by lane, without those that would be too large."""
+        parts, gains = self.wiring.parts, {number: self._gain(number) for number in self.wiring.configuration.lanes}
+        return {
+            number: 1.0 + parts.gain_step * round((1.0 / gain - 1.0) / parts.gain_step)
+            for number, gain in gains.items()
+            if abs(1.0 - gain) <= parts.most_gain * gain
+        }
 
     def _gain(self, number: int) -> float:
-        """Real gain of a lane over its nominal one, from its source to the element that it feeds."""
+        """Real gain of a lane without correction over its nominal one, from its source to the element that it feeds.
+
+        Errors of the resistors weigh the more, the smaller the coefficient: a small one may even change its sign.
+        """
         configuration = self.wiring.configuration
         lane = configuration.lanes[number]
-        gain = SUM_OHM / lane.gain / self._value(f"RS{number}") * lane.gain_correction
+        gain = SUM_OHM / lane.gain / self._value(f"RS{number}")
         if lane.target < INTEGRATORS:
             fast = configuration.integrators[lane.target].k0 == FAST
             name, nominal = (f"CF{lane.target}", FAST_FARAD) if fast else (f"CS{lane.target}", SLOW_FARAD)
@@ -321,8 +344,7 @@ class _Calibration:
             own_v = amplifier.model.vos_v
             current_a = sum(
                 (self._lane_offset_v(number) - own_v)
-                * gains.get(number, 1.0)
-                * lane.gain_correction
+                * gains.get(number, lane.gain_correction)
                 / self._value(f"RS{number}")
                 for number, lane in self.wiring.configuration.lanes.items()
                 if lane.target == j

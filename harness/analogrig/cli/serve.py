@@ -114,11 +114,12 @@ def _lucidac(arguments: argparse.Namespace, seed: int, clock: Clock | None) -> t
 
 async def _serve(server: TcpServer, arguments: argparse.Namespace, names: dict[str, Any]) -> int:
     """Serve until a signal ends the command or, if there is one, until the client ends. Return the exit status."""
+    from analogrig.hardware.tcp_address import place_of
     from analogrig.signals import signal_future
 
     ended = signal_future()
     host, number = await server.listen(arguments.host, arguments.port)
-    address = f"[{host}]:{number}" if ":" in host else f"{host}:{number}"
+    address = place_of(host, number)
     try:
         if arguments.json:
             show_json({**names, "host": host, "port": number, "address": address})

@@ -18,6 +18,10 @@ BEFORE_S, AFTER_S = 0.02, 0.05
 
 LEAST_SEARCH_N = 8
 
+_NEAR_N = 4096
+"""Samples before and after a scheduled instant in which its change is searched: the search takes 0.1 ms a sample. A
+change farther away is one that the samples do not show."""
+
 _CERTAIN_INFORMATION = 1000.0
 """Information, as in ``analogrig.judging.information``, with which a change is always detected."""
 _BEYOND_DOUBT = 1.0 - 1e-6
@@ -141,12 +145,13 @@ def _shift(segment: Segment, by: int) -> Segment:
 def contradictions(signals: Signals, changes: Sequence[PlannedChange], first: int) -> list[str]:
     """Contradictions between the samples of a record and the scheduled instants of its changes.
 
-    Each change is searched in all samples that no other one affects. A search that ended near the scheduled instant
-    would attribute a displaced change to the plant around it.
+    Each change is searched in all samples within _NEAR_N that no other one affects. A search that ended nearer to the
+    scheduled instant would attribute a displaced change to the plant around it.
     """
     out = []
     starts = [change.sample for change in changes]
-    for change, before, after in zip(changes, [0, *starts], [*starts[1:], len(signals)], strict=False):
+    for change, previous, following in zip(changes, [0, *starts], [*starts[1:], len(signals)], strict=False):
+        before, after = max(previous, change.sample - _NEAR_N), min(following, change.sample + _NEAR_N)
         search = range(before + 2, after - 1)
         if len(search) < LEAST_SEARCH_N:
             continue

@@ -14,31 +14,39 @@ from pathlib import Path
 from types import FrameType
 
 from analogrig.errors import RigClosed
+from analogrig.hardware.tcp_address import resolved_places
 
 _ENDING = (signal.SIGTERM, signal.SIGHUP)
 
 
 @contextlib.contextmanager
-def lock_instrument(url: str) -> Iterator[None]:
+def lock_instrument(url: str, place: str) -> Iterator[None]:
     """Hold the lock of the instrument at a URL; the kernel releases it with the process, also after SIGKILL.
 
+    All names of a host lock the same instrument: there is a lock for each address of the driver's ``place``.
     Meanwhile SIGTERM and SIGHUP raise SystemExit unless the process handles them, so that generators are switched off.
 
     :raises RigClosed: another process, or another rig of this one, holds it.
     """
-    digest = hashlib.sha256(url.lower().encode()).hexdigest()[:16]
+    with contextlib.ExitStack() as locks:
+        for name in resolved_places(place):
+            _lock(url, name, locks)
+        with _exit_at_signals():
+            yield
+
+
+def _lock(url: str, name: str, locks: contextlib.ExitStack) -> None:
+    digest = hashlib.sha256(name.encode()).hexdigest()[:16]
     path = Path(tempfile.gettempdir()) / f"analogrig-{os.getuid()}-{digest}.lock"
     try:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         raise RigClosed(f"instrument {url}: cannot be locked: {path}: {error.strerror or error}") from error
-    with os.fdopen(fd, "wb"):
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RigClosed(f"instrument {url}: in use by another process or rig on this machine") from error
-        with _exit_at_signals():
-            yield
+    locks.enter_context(os.fdopen(fd, "wb"))
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise RigClosed(f"instrument {url}: in use by another process or rig on this machine") from error
 
 
 @contextlib.contextmanager

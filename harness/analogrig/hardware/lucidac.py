@@ -34,10 +34,7 @@ from analogrig.links.wire import Clock
 from analogrig.program import Program
 from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
 from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
-from analogrig_emulator.lucidac.wiring import UNIT_V
-
-FULL_SCALE = 1.25
-"""End of the converter's range in machine units, by the legacy firmware; values beyond it count as clipped."""
+from analogrig_emulator.lucidac.wiring import FULL_SCALE, UNIT_V
 
 _HALF_RANGE = 1 << 15
 _MOST_INITIAL = 1.001
@@ -135,8 +132,6 @@ class LucidacInstrument(Instrument):
         values, ends = self._play(self._patched, self._box, samples)
         if while_recording is not None:
             while_recording()
-        if overloaded := self._connection.overloads():
-            raise RigError(f"{self.name}: overload of {', '.join(overloaded[:4])}: rescale the program")
         wanted = signs * values[:, channels]
         codes = np.clip(np.rint(wanted / (FULL_SCALE / _HALF_RANGE)), -_HALF_RANGE, _HALF_RANGE - 1).astype(np.int32)
         at_end = ends[:, channels]
@@ -157,10 +152,13 @@ class LucidacInstrument(Instrument):
         for i, (start, dials) in enumerate(cuts):
             box.set_all(dials)
             stop = cuts[i + 1][0] if i + 1 < len(cuts) else samples - 1
-            configuration = patched.configuration(box.values(), initial.tolist(), self._generator(start))
-            self._connection.ask("config_command", module=module_of(configuration, self._mac), reset_before=True)
-            self._calibrate()
+            self._configure(patched.configuration(box.values(), initial.tolist(), self._generator(start)))
             taken, at_end = self._connection.run(stop + 1 - start, int(rate_hz), states + 1)
+            if overloaded := self._connection.overloads():
+                raise RigError(
+                    f"{self.name}: overload of {', '.join(overloaded[:4])} in samples {start} to {stop}:"
+                    " rescale the program"
+                )
             for name, value in zip(patched.states, taken[-1, 1:], strict=True):
                 if start != cuts[-1][0] and abs(value) > _MOST_INITIAL:
                     raise RigError(
@@ -173,6 +171,16 @@ class LucidacInstrument(Instrument):
             ends.append(at_end[first:])
         box.set_all(late)
         return np.concatenate(values), np.concatenate(ends)
+
+    def _configure(self, configuration: Configuration) -> None:
+        """Configure and calibrate. :raises RigError: another client has changed the configuration meanwhile."""
+        self._connection.ask("config_command", module=module_of(configuration, self._mac), reset_before=True)
+        configured = self._connection.configuration()
+        self._calibrate()
+        if self._connection.configuration() != configured:
+            raise RigError(
+                f"{self.name}: another client has changed the configuration: let only one work with the machine"
+            )
 
     def _calibrate(self) -> None:
         self._connection.ask("calibration_command", config={"gain": "Enabled", "offset": "Enabled"})

@@ -7,7 +7,7 @@ import math
 import socket
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from analogrig.errors import RecordIncomplete, RigClosed, RigError, RigRefused, RigTimeout
 from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, parse_envelope, protocol
+from analogrig.hardware.tcp_address import place_of
 from analogrig.links.wire import Clock
 
 _MOST_ANSWER_BYTES = 1 << 20
@@ -22,7 +23,22 @@ _MOST_ANSWER_BYTES = 1 << 20
 _MOST_SPARE = 10_000
 """Samples beyond those asked for that a run may send."""
 
-_IS_IT_ONE = "is a LUCIDAC at this address?"
+_STOP_S = 2.0
+"""Longest time to stop a run that is given up."""
+
+_READ_BACK = frozenset(
+    (
+        "adc_config",
+        "coef_config",
+        "itor_config",
+        "limiter_config",
+        "port_config",
+        "select_config",
+        "signal_generator_config",
+        "sum_config",
+    )
+)
+"""Items of a configuration that a client sets, and that a device leaves as they are until another client does."""
 
 _QUESTION_RATE_HZ = 1000
 _QUESTION_SAMPLES = (100, 1000, 10_000)
@@ -37,10 +53,12 @@ class LucidacConnection:
         :raises RigError: the connection failed.
         """
         self._pb = protocol()
-        self.name = f"{host}:{port}"
+        self.name = place_of(host, port)
         self._clock = clock
         self._timeout_s = timeout_s
         self._reader = FrameReader(_MOST_ANSWER_BYTES)
+        self._doubt = "; is a LUCIDAC at this address?"
+        """Question of the error messages until the device has told what it is."""
         try:
             self._socket = socket.create_connection((host, port), timeout_s)
         except TimeoutError as error:
@@ -79,6 +97,7 @@ class LucidacConnection:
         roots = [item.entity_specification.entity for item in module.items if item.HasField("entity_specification")]
         for entity in [*roots, *(child for root in roots for child in root.children)]:
             if entity.class_ == self._pb.Entity.CARRIER:
+                self._doubt = ""
                 return str(entity.id).strip("/")
         raise RigError(f"instrument {self.name}: names no carrier board: it is no LUCIDAC")
 
@@ -88,12 +107,13 @@ class LucidacConnection:
         :raises RecordIncomplete: samples are missing.
         """
         values, ends, taken = np.empty((samples, channels)), np.zeros((samples, channels), np.bool_), 0
-        for message in self._messages_of_run(samples, rate_hz, channels):
-            if message.WhichOneof("kind") == "run_data_message":
-                part, at_end = self._samples(message.run_data_message.data, channels)
-                count = min(len(part), samples - taken)
-                values[taken : taken + count], ends[taken : taken + count] = part[:count], at_end[:count]
-                taken += count
+        with contextlib.closing(self._messages_of_run(samples, rate_hz, channels)) as messages:
+            for message in messages:
+                if message.WhichOneof("kind") == "run_data_message":
+                    part, at_end = self._samples(message.run_data_message.data, channels)
+                    count = min(len(part), samples - taken)
+                    values[taken : taken + count], ends[taken : taken + count] = part[:count], at_end[:count]
+                    taken += count
         if taken < samples:
             raise RecordIncomplete(f"instrument {self.name}: returned {taken} of {samples} samples")
         return values, ends
@@ -106,41 +126,76 @@ class LucidacConnection:
     def _ask_in_op(self, module: Any, samples: int, channels: int) -> str:
         """Kind of the answer to a configuration sent in OP; empty if it came too late."""
         states, command_id, operates, answered = self._pb.RunState, "", False, ""
-        for message in self._messages_of_run(samples, _QUESTION_RATE_HZ, channels):
-            if message.WhichOneof("kind") == "run_state_change_message":
-                operates = message.run_state_change_message.new_ == states.OP
-                if operates:
-                    command_id = self._command("config_command", module=module)
-            elif operates and message.id == command_id:
-                answered = message.WhichOneof("kind")
+        with contextlib.closing(self._messages_of_run(samples, _QUESTION_RATE_HZ, channels)) as messages:
+            for message in messages:
+                if message.WhichOneof("kind") == "run_state_change_message":
+                    operates = message.run_state_change_message.new_ == states.OP
+                    if operates:
+                        command_id = self._command("config_command", module=module)
+                elif operates and message.id == command_id:
+                    answered = message.WhichOneof("kind")
         return answered
 
-    def _messages_of_run(self, samples: int, rate_hz: int, channels: int) -> Iterator[Any]:
-        """Start a run. Yield all messages until it is done."""
-        pb, op_ns = self._pb, math.ceil(samples / rate_hz * 1e9)
-        self.ask(
-            "start_run_command",
-            run=pb.Run(id=str(uuid.uuid4())),
-            run_config=pb.RunConfig(
-                ic_time=pb.Time(value=1, prefix=pb.MILLI), op_time=pb.Time(value=op_ns, prefix=pb.NANO)
-            ),
-            daq_config=pb.DaqConfig(num_channels=channels, sample_rate=rate_hz, sample_op=True),
-        )
-        within_s = self._timeout_s + op_ns * 1e-9
-        deadline_s, spare = self._clock() + within_s, samples + _MOST_SPARE
-        while True:
-            message = self._next("the run", deadline_s)
-            if message.WhichOneof("kind") == "run_data_message" and message.run_data_message.data.sample_count:
-                deadline_s = self._clock() + within_s
-                spare -= message.run_data_message.data.sample_count
-                if spare < 0:
-                    raise RigError(f"instrument {self.name}: sends more than the {samples} samples that were asked for")
-            yield message
-            change = message.run_state_change_message
-            if change.new_ == pb.RunState.ERROR:
-                raise RigError(f"instrument {self.name}: the run failed: {change.reason[:200]!r}")
-            if change.new_ == pb.RunState.DONE:
-                return
+    def _messages_of_run(self, samples: int, rate_hz: int, channels: int) -> Generator[Any, None, None]:
+        """Start a run. Yield all messages until it is done; stop it if it is given up before."""
+        pb, op_ns, is_over = self._pb, math.ceil(samples / rate_hz * 1e9), False
+        try:
+            self.ask(
+                "start_run_command",
+                run=pb.Run(id=str(uuid.uuid4())),
+                run_config=pb.RunConfig(
+                    ic_time=pb.Time(value=1, prefix=pb.MILLI), op_time=pb.Time(value=op_ns, prefix=pb.NANO)
+                ),
+                daq_config=pb.DaqConfig(num_channels=channels, sample_rate=rate_hz, sample_op=True),
+            )
+            within_s = self._timeout_s + op_ns * 1e-9
+            deadline_s, spare = self._clock() + within_s, samples + _MOST_SPARE
+            while not is_over:
+                message = self._next("the run", deadline_s)
+                if message.WhichOneof("kind") == "run_data_message" and message.run_data_message.data.sample_count:
+                    deadline_s = self._clock() + within_s
+                    spare -= message.run_data_message.data.sample_count
+                    if spare < 0:
+                        raise RigError(
+                            f"instrument {self.name}: sends more than the {samples} samples that were asked for"
+                        )
+                change = message.run_state_change_message
+                is_over = self._is_end(change)
+                yield message
+                if change.new_ == pb.RunState.ERROR:
+                    raise RigError(f"instrument {self.name}: the run failed: {change.reason[:200]!r}")
+        except RigRefused:
+            is_over = True  # the machine may be at the run of another client
+            raise
+        finally:
+            if not is_over:
+                self._stop_run()
+
+    def _is_end(self, change: Any) -> bool:
+        return change.new_ in (self._pb.RunState.DONE, self._pb.RunState.ERROR)
+
+    def _stop_run(self) -> None:
+        """Stop the run, and await its end, as far as the device takes part within _STOP_S."""
+        deadline_s = self._clock() + _STOP_S
+        with contextlib.suppress(RigError):
+            self._command("stop_run_command", within_s=_STOP_S)
+            while not self._is_end(self._next("stop", deadline_s).run_state_change_message):
+                pass
+
+    def configuration(self) -> dict[tuple[str, str], bytes]:
+        """Present configuration of the device: items by entity and kind, without what a calibration may change.
+
+        Empty if the device refuses to tell.
+        """
+        items = {}
+        answer = self.ask_once("extract_command", recursive=True, configuration=True)
+        for item in answer.extract_response.module.items:
+            kind = item.WhichOneof("kind")
+            for element in item.coef_config.elements:
+                element.ClearField("gain_correction")
+            if kind in _READ_BACK:
+                items[item.entity.path, kind] = item.SerializeToString(deterministic=True)
+        return items
 
     def overloads(self) -> list[str]:
         """Elements that were overloaded since the flags were cleared."""
@@ -171,23 +226,21 @@ class LucidacConnection:
         at_end = np.zeros(raw.shape, np.bool_) if limits is None else (raw == limits.min) | (raw == limits.max)
         return values, at_end[:, order]
 
-    def _command(self, kind: str, **fields: Any) -> str:
-        """Send a command. Return the id of its answer."""
+    def _command(self, kind: str, within_s: float | None = None, **fields: Any) -> str:
+        """Send a command, within the time-out unless another time is given. Return the id of its answer."""
         message = self._pb.MessageV1(id=str(uuid.uuid4()))
         command = getattr(message, kind)
         command.SetInParent()
         command.MergeFrom(type(command)(**fields))
-        self._send(frame(message), kind)
-        return str(message.id)
-
-    def _send(self, data: bytes, what: str) -> None:
+        within_s = self._timeout_s if within_s is None else within_s
         try:
-            self._socket.settimeout(self._timeout_s)
-            self._socket.sendall(data)
+            self._socket.settimeout(within_s)
+            self._socket.sendall(frame(message))
         except TimeoutError as error:
-            raise RigTimeout(f"instrument {self.name}: accepted no command for {self._timeout_s:g} s") from error
+            raise RigTimeout(f"instrument {self.name}: accepted no command for {within_s:g} s") from error
         except OSError as error:
-            raise RigClosed(f"instrument {self.name}: connection lost at {what}: {error.strerror or error}") from error
+            raise RigClosed(f"instrument {self.name}: connection lost at {kind}: {error.strerror or error}") from error
+        return str(message.id)
 
     def _next(self, what: str, deadline_s: float) -> Any:
         """Next message, of whatever sender.
@@ -201,11 +254,11 @@ class LucidacConnection:
             try:
                 content = self._reader.next()
             except FrameError as error:
-                raise RigError(f"instrument {self.name}: {what}: {error}; {_IS_IT_ONE}") from error
+                raise RigError(f"instrument {self.name}: {what}: {error}{self._doubt}") from error
             if content is not None:
                 envelope = parse_envelope(content)
                 if envelope is None or not envelope.HasField("message_v1"):
-                    raise RigError(f"instrument {self.name}: {what}: sent no message of this protocol; {_IS_IT_ONE}")
+                    raise RigError(f"instrument {self.name}: {what}: sent no message of this protocol{self._doubt}")
                 return envelope.message_v1
             self._socket.settimeout(left_s)
             try:
@@ -221,4 +274,4 @@ class LucidacConnection:
             self._reader.feed(received)
 
     def _silence(self, what: str) -> str:
-        return f"instrument {self.name}: {what}: no answer within {self._timeout_s:g} s; {_IS_IT_ONE}"
+        return f"instrument {self.name}: {what}: no answer within {self._timeout_s:g} s{self._doubt}"

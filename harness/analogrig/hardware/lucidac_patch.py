@@ -36,9 +36,10 @@ from analogrig_emulator.lucidac.configuration import (
     Integrator,
     LucidacLane,
     SignalGenerator,
+    rounded_coefficient,
 )
 
-PORT = 2
+SQUARE_PORT = 2
 """Port of the front panel for the square wave, as in the manufacturer's example."""
 
 _INPUT = 8
@@ -104,8 +105,8 @@ class LinearPatch:
         integrators += [Integrator()] * (INTEGRATORS - len(integrators))
         return Configuration(
             tuple(integrators),
-            {FIRST_PORT_LANE + PORT: LucidacLane(None, _INPUT)} | dict(zip(numbers, lanes, strict=False)),
-            external=frozenset({PORT}),
+            {FIRST_PORT_LANE + SQUARE_PORT: LucidacLane(None, _INPUT)} | dict(zip(numbers, lanes, strict=False)),
+            external=frozenset({SQUARE_PORT}),
             adc=(FIRST_IDENTITY, *range(len(self.states))),
             generator=generator,
         )
@@ -169,7 +170,7 @@ class LinearPatch:
                 count = max(1, math.ceil(abs(factor) / UPSCALE))
                 upscaled = abs(factor) > 1.0
                 coefficient = factor / count / (UPSCALE if upscaled else 1.0)
-                rounded = round(coefficient * COEFFICIENT_STEPS) / COEFFICIENT_STEPS
+                rounded = rounded_coefficient(coefficient)
                 if not rounded:
                     raise ConfigurationError(
                         f"program {self.program.name}: a coefficient of {coefficient:.2g} in the equation of"

@@ -81,6 +81,7 @@ class RealRig(Rig):
         """
         self.capabilities = frozenset({"excite", "tweak"} if description.pots.changeable else {"excite"})
         kind, self._address = find_driver(description.instrument)
+        self._place = kind.place(self._address)
         check_wiring(description)
         self._datasheet = kind.datasheet
         self._description = description
@@ -262,7 +263,7 @@ class RealRig(Rig):
         """
         description = self._description
         if not self._is_locked:
-            self._lock.enter_context(lock_instrument(description.instrument))
+            self._lock.enter_context(lock_instrument(description.instrument, self._place))
             self._is_locked = True
         if self._instrument is None:
             self._instrument = self._connect(self._address, description.timeout_s)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 from analogrig.errors import RigClosed, RigError, RigRefused, RigTimeout
+from analogrig.hardware.tcp_address import place_of
 from analogrig.links.wire import Clock
 
 _MOST_ANSWER_BYTES = 1 << 20
@@ -18,7 +19,7 @@ class ScpiConnection:
 
     def __init__(self, host: str, port: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
         """:raises RigError: the connection failed."""
-        self.name = f"{host}:{port}"
+        self.name = place_of(host, port)
         self._clock = clock
         self._timeout_s = timeout_s
         self._input = bytearray()

@@ -99,7 +99,9 @@ class LucidacServer(TcpServer):
         self._items: list[Any] = []
         self._runner: Client | None = None
         self._run: asyncio.Task[None] | None = None
-        self._is_stopped = False
+        self._block: asyncio.Task[NDArray[np.int16] | None] | None = None
+        """Computes the next block of the run in a thread, which a cancelled run cannot stop."""
+        self._stopping = asyncio.Event()
         self._commands: dict[str, Callable[[Client, Any], Any]] = {
             "extract_command": self._extract,
             "reset_command": self._reset,
@@ -285,18 +287,22 @@ class LucidacServer(TcpServer):
             raise RefusedError(f"sample_rate x channels must be 1 to {MOST_RATE_HZ}, not {rate_hz} x {channels}")
         samples = math.floor(round(op_s * rate_hz, 6))
         codes = self._machine.play(samples, rate_hz, halt_on_overload=command.run_config.halt_on_overload)
-        self._runner, self._is_stopped = client, False
+        self._runner, self._stopping = client, asyncio.Event()
         self._run = asyncio.ensure_future(self._conduct(client, command, codes, rate_hz))
         self._run.add_done_callback(lambda _: self._end_run())
         return self._pb.StartRunResponse()
 
     def _end_run(self) -> None:
-        self._runner = self._run = None
+        """Free the machine, but not before the thread of a cancelled run is done with it."""
+        if self._block is None or self._block.done():
+            self._runner = self._run = self._block = None
+        else:
+            self._block.add_done_callback(lambda _: self._end_run())
 
     def _stop_run(self, client: Client, _: Any) -> Any:
         if self._run is None or client is not self._runner:
             raise RefusedError("there is no run of this client")
-        self._is_stopped = True
+        self._stopping.set()
         return self._pb.SuccessMessage()
 
     def _seconds(self, time: Any) -> float:
@@ -322,11 +328,13 @@ class LucidacServer(TcpServer):
         try:
             for new in (states.TAKE_OFF, states.IC, states.OP):
                 await enter(new)
-            while not self._is_stopped and (codes := await asyncio.to_thread(next, blocks, None)) is not None:
+            while not self._stopping.is_set() and (codes := await self._next_block(blocks)) is not None:
                 for part in _chunks(codes):
-                    taken += len(part)
                     if self._clock:
-                        await asyncio.sleep(max(0.0, started_s + taken / rate_hz - self._clock()))
+                        await self._wait(started_s + (taken + len(part)) / rate_hz - self._clock())
+                    if self._stopping.is_set():
+                        break
+                    taken += len(part)
                     message = self._pb.RunDataMessage(run=run, entity=self._pb.EntityId(path=f"/{MAC}"))
                     self._fill(message.data, part)
                     run.chunk += 1
@@ -342,6 +350,17 @@ class LucidacServer(TcpServer):
             await enter(states.ERROR, str(error))
         except (OSError, TimeoutError):
             client.hang_up()
+
+    async def _next_block(self, blocks: Iterator[NDArray[np.int16]]) -> NDArray[np.int16] | None:
+        """Next block of a run; None at its end."""
+        self._block = asyncio.ensure_future(asyncio.to_thread(next, blocks, None))
+        return await asyncio.shield(self._block)
+
+    async def _wait(self, seconds: float) -> None:
+        """Wait, but no longer than until the run is stopped."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._stopping.wait()
 
     async def _notify(self, client: Client, body: Any) -> None:
         client.writer.write(frame(self._message(body)))

@@ -19,6 +19,7 @@ import socket
 from dataclasses import dataclass
 
 from analogrig.errors import ConfigurationError
+from analogrig.hardware.tcp_address import place_of
 
 MOST_CLIENTS = 16
 IDLE_S = 10.0
@@ -80,7 +81,7 @@ class TcpServer:
         try:
             self._server = await asyncio.start_server(self._accept, host, port, limit=self.most_read_bytes)
         except OSError as error:
-            raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror or error}") from error
+            raise ConfigurationError(f"cannot listen at {place_of(host, port)}: {error.strerror or error}") from error
         for listening in self._server.sockets:  # accepted connections inherit the options
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFERED_BYTES)
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFERED_BYTES)
