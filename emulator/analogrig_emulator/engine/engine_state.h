@@ -213,6 +213,7 @@ struct engine {
     double  binomial[NODES][ORDER][ORDER];         // (s + c)^k over s^l, with c each node
     double  extension[NODES * ORDER], ratio;       // panelled values at the nodes of a step over the moments of the one before
     double  moments[ENGINE_MAX_PRODUCTS][ORDER];   // of the products in the last step
+    double  contraction;                           // of the changes of the products from one iteration to the next
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER

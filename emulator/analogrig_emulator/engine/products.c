@@ -46,7 +46,7 @@ static const double nodes[ORDER] = { 0.0, 0.17267316464601143, 0.5, 0.8273268353
 typedef struct {
     double* block;
     double* arguments;      // of each product p, then q, at the other nodes, over z
-    double* feedback;       // the same, over g
+    double* feedback;       // the same, over the values of the products at these nodes
     double* change[NODES];  // of x up to each node, over [z g]
 } rung_t;
 
@@ -135,6 +135,21 @@ static void double_moments(const engine_t* const self, int node, double* moments
     }
 }
 
+/// Turn a row over [z g] into one over z and the values of the products at the other nodes.
+static void weigh(const engine_t* const self, double* row) {
+    for (int i = 0; i < self->products; i++) {
+        double* const g                 = &row[column_of(self, i, 1)];
+        double        by_value[ORDER] = { 0.0 };
+        for (int node = 0; node < ORDER; node++) {
+            for (int k = 0; k < NODES; k++) {
+                by_value[node] += g[k] * self->weight[node * PANEL + k];
+            }
+        }
+        row[column_of(self, i, 0)] += by_value[0];
+        memcpy(g, &by_value[1], NODES * sizeof g[0]);
+    }
+}
+
 /// Matrices of the arguments at a node, row-major over [z g]: w of the state there, with the products as they are there.
 static void
 read_arguments(const engine_t* const self, const double* w, int node, const double* moments, double* arguments) {
@@ -188,6 +203,9 @@ static void fill_rung(const engine_t* const self, double* const* moments, rung_t
     for (int node = 0; node < NODES; node++) {
         panels_pack(self->states, width, stride, moments[node], rung->change[node]);
         read_arguments(self, w, node, moments[node], arguments);
+    }
+    for (int i = 0; i < NODES * count; i++) {
+        weigh(self, &arguments[i * stride]);
     }
     panels_pack(NODES * count, columns, stride, arguments, rung->arguments);
     panels_pack(NODES * count, NODES * self->products, stride, &arguments[columns], rung->feedback);
@@ -365,11 +383,12 @@ engine_status_t products_solve(engine_t* const self) {
 
 // ---------------------------------------------         STEPS          ---------------------------------------------
 
-/// One step under trial. The rows of products begin with their values at its beginning.
+/// One step under trial.
 typedef struct {
-    double values[ENGINE_MAX_PRODUCTS][ORDER];  // at the nodes
-    double vector[MAX_WIDTH];                   // [z g]
-    double z[PADDED(MAX_COLUMNS)];              // at the end
+    double values[MAX_VALUES];      // of the products at the nodes beyond its beginning
+    double contraction;             // of their changes from one iteration to the next
+    double vector[MAX_WIDTH];       // [z g]
+    double z[PADDED(MAX_COLUMNS)];  // at the end
 } step_t;
 
 /// Extend the polynomials of the step before to the nodes of this one.
@@ -386,20 +405,22 @@ static void predict(engine_t* const self, int64_t ticks, step_t* step) {
         }
     }
     for (int i = 0; i < self->products; i++) {
-        double* const value = step->values[i];
-        value[0]            = self->z[column_of(self, i, 0)];
+        double* const value = &step->values[i * NODES];
         if (self->stride > 0) {
-            self->kernels->multiply(NODES, ORDER, self->extension, self->moments[i], &value[1]);
+            self->kernels->multiply(NODES, ORDER, self->extension, self->moments[i], value);
         } else {
-            value[1] = value[2] = value[3] = value[4] = value[0];
+            value[0] = value[1] = value[2] = value[3] = self->z[column_of(self, i, 0)];
         }
     }
 }
 
-/// Set the polynomials through the products at the nodes.
+/// Set [z g] of the polynomials through the products at the nodes.
 static void fit(const engine_t* const self, step_t* step) {
+    copy_z(self, self->z, step->vector);
     for (int i = 0; i < self->products; i++) {
-        self->kernels->multiply(NODES, ORDER, self->weight, step->values[i], &step->vector[column_of(self, i, 1)]);
+        double value[ORDER] = { self->z[column_of(self, i, 0)] };
+        memcpy(&value[1], &step->values[i * NODES], NODES * sizeof value[0]);
+        self->kernels->multiply(NODES, ORDER, self->weight, value, &step->vector[column_of(self, i, 1)]);
     }
 }
 
@@ -415,30 +436,28 @@ static double find_tail(const engine_t* const self, const step_t* step) {
 
 /// Find the products at the nodes of a step from now. Return false if the iteration does not converge.
 static bool iterate(const engine_t* const self, const rung_t* rung, int64_t ticks, step_t* step) {
-    const int count = 2 * NODES * self->products, columns = self->columns;
-    double    fixed[MAX_ARGUMENTS], fed[MAX_ARGUMENTS], driven[ENGINE_MAX_PRODUCTS][NODES];
+    const int values = NODES * self->products;
+    double    fixed[MAX_ARGUMENTS], fed[2 * NODES], driven[MAX_VALUES] = { 0.0 };
     double    before = 0.0;
-    self->kernels->multiply(count, columns, rung->arguments, self->z, fixed);
-    for (int i = 0; i < self->products; i++) {
-        for (int node = 0; node < NODES; node++) {
-            driven[i][node] = 0.0;
-            if (self->drives[i].terms != NULL) {
-                follow_drive(&self->drives[i], (double)self->now + nodes[node + 1] * (double)ticks, &driven[i][node]);
-            }
+    self->kernels->multiply(2 * values, self->columns, rung->arguments, self->z, fixed);
+    for (int j = 0; j < values; j++) {
+        const drive_t* const drive = &self->drives[j / NODES];
+        if (drive->terms != NULL) {
+            follow_drive(drive, (double)self->now + nodes[j % NODES + 1] * (double)ticks, &driven[j]);
         }
     }
+    step->contraction = self->stride > 0 ? 2.0 * self->ratio * self->contraction : 1.0;
     for (int i = 0; i < ITERATIONS; i++) {
         double moved = 0.0;
-        fit(self, step);
-        self->kernels->multiply(count, NODES * self->products, rung->feedback, &step->vector[columns], fed);
-        self->kernels->add(count, 1.0, fixed, 1.0, fed);
-        for (int j = 0; j < self->products; j++) {
-            const double change = self->kernels->apply(&self->circuit->law[j], &fed[2 * NODES * j], driven[j],
-                                                       &step->values[j][1]);
-            moved               = change > moved ? change : moved;
+        for (int j = 0; j < values; j += NODES) {  // each product takes the new values of those before it
+            self->kernels->multiply(2 * NODES, values, &rung->feedback[2 * j * values], step->values, fed);
+            self->kernels->add(2 * NODES, 1.0, &fixed[2 * j], 1.0, fed);
+            const double change =
+                self->kernels->apply(&self->circuit->law[j / NODES], fed, &driven[j], &step->values[j]);
+            moved = change > moved ? change : moved;
         }
-        if (moved <= CONVERGED_V || moved * moved <= CONVERGED_V * (before - moved)) {
-            fit(self, step);
+        step->contraction = i > 0 ? moved / before : step->contraction;
+        if (moved <= CONVERGED_V || step->contraction * moved <= CONVERGED_V * (1.0 - step->contraction)) {
             return true;
         }
         if (!isfinite(moved)) {
@@ -458,7 +477,7 @@ static void arrive(const engine_t* const self, const rung_t* rung, int node, con
         z[i] += change[i];
     }
     for (int i = 0; i < self->products; i++) {
-        z[column_of(self, i, 0)] = step->values[i][node + 1];
+        z[column_of(self, i, 0)] = step->values[i * NODES + node];
     }
 }
 
@@ -498,10 +517,10 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
     const int64_t ticks = INT64_C(1) << level;
     self->counts.steps++;
     predict(self, ticks, step);
-    copy_z(self, self->z, step->vector);
     if (!iterate(self, rung, ticks, step)) {
         return level > 0 ? TOO_LONG : FAILED;
     }
+    fit(self, step);
     *tail = find_tail(self, step);
     if (level > 0 && !(*tail <= TAIL_V)) {
         return TOO_LONG;
@@ -518,9 +537,10 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
 /// Accept a step.
 static void accept(engine_t* const self, int level, const step_t* step) {
     for (int i = 0; i < self->products; i++) {
-        self->moments[i][0] = step->values[i][0];
+        self->moments[i][0] = self->z[column_of(self, i, 0)];
         memcpy(&self->moments[i][1], &step->vector[column_of(self, i, 1)], NODES * sizeof self->moments[0][0]);
     }
+    self->contraction = step->contraction;
     copy_z(self, step->z, self->z);
     self->clear = self->now;
     step_accept(self, INT64_C(1) << level);
