@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Real
@@ -206,6 +206,9 @@ class Switch(_TwoEnded):
 Element: TypeAlias = (
     Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch | Multiplier | Function
 )
+Ways: TypeAlias = Mapping[str, Sequence[str]]
+"""Neighbours of each node."""
+
 _T = TypeVar("_T")
 _E = TypeVar(
     "_E",
@@ -440,7 +443,7 @@ def _check_value(element: Element, field: str) -> None:
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:
     """Raise CircuitError for a node without a path to ground that determines its voltage."""
-    grounded = _reachable(GROUND, _neighbours(bond for element in elements for bond in element.bonds))
+    grounded = reachable(GROUND, neighbours(bond for element in elements for bond in element.bonds))
     for element in elements:
         for node in element.nodes:
             if node not in grounded:
@@ -474,7 +477,7 @@ def _root(node: str, joined: dict[str, str]) -> str:
 def _path_names(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
     """Names of the rigid elements on the path from node a to node b, in order."""
     rigid = [(element.name, bond) for element in elements for bond in element.rigid_bonds]
-    ways = _neighbours(bond for _, bond in rigid)
+    ways = neighbours(bond for _, bond in rigid)
     names = {frozenset(bond): name for name, bond in rigid}
     before, front = {a: a}, [a]
     while b not in before:
@@ -490,7 +493,7 @@ def _path_names(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
 
 def _check_feedback(elements: tuple[Element, ...]) -> None:
     """Raise CircuitError for an op-amp whose output acts on neither of its inputs."""
-    acts = _neighbours(
+    acts = neighbours(
         bond for element in elements if not isinstance(element, OpAmp) for bond in element.bonds if GROUND not in bond
     )
     for amp in elements:
@@ -501,7 +504,7 @@ def _check_feedback(elements: tuple[Element, ...]) -> None:
             for node in amp.nodes[:-1]:
                 acts.setdefault(node, []).append(amp.out)
     for amp in elements:
-        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reachable(amp.out, acts):
+        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & reachable(amp.out, acts):
             raise element_error(
                 amp,
                 f"no feedback: its output, node {amp.out}, acts on neither of its inputs, nodes"
@@ -509,7 +512,7 @@ def _check_feedback(elements: tuple[Element, ...]) -> None:
             )
 
 
-def _neighbours(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def neighbours(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     """The neighbours of each node."""
     ways: dict[str, list[str]] = {}
     for a, b in bonds:
@@ -518,10 +521,13 @@ def _neighbours(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     return ways
 
 
-def _reachable(start: str, ways: Mapping[str, Sequence[str]]) -> set[str]:
+def reachable(start: str, ways: Ways, borders: Container[str] = ()) -> set[str]:
+    """Nodes to which ways lead from start, up to and including borders."""
     reached, front = {start}, [start]
     while front:
-        fresh = [node for node in ways.get(front.pop(), ()) if node not in reached]
-        reached.update(fresh)
-        front += fresh
+        for node in ways.get(front.pop(), ()):
+            if node not in reached:
+                reached.add(node)
+                if node not in borders:
+                    front.append(node)
     return reached

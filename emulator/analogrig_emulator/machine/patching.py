@@ -19,7 +19,10 @@ from analogrig_emulator.circuit.circuit import (
     OpAmp,
     Pot,
     VoltageSource,
+    Ways,
     label,
+    neighbours,
+    reachable,
 )
 from analogrig_emulator.circuit.components import is_part_of
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
@@ -70,11 +73,13 @@ class _Wiring:
 def _patches(panel: _Wiring) -> dict[str, Patch]:
     circuit = panel.circuit
     drivers = _drivers(circuit)
+    passive = neighbours(bond for element in circuit.elements for bond in _passive_bonds(element))
+    ways = neighbours(bond for element in circuit.elements for bond in element.bonds)
     _check_ends(circuit)
-    _check_feeds(circuit, drivers)
+    _check_feeds(circuit, drivers, passive)
     for amp in circuit.of(OpAmp):
-        _check_feedback(circuit, amp, drivers)
-    found = {amp.name: _patch(circuit, amp) for amp in circuit.of(OpAmp)}
+        _check_feedback(circuit, amp, reachable(amp.minus, passive, drivers | {GROUND}))
+    found = {amp.name: _patch(circuit, amp, ways) for amp in circuit.of(OpAmp)}
     for amp in circuit.of(OpAmp):
         if amp.plus == GROUND and not found[amp.name].inputs:
             raise CircuitError(f"{label(amp)}: nothing feeds its input at node {amp.minus}")
@@ -118,43 +123,41 @@ def _open_end(element: Element, node: str) -> str:
     return f"nothing feeds its node {node}"
 
 
-def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
+def _check_feeds(circuit: Circuit, drivers: set[str], passive: Ways) -> None:
     """Raise CircuitError for passive elements that neither reach an output nor ground an input."""
-    junctions = {amp.minus for amp in circuit.of(OpAmp)}
     drivers = drivers | {node for source in circuit.of(CurrentSource) for node in source.nodes}
     rests = {amp.plus for amp in circuit.of(OpAmp)}
-    bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
+    held = drivers | {amp.minus for amp in circuit.of(OpAmp)} | {GROUND}
     for element in circuit.elements:
         for node in element.nodes:
-            if node in drivers | junctions | {GROUND}:
+            if node in held:
                 continue
-            reached = _reachable(node, bonds, drivers | junctions | {GROUND})
+            reached = reachable(node, passive, held)
             if not reached & drivers and not (GROUND in reached and reached & rests):
                 raise CircuitError(f"{label(element)}: nothing feeds its node {node}")
 
 
-def _check_feedback(circuit: Circuit, amp: OpAmp, drivers: set[str]) -> None:
-    bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
+def _check_feedback(circuit: Circuit, amp: OpAmp, reached: set[str]) -> None:
+    """Raise CircuitError if what the junction reaches is no feedback."""
     computing: tuple[Multiplier | Function, ...] = (*circuit.of(Multiplier), *circuit.of(Function))
     fed_back = {amp.out} | {part.out for part in computing if amp.out in part.nodes[:-1]}
-    if amp.minus != amp.out and not fed_back & _reachable(amp.minus, bonds, drivers | {GROUND}):
+    if amp.minus != amp.out and not fed_back & reached:
         raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
 
-def _patch(circuit: Circuit, amp: OpAmp) -> Patch:
+def _patch(circuit: Circuit, amp: OpAmp, ways: Ways) -> Patch:
     capacitors = tuple(part.name for part in circuit.of(Capacitor) if {part.a, part.b} == {amp.minus, amp.out})
-    inputs = () if amp.minus == amp.out else tuple(part.name for part in _inputs(circuit, amp))
+    inputs = () if amp.minus == amp.out else tuple(part.name for part in _inputs(circuit, amp, ways))
     return Patch(amp.name, amp.minus, amp.out, inputs, capacitors)
 
 
-def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
+def _inputs(circuit: Circuit, amp: OpAmp, ways: Ways) -> Iterator[Element]:
     """Elements at the junction that also connect to something other than the amplifier's own output."""
-    bonds = [bond for element in circuit.elements for bond in element.bonds]
-    elsewhere = _reachable(GROUND, bonds, {amp.minus, amp.out}) - {amp.minus, amp.out, GROUND}
+    own = {amp.minus, amp.out}
+    elsewhere = reachable(GROUND, ways, own) - own - {GROUND}
     for element in circuit.elements:
-        if (
-            isinstance(element, OpAmp | VoltageSource | Capacitor | Multiplier | Function)
-            or amp.minus not in element.nodes
+        if amp.minus not in element.nodes or isinstance(
+            element, OpAmp | VoltageSource | Capacitor | Multiplier | Function
         ):
             continue
         if not is_part_of(element, amp.name) and elsewhere.intersection(element.nodes):
@@ -163,13 +166,3 @@ def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
 
 def _passive_bonds(element: Element) -> tuple[tuple[str, str], ...]:
     return () if isinstance(element, OpAmp | VoltageSource | Multiplier | Function) else element.bonds
-
-
-def _reachable(start: str, bonds: list[tuple[str, str]], borders: set[str]) -> set[str]:
-    """Nodes that bonds join to start, up to and including borders."""
-    reached, fresh = {start}, {start}
-    while fresh:
-        fresh = {node for bond in bonds if fresh.intersection(bond) for node in bond} - reached
-        reached |= fresh
-        fresh = fresh - borders
-    return reached
