@@ -74,12 +74,11 @@ def _patches(panel: _Wiring) -> dict[str, Patch]:
     circuit = panel.circuit
     drivers = _drivers(circuit)
     passive = neighbours(bond for element in circuit.elements for bond in _passive_bonds(element))
-    ways = neighbours(bond for element in circuit.elements for bond in element.bonds)
     _check_ends(circuit)
     _check_feeds(circuit, drivers, passive)
     for amp in circuit.of(OpAmp):
         _check_feedback(circuit, amp, reachable(amp.minus, passive, drivers | {GROUND}))
-    found = {amp.name: _patch(circuit, amp, ways) for amp in circuit.of(OpAmp)}
+    found = {amp.name: _patch(circuit, amp) for amp in circuit.of(OpAmp)}
     for amp in circuit.of(OpAmp):
         if amp.plus == GROUND and not found[amp.name].inputs:
             raise CircuitError(f"{label(amp)}: nothing feeds its input at node {amp.minus}")
@@ -128,10 +127,12 @@ def _check_feeds(circuit: Circuit, drivers: set[str], passive: Ways) -> None:
     drivers = drivers | {node for source in circuit.of(CurrentSource) for node in source.nodes}
     rests = {amp.plus for amp in circuit.of(OpAmp)}
     held = drivers | {amp.minus for amp in circuit.of(OpAmp)} | {GROUND}
+    fed = set(held)
     for element in circuit.elements:
         for node in element.nodes:
-            if node in held:
+            if node in fed:
                 continue
+            fed.add(node)
             reached = reachable(node, passive, held)
             if not reached & drivers and not (GROUND in reached and reached & rests):
                 raise CircuitError(f"{label(element)}: nothing feeds its node {node}")
@@ -145,16 +146,16 @@ def _check_feedback(circuit: Circuit, amp: OpAmp, reached: set[str]) -> None:
         raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
 
-def _patch(circuit: Circuit, amp: OpAmp, ways: Ways) -> Patch:
+def _patch(circuit: Circuit, amp: OpAmp) -> Patch:
     capacitors = tuple(part.name for part in circuit.of(Capacitor) if {part.a, part.b} == {amp.minus, amp.out})
-    inputs = () if amp.minus == amp.out else tuple(part.name for part in _inputs(circuit, amp, ways))
+    inputs = () if amp.minus == amp.out else tuple(part.name for part in _inputs(circuit, amp))
     return Patch(amp.name, amp.minus, amp.out, inputs, capacitors)
 
 
-def _inputs(circuit: Circuit, amp: OpAmp, ways: Ways) -> Iterator[Element]:
+def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
     """Elements at the junction that also connect to something other than the amplifier's own output."""
     own = {amp.minus, amp.out}
-    elsewhere = reachable(GROUND, ways, own) - own - {GROUND}
+    elsewhere = reachable(GROUND, circuit.ways, own) - own - {GROUND}
     for element in circuit.elements:
         if amp.minus not in element.nodes or isinstance(
             element, OpAmp | VoltageSource | Capacitor | Multiplier | Function
