@@ -139,9 +139,7 @@ class Nodal:
         limits = [_limits(part) for part in limited]
         self._kinks = tuple(kink for kinks in limits for kink in kinks.values())
         first_source = len(self._kinks)
-        self._kinks += tuple(
-            Kink.deadzone(-math.inf, limiter.threshold_v, limiter.name) for limiter in self._limiters
-        )
+        self._kinks += tuple(Kink.deadzone(-math.inf, limiter.threshold_v, limiter.name) for limiter in self._limiters)
         self._kinks += tuple(kink for function in self._functions for kink in function.kinks)
         self._recovering = tuple(amp for amp in self._poles if amp.model.recovers)
         self._kinks += tuple(Kink.deadzone(*amp.model.swing_v, amp.name) for amp in self._recovering)
@@ -510,9 +508,8 @@ class _Laws:
         plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
         limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
         first, states = len(capacitors), len(capacitors) + len(limited)
-        kinds = [
-            (i, part, limit) for i, (part, kinks) in enumerate(zip(limited, limits, strict=True), first) for limit in kinks
-        ]
+        parts_limits = enumerate(zip(limited, limits, strict=True), first)
+        kinds = [(i, part, limit) for i, (part, kinks) in parts_limits for limit in kinks]
         held = [(kink, i) for kink, (i, _, limit) in enumerate(kinds) if limit is not _Limit.SLEW]
         fed_back = [(kink, part) for kink, (_, part, limit) in enumerate(kinds) if limit is _Limit.CURRENT]
         last_source = len(kinds) + len(limiters) + len(bent) + len(recovering)

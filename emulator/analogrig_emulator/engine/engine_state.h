@@ -20,6 +20,7 @@
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>
+#include <string.h>
 
 #define TOP_LEVEL (ENGINE_LEVELS - 1)
 #define NEVER INT64_C(-1)
@@ -208,12 +209,13 @@ struct engine {
 
     drive_t drives[ENGINE_MAX_PRODUCTS];  // of the products
 
-    int64_t ahead;                                 // ticks; see engine_look_ahead()
-    double  weight[NODES * ORDER];                 // panelled moments of a polynomial over its values at the nodes
-    double  binomial[NODES][ORDER][ORDER];         // (s + c)^k over s^l, with c each node
-    double  extension[NODES * ORDER], ratio;       // panelled values at the nodes of a step over the moments of the one before
-    double  moments[ENGINE_MAX_PRODUCTS][ORDER];   // of the products in the last step
-    double  contraction;                           // of the changes of the products from one iteration to the next
+    int64_t ahead;                          // ticks; see engine_look_ahead()
+    double  weight[NODES * ORDER];          // panelled moments of a polynomial over its values at the nodes
+    double  binomial[NODES][ORDER][ORDER];  // (s + c)^k over s^l, with c each node
+    double  extension[NODES * ORDER],
+        ratio;  // panelled values at the nodes of a step over the moments of the one before
+    double moments[ENGINE_MAX_PRODUCTS][ORDER];  // of the products in the last step
+    double contraction;                          // of the changes of the products from one iteration to the next
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER
@@ -250,9 +252,7 @@ static inline double kink_upper_bound(const engine_kink_t* kink, unsigned char p
 static inline int row_length(const engine_t* self) { return self->ahead > 0 ? 2 * self->outputs : self->outputs; }
 
 static inline void copy_z(const engine_t* self, const double* from, double* to) {
-    for (int j = 0; j < self->columns; j++) {
-        to[j] = from[j];
-    }
+    memcpy(to, from, (size_t)self->columns * sizeof to[0]);
 }
 
 // The functions below are shared by the chapters, but not exported by the library.

@@ -155,9 +155,9 @@ TARGET static double KERNEL(apply)(const law_t* law, const double* arguments, co
     double change[PANEL], most = 0.0;
     for (int i = 0; i < PANEL; i += LANES) {
         const lanes_t p = *(const lanes_t*)&arguments[i], q = *(const lanes_t*)&arguments[PANEL + i];
-        const lanes_t value = KERNEL(evaluate)(law->factors.x, law->x_degree, p) *
-                                  KERNEL(evaluate)(law->factors.y, law->y_degree, q) +
-                              *(const lanes_t*)&driven[i];
+        const lanes_t value =
+            KERNEL(evaluate)(law->factors.x, law->x_degree, p) * KERNEL(evaluate)(law->factors.y, law->y_degree, q) +
+            *(const lanes_t*)&driven[i];
         *(lanes_t*)&change[i] = value - *(const lanes_t*)&values[i];
         *(lanes_t*)&values[i] = value;
     }
@@ -254,8 +254,8 @@ TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     return CLEAR;
 }
 
-static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose),
-                                           KERNEL(add),      KERNEL(apply),   KERNEL(look), KERNEL(look_on) };
+static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose), KERNEL(add),
+                                           KERNEL(apply),    KERNEL(look),    KERNEL(look_on) };
 
 #undef INLINE
 #undef JOINED

@@ -117,7 +117,7 @@ static void double_moments(const engine_t* const self, int node, double* moments
         double* const       row = &moments[i];
         const double* const fed = &product[i];
         for (int j = 0; j < self->products; j++) {
-            const double first = row[column_of(self, j, 0)];
+            const double        first = row[column_of(self, j, 0)];
             double* const       g     = &row[column_of(self, j, 1)];
             const double* const g_fed = &fed[column_of(self, j, 1)];
             for (int k = ORDER - 1; k > 0; k--) {  // each needs those below it
@@ -138,7 +138,7 @@ static void double_moments(const engine_t* const self, int node, double* moments
 /// Turn a row over [z g] into one over z and the values of the products at the other nodes.
 static void weigh(const engine_t* const self, double* row) {
     for (int i = 0; i < self->products; i++) {
-        double* const g                 = &row[column_of(self, i, 1)];
+        double* const g               = &row[column_of(self, i, 1)];
         double        by_value[ORDER] = { 0.0 };
         for (int node = 0; node < ORDER; node++) {
             for (int k = 0; k < NODES; k++) {
@@ -437,13 +437,14 @@ static double find_tail(const engine_t* const self, const step_t* step) {
 /// Find the products at the nodes of a step from now. Return false if the iteration does not converge.
 static bool iterate(const engine_t* const self, const rung_t* rung, int64_t ticks, step_t* step) {
     const int values = NODES * self->products;
-    double    fixed[MAX_ARGUMENTS], fed[2 * NODES], driven[MAX_VALUES] = { 0.0 };
+    double    fixed[MAX_ARGUMENTS], fed[2 * NODES], driven[MAX_VALUES];
     double    before = 0.0;
     self->kernels->multiply(2 * values, self->columns, rung->arguments, self->z, fixed);
-    for (int j = 0; j < values; j++) {
-        const drive_t* const drive = &self->drives[j / NODES];
-        if (drive->terms != NULL) {
-            follow_drive(drive, (double)self->now + nodes[j % NODES + 1] * (double)ticks, &driven[j]);
+    memset(driven, 0, (size_t)values * sizeof driven[0]);
+    for (int i = 0; i < self->products; i++) {
+        for (int node = 0; node < NODES && self->drives[i].terms != NULL; node++) {
+            follow_drive(&self->drives[i], (double)self->now + nodes[node + 1] * (double)ticks,
+                         &driven[i * NODES + node]);
         }
     }
     step->contraction = self->stride > 0 ? 2.0 * self->ratio * self->contraction : 1.0;
@@ -502,7 +503,8 @@ static int choose_level(const engine_t* const self, int64_t tick) {
     int           level = self->look;
     while (level > 0) {
         const int64_t ticks = INT64_C(1) << level;
-        if ((ticks <= since || level <= self->mode->base) && self->now % ticks == 0 && self->now + ticks <= tick) {
+        if ((ticks <= since || level <= self->mode->base) && (self->now & (ticks - 1)) == 0 &&
+            self->now + ticks <= tick) {
             break;
         }
         level--;

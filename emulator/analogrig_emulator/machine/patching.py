@@ -7,6 +7,7 @@ junction, and every cord leads from an output to an input; this module rejects a
 from __future__ import annotations
 
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -107,7 +108,7 @@ def _output(element: Element) -> str | None:
 
 def _check_ends(circuit: Circuit) -> None:
     """Raise CircuitError for a node with one end, unless that is an output."""
-    ends = Counter(node for element in circuit.elements for node in element.nodes)
+    ends = Counter(itertools.chain.from_iterable(element.nodes for element in circuit.elements))
     for element in circuit.elements:
         for node in element.nodes:
             if ends[node] == 1 and node not in (GROUND, _output(element)):
