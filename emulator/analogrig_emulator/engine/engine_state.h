@@ -212,10 +212,10 @@ struct engine {
     int64_t ahead;                          // ticks; see engine_look_ahead()
     double  weight[NODES * ORDER];          // panelled moments of a polynomial over its values at the nodes
     double  binomial[NODES][ORDER][ORDER];  // (s + c)^k over s^l, with c each node
-    double  extension[NODES * ORDER],
-        ratio;  // panelled values at the nodes of a step over the moments of the one before
-    double moments[ENGINE_MAX_PRODUCTS][ORDER];  // of the products in the last step
-    double contraction;                          // of the changes of the products from one iteration to the next
+    double  ratio;                          // length of a step over that of the one before
+    double  extension[NODES * ORDER];  // panelled values at the nodes of this step over the moments of the one before
+    double  moments[ENGINE_MAX_PRODUCTS][ORDER];  // of the products in the last step
+    double  contraction;  // ratio of the last change of the products in an iteration to the change before
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER

@@ -29,7 +29,8 @@
 #define TAIL_V 1e-4
 #define GROWING 0.02
 
-/// Error of a product, in V, at which an iteration has converged: each change is the same part of the one before.
+/// Error of a product, in V, at which an iteration has converged. It is estimated as the sum of all changes to come: each is
+/// the same part, the contraction, of the one before.
 #define CONVERGED_V 1e-7
 #define ITERATIONS 14
 
@@ -447,6 +448,7 @@ static bool iterate(const engine_t* const self, const rung_t* rung, int64_t tick
                          &driven[i * NODES + node]);
         }
     }
+    // Until the second change, that of the step before counts twice, and the more the longer this step is.
     step->contraction = self->stride > 0 ? 2.0 * self->ratio * self->contraction : 1.0;
     for (int i = 0; i < ITERATIONS; i++) {
         double moved = 0.0;
