@@ -59,9 +59,9 @@ FAST_FARAD, SLOW_FARAD = 10e-9, 1e-6
 
 _COEFFICIENT_OHM = 10e3
 
-_COMPUTING = OpAmpModel(avol=1e6, gbw_hz=400e6, slew_v_per_s=300e6, swing_v=(-2.5, 2.5))
+_COMPUTING = OpAmpModel(avol=1e6, gbw_hz=1e9, slew_v_per_s=300e6, swing_v=(-2.5, 2.5))
 _LANE = OpAmpModel(avol=1e6)
-_MULTIPLIER = MultiplierModel(full_v=UNIT_V, bandwidth_hz=50e6, slew_v_per_s=300e6, swing_v=(-2.5, 2.5))
+_MULTIPLIER = MultiplierModel(full_v=UNIT_V, bandwidth_hz=250e6, slew_v_per_s=1e9, swing_v=(-2.5, 2.5))
 
 
 @dataclass(frozen=True)
@@ -92,15 +92,15 @@ class LucidacParts:
                 x_offset_v=5e-3,
                 y_offset_v=5e-3,
                 z_offset_v=5e-3,
-                x_nonlinearity=5e-4,
-                y_nonlinearity=5e-4,
+                x_nonlinearity=5e-5,
+                y_nonlinearity=5e-5,
             ),
         )
     )
     coefficient_steps: int = COEFFICIENT_STEPS
     gain_step: float = 2.0**-16
     offset_step: float = 2.0**-17
-    multiplier_step: float = 2.0**-14
+    multiplier_step: float = 2.0**-17
     most_gain: float = 0.1
     overload: float = 1.05
     full_scale: float = FULL_SCALE
