@@ -480,7 +480,7 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// Bad data never fails and never enters the estimate: see est_status_t. Up to 8 samples in a row that are missing or
 /// refused are predicted, if C is that of the plant and u is the same before and after them; the next good sample then
 /// has its equation. After any other gap the equations begin anew, as after est_init().
-/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.4 times a
+/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.45 times a
 /// typical one if edges may slip, 1.3 times otherwise.
 /// RAM: the state, and stack: on a Cortex-M 300 to 440 bytes, at -O0 4,500; on an AVR 340, at -O0 2,800 (make
 /// cost). May be called from an interrupt.
