@@ -43,6 +43,11 @@ SLOWEST = (
     "test_planted_defects",
     "test_kills",
     "test_packaging",
+    "test_real_rig",
+    "test_detection",
+    "test_docs",
+    "test_mutation",
+    "test_coverage",
 )
 """Modules to start with, in order: one that is left for the end has a processor to itself while others are idle."""
 

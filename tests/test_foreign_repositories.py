@@ -169,12 +169,11 @@ def outcomes(programs: Path, way: Way, folder: Path, *options: str, status: int 
     return told
 
 
-@pytest.mark.parametrize("packages", [True, False], ids=["packages", "folders"])
 @pytest.mark.parametrize(
-    ("with_ours", "way"),
+    ("with_ours", "way", "packages"),
     [
-        *((THIS, way) for way in WAYS),
-        *((version, "python -m pytest") for version in VERSIONS if version != THIS),
+        *((THIS, way, packages) for way in WAYS for packages in (True, False)),
+        *((version, "python -m pytest", True) for version in VERSIONS if version != THIS),
     ],
     indirect=["with_ours"],
 )

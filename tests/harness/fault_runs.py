@@ -307,7 +307,7 @@ def everywhere(
         for step in STEPS:
             numbers = [number for number, name in enumerate(names) if name == step]
             n = 2 if step == "samples" else ends
-            for number in {*numbers[:n], *numbers[::stride], *numbers[-n:]}:
+            for number in {*numbers[:n], *numbers[::stride], *numbers[len(numbers) - n :]}:
                 fault = WireFault(kind, direction, number)
                 first_seq = 250 if number % 2 else 0  # which wraps around in the handshake
                 yield step, direction, Case(WireFaults((fault,), seed=number), exchange, link, first_seq)

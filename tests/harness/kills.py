@@ -189,11 +189,7 @@ def started(case: Case, folder: Path) -> Iterator[tuple[subprocess.Popen[bytes],
 
 
 def duration_s(case: Case, before: Path) -> float:
-    """Duration of the command, the shorter of two; for a command that does not end, until it is at work."""
-    return min(_measured_s(case, before) for _ in range(2))
-
-
-def _measured_s(case: Case, before: Path) -> float:
+    """Duration of the command; for a command that does not end, until it is at work."""
     with tempfile.TemporaryDirectory() as folder:
         now = Path(shutil.copytree(before, Path(folder) / "now"))
         start_s = time.monotonic()
