@@ -62,8 +62,8 @@ absolute values, minima, quotients, roots, curves. The square wave of its trial 
 
 Ideal parts: the largest difference at any channel from the equations of the file, solved by scipy's
 DOP853 to 1e-9. Dividers and roots have {_IDEAL_LOOP:g} of their loop capacitors. These stabilise real
-amplifiers and make them late: by 0.5 to 5 us, times 10 V over the divisor's voltage. Uncut, and with
-divisors near zero, that is 1 to 1,000 LSB for some microseconds to samples after an edge.
+amplifiers, and make them late by 0.5 to 5 us times 10 V over the divisor's voltage. Whole, and with
+divisors near zero, that is 1 to 1,000 LSB after an edge.
 
 Real parts: the largest difference at any amplifier from ngspice, in the tightest setting with which
 it reaches the end. The parts are those of the rig `emulator-real`: drawn resistors, capacitors that
