@@ -43,6 +43,7 @@ def main(count: int = 50, first: int = 0) -> int:
                 errors_lsb[seed] = found
                 print(f"seed {seed}: {found:.4f} LSB", flush=True)
             if len(errors_lsb) == count:
+                pool.shutdown(wait=False, cancel_futures=True)
                 break
     failed = [seed for seed, error_lsb in errors_lsb.items() if error_lsb > MOST_LSB]
     print(f"{len(errors_lsb)} configurations: at most {max(errors_lsb.values()):.4f} LSB of 16 bits; {failed=}")
