@@ -2,7 +2,7 @@
 
 python -m tests.benchmarks.soak_lucidac [COUNT [FIRST_SEED]]
 
-A deck that takes ngspice longer than LIMIT_S is replaced by that of a further seed.
+A deck that ngspice gives up, or that takes it longer than LIMIT_S, is replaced by that of a further seed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from tests.emulator.conftest import OutOfTimeError, ngspice_in
+from tests.emulator.conftest import UnfinishedError, ngspice_in
 from tests.emulator.lucidac_decks import ngspice_error_lsb
 
 MOST_LSB = 0.05
@@ -25,7 +25,7 @@ def compare(seed: int) -> float | str:
     with tempfile.TemporaryDirectory() as folder:
         try:
             return ngspice_error_lsb(ngspice_in(Path(folder), LIMIT_S), seed)
-        except OutOfTimeError as error:
+        except UnfinishedError as error:
             return str(error)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
@@ -16,8 +17,8 @@ NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 SAMPLE_RATE_HZ = 20e3
 
 
-class OutOfTimeError(Exception):
-    """ngspice had not finished a deck within its limit of time."""
+class UnfinishedError(Exception):
+    """ngspice did not finish a deck: its limit of time was over, or its step became too small."""
 
 
 @pytest.fixture
@@ -35,8 +36,10 @@ def ngspice_in(folder: Path, limit_s: int | None = None) -> NgSpice:
         command = [*limit, "ngspice", "-b", "-r", "out.raw", "deck.cir"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode == -signal.SIGXCPU:
-            raise OutOfTimeError(f"not finished after {limit_s} s of processor time")
+            raise UnfinishedError(f"not finished after {limit_s} s of processor time")
         log = done.stdout[-2000:] + done.stderr[-2000:]
+        if aborted := re.search("Timestep too small; time = [^,]*", log):
+            raise UnfinishedError(aborted[0])
         assert (folder / "out.raw").exists(), log
         names, table = _read_raw(folder / "out.raw")
         instants_s = np.arange(samples) / SAMPLE_RATE_HZ
