@@ -34,6 +34,10 @@
 #define CONVERGED_V 1e-7
 #define ITERATIONS 14
 
+/// Least change of a product, in V, of which a contraction is computed: smaller ones are rounding. A contraction of 0 would
+/// hold for all steps to come, since each step then ends after one iteration.
+#define ROUNDING_V 1e-15
+
 /// Passes after which products that feed one another without a state between must have settled.
 #define PASSES (2 * ENGINE_MAX_PRODUCTS + 2)
 #define SETTLED 1e-13
@@ -459,7 +463,7 @@ static bool iterate(const engine_t* const self, const rung_t* rung, int64_t tick
                 self->kernels->apply(&self->circuit->law[j / NODES], fed, &driven[j], &step->values[j]);
             moved = change > moved ? change : moved;
         }
-        step->contraction = i > 0 ? moved / before : step->contraction;
+        step->contraction = i > 0 ? (moved > ROUNDING_V ? moved : ROUNDING_V) / before : step->contraction;
         if (moved <= CONVERGED_V || step->contraction * moved <= CONVERGED_V * (1.0 - step->contraction)) {
             return true;
         }
