@@ -13,14 +13,13 @@ import numpy as np
 
 from analogrig.hardware.simulator.served_lucidac import specimen
 from analogrig.scenario import DEFAULT_SEED
-from analogrig_emulator.lucidac.configuration import Configuration
 from analogrig_emulator.lucidac.machine import Lucidac
 from analogrig_emulator.lucidac.wiring import LucidacParts
-from tests.served.lucidac_deviations import deviation, play, read_configuration, run_examples
-from tests.served.lucidac_examples import EXAMPLES, Example
+from tests.served.lucidac_deviations import calibrated_deviation, deviation, play, read_configuration, run_examples
+from tests.served.lucidac_examples import EXAMPLES
 from tests.served.serving import serving
 
-BANDWIDTHS_MHZ = (20, 50, 100, 400)
+BANDWIDTHS_MHZ = (50, 100, 400, 1000)
 SEEDS = range(1, 13)
 
 
@@ -28,12 +27,6 @@ def machine(bandwidth_mhz: float) -> Lucidac:
     parts = LucidacParts()
     computing = replace(parts.computing, gbw_hz=1e6 * bandwidth_mhz)
     return Lucidac(replace(parts, computing=computing, components=replace(parts.components, seed=DEFAULT_SEED)))
-
-
-def calibrated_deviation(each: Lucidac, example: Example, patch: Configuration) -> float:
-    each.configure(patch)
-    each.calibrate(gain=True, offset=True)
-    return deviation(example, patch, play(each, example))
 
 
 def main() -> None:

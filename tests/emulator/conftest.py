@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import signal
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,20 +17,29 @@ NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 SAMPLE_RATE_HZ = 20e3
 
 
+class UnfinishedError(Exception):
+    """ngspice did not finish a deck: its limit of time was over, or its step became too small."""
+
+
 @pytest.fixture
 def ngspice(tmp_path: Path) -> NgSpice:
     """(deck, nodes, samples) -> voltages of the nodes at every sample instant of 20 kHz, (samples, nodes)."""
     return ngspice_in(tmp_path)
 
 
-def ngspice_in(folder: Path) -> NgSpice:
-    """Value of the fixture, with its files in a folder."""
+def ngspice_in(folder: Path, limit_s: int | None = None) -> NgSpice:
+    """Value of the fixture, with its files in a folder; limit_s: most processor time of a deck."""
+    limit = [] if limit_s is None else ["prlimit", f"--cpu={limit_s}:"]
 
     def run(deck: str, nodes: Sequence[str], samples: int) -> NDArray[np.float64]:
         (folder / "deck.cir").write_text(deck)
-        command = ["ngspice", "-b", "-r", "out.raw", "deck.cir"]
+        command = [*limit, "ngspice", "-b", "-r", "out.raw", "deck.cir"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode == -signal.SIGXCPU:
+            raise UnfinishedError(f"not finished after {limit_s} s of processor time")
         log = done.stdout[-2000:] + done.stderr[-2000:]
+        if aborted := re.search("Timestep too small; time = [^,]*", log):
+            raise UnfinishedError(aborted[0])
         assert (folder / "out.raw").exists(), log
         names, table = _read_raw(folder / "out.raw")
         instants_s = np.arange(samples) / SAMPLE_RATE_HZ

@@ -124,7 +124,12 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., CDLL]:
 def test_bits_do_not_depend_on_the_width_of_registers_or_the_compilers_options(
     options: tuple[str, ...], compiled: Callable[..., CDLL], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cases = (("front", "tl07x", LOUD), ("shock", "opa627", FREE), ("two-mass", "741", OVERLOAD))
+    cases = (
+        ("front", "tl07x", LOUD),
+        ("shock", "opa627", FREE),
+        ("two-mass", "741", OVERLOAD),
+        ("van-der-pol", "tl07x", FREE),
+    )
     usual = [played(*case, 200).tobytes() for case in cases]
     other = compiled(*options)
     monkeypatch.setattr(library, "load", lambda: other)

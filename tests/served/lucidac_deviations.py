@@ -46,6 +46,13 @@ def play(machine: Lucidac, example: Example) -> Values:
     return np.asarray(codes * np.array(gains) + np.array(offsets))
 
 
+def calibrated_deviation(machine: Lucidac, example: Example, patch: Configuration) -> float:
+    """Largest deviation within the horizon of a machine that is patched and calibrated."""
+    machine.configure(patch)
+    machine.calibrate(gain=True, offset=True)
+    return deviation(example, patch, play(machine, example))
+
+
 def deviation(example: Example, patch: Configuration, values: Values) -> float:
     """Largest deviation of values (samples, channels) within the horizon."""
     first, last = (round(time_s * example.sample_rate) for time_s in (example.from_s, example.horizon_s))

@@ -26,7 +26,7 @@ from analogrig_emulator.lucidac.configuration import COEFFICIENT_STEPS
 from analogrig_emulator.lucidac.machine import Lucidac
 from tests.harness.processes import LONG_S
 from tests.served.hostile_lucidac import nested, varint
-from tests.served.lucidac_deviations import deviation, play, read_configuration, run_examples
+from tests.served.lucidac_deviations import calibrated_deviation, deviation, play, read_configuration, run_examples
 from tests.served.lucidac_examples import EXAMPLES
 from tests.served.serving import Served, in_thread, serving
 
@@ -57,6 +57,12 @@ def test_manufacturers_client_gets_the_ideal_solution_after_calibration_and_not_
     before, after = (deviation(example, patch, values) for values in (play(machine, example), data))
     assert after < 0.01
     assert before > 0.003 and before > 3 * after
+
+
+@pytest.mark.parametrize("name", ["roessler", "van-der-pol"])
+def test_another_calibrated_specimen_gets_the_ideal_solution(runs: Path, name: str) -> None:
+    """All examples on twelve specimens: python -m tests.benchmarks.bandwidth_lucidac."""
+    assert calibrated_deviation(specimen(5), EXAMPLES[name], read_configuration(runs, name)) < 0.01
 
 
 def test_generator_comes_through_its_cables(runs: Path) -> None:

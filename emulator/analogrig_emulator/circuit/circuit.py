@@ -9,7 +9,8 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Real
@@ -206,6 +207,9 @@ class Switch(_TwoEnded):
 Element: TypeAlias = (
     Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch | Multiplier | Function
 )
+Ways: TypeAlias = Mapping[str, Sequence[str]]
+"""Neighbours of each node."""
+
 _T = TypeVar("_T")
 _E = TypeVar(
     "_E",
@@ -244,7 +248,7 @@ class Circuit:
         _check_names(self.elements)
         for element in self.elements:
             _check_element(element)
-        _check_nodes(self.elements)
+        _check_nodes(self)
         _check_loops(self.elements)
         _check_feedback(self.elements)
 
@@ -266,17 +270,22 @@ class Circuit:
 
     def of(self, kind: type[_E]) -> tuple[_E, ...]:
         """The elements of one kind, in netlist order."""
-        if kind not in self._of_kind:
-            shared = self.untrimmed is not self and kind is not OpAmp
-            self._of_kind[kind] = (
-                self.untrimmed.of(kind) if shared else tuple(part for part in self.elements if isinstance(part, kind))
-            )
-        found: tuple[_E, ...] = self._of_kind[kind]
+        if self.untrimmed is not self and kind is not OpAmp:
+            return self.untrimmed.of(kind)
+        found: Sequence[_E] = self._of_kind.get(kind, ())
+        return tuple(found)
+
+    @functools.cached_property
+    def _of_kind(self) -> Mapping[type, Sequence[Any]]:
+        found: defaultdict[type, list[Element]] = defaultdict(list)
+        for element in self.elements:
+            found[type(element)].append(element)
         return found
 
     @functools.cached_property
-    def _of_kind(self) -> dict[type, Any]:
-        return {}
+    def ways(self) -> Ways:
+        """Nodes that bonds of elements join to each node."""
+        return neighbours(bond for element in self.elements for bond in element.bonds)
 
     def derive(self, make: Callable[[Circuit], _T]) -> _T:
         """make(self), computed once for each function `make`."""
@@ -392,6 +401,7 @@ def _check_known(kind: str, names: Iterable[str], elements: Iterable[Element]) -
 def _check_names(elements: tuple[Element, ...]) -> None:
     names: set[str] = set()
     nodes: dict[str, str] = {}
+    known: set[str] = set()
     for element in elements:
         if not _NAME.fullmatch(element.name):
             raise element_error(element, f"element name {element.name!r}: only letters, digits and _ are allowed")
@@ -399,8 +409,9 @@ def _check_names(elements: tuple[Element, ...]) -> None:
             raise element_error(element, f"two elements are called {element.name!r}")
         names.add(element.name.lower())
         for node in element.nodes:
-            if nodes.get(node.lower()) == node:
+            if node in known:
                 continue
+            known.add(node)
             if not _NAME.fullmatch(node):
                 raise element_error(element, f"node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:
@@ -438,10 +449,10 @@ def _check_value(element: Element, field: str) -> None:
         raise element_error(element, f"{field} must be at least {_LEAST:g}, got {value!r}")
 
 
-def _check_nodes(elements: tuple[Element, ...]) -> None:
+def _check_nodes(circuit: Circuit) -> None:
     """Raise CircuitError for a node without a path to ground that determines its voltage."""
-    grounded = _reachable(GROUND, _neighbours(bond for element in elements for bond in element.bonds))
-    for element in elements:
+    grounded = reachable(GROUND, circuit.ways)
+    for element in circuit.elements:
         for node in element.nodes:
             if node not in grounded:
                 raise element_error(element, f"node {node} floats: no path to ground holds its voltage")
@@ -474,7 +485,7 @@ def _root(node: str, joined: dict[str, str]) -> str:
 def _path_names(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
     """Names of the rigid elements on the path from node a to node b, in order."""
     rigid = [(element.name, bond) for element in elements for bond in element.rigid_bonds]
-    ways = _neighbours(bond for _, bond in rigid)
+    ways = neighbours(bond for _, bond in rigid)
     names = {frozenset(bond): name for name, bond in rigid}
     before, front = {a: a}, [a]
     while b not in before:
@@ -490,18 +501,18 @@ def _path_names(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
 
 def _check_feedback(elements: tuple[Element, ...]) -> None:
     """Raise CircuitError for an op-amp whose output acts on neither of its inputs."""
-    acts = _neighbours(
+    acts = neighbours(
         bond for element in elements if not isinstance(element, OpAmp) for bond in element.bonds if GROUND not in bond
     )
     for amp in elements:
         if isinstance(amp, OpAmp):
             for node in {amp.plus, amp.minus} - {GROUND}:
-                acts.setdefault(node, []).append(amp.out)
+                acts[node].append(amp.out)
         elif isinstance(amp, Multiplier | Function):
             for node in amp.nodes[:-1]:
-                acts.setdefault(node, []).append(amp.out)
+                acts[node].append(amp.out)
     for amp in elements:
-        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reachable(amp.out, acts):
+        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & reachable(amp.out, acts):
             raise element_error(
                 amp,
                 f"no feedback: its output, node {amp.out}, acts on neither of its inputs, nodes"
@@ -509,19 +520,22 @@ def _check_feedback(elements: tuple[Element, ...]) -> None:
             )
 
 
-def _neighbours(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def neighbours(bonds: Iterable[tuple[str, str]]) -> defaultdict[str, list[str]]:
     """The neighbours of each node."""
-    ways: dict[str, list[str]] = {}
+    ways: defaultdict[str, list[str]] = defaultdict(list)
     for a, b in bonds:
-        ways.setdefault(a, []).append(b)
-        ways.setdefault(b, []).append(a)
+        ways[a].append(b)
+        ways[b].append(a)
     return ways
 
 
-def _reachable(start: str, ways: Mapping[str, Sequence[str]]) -> set[str]:
+def reachable(start: str, ways: Ways, borders: Container[str] = ()) -> set[str]:
+    """Nodes to which ways lead from start, up to and including borders."""
     reached, front = {start}, [start]
     while front:
-        fresh = [node for node in ways.get(front.pop(), ()) if node not in reached]
-        reached.update(fresh)
-        front += fresh
+        for node in ways.get(front.pop(), ()):
+            if node not in reached:
+                reached.add(node)
+                if node not in borders:
+                    front.append(node)
     return reached

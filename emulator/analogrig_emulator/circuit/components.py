@@ -16,6 +16,7 @@ element or a non-ideality changes no other draw. Each default switches its non-i
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -313,6 +314,9 @@ MULTIPLIER_GRADES: Mapping[str, MultiplierGrade] = MappingProxyType(
 """Grades for the models of the same name in nonlinear.py; typical values of the data sheet."""
 
 
+_pot_model = functools.lru_cache(maxsize=64)(PotModel)
+
+
 @dataclass(frozen=True)
 class PotGrade:
     """Coefficient pots: grade of the track, resistances of wiper and ends, and windings.
@@ -333,7 +337,7 @@ class PotGrade:
 
     def model(self, track_ohm: float) -> PotModel:
         """Pot of this grade with track_ohm between the stops."""
-        return PotModel(track_ohm, self.wiper_ohm, self.end_ohm, self.windings, self.wiper_noise_ohm)
+        return _pot_model(track_ohm, self.wiper_ohm, self.end_ohm, self.windings, self.wiper_noise_ohm)
 
 
 @dataclass(frozen=True)

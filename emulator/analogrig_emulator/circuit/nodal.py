@@ -136,14 +136,13 @@ class Nodal:
         self._state = {element.name: i for i, element in enumerate(holders)}
         self._columns = len(self._state) + len(self._inputs) + len(self._multipliers) + 1
         limited: tuple[OpAmp | Multiplier, ...] = (*self._poles, *followers)
-        self._kinks = tuple(replace(kink, element=part.name) for part in limited for kink in _limits(part).values())
+        limits = [_limits(part) for part in limited]
+        self._kinks = tuple(kink for kinks in limits for kink in kinks.values())
         first_source = len(self._kinks)
-        self._kinks += tuple(
-            replace(Kink.deadzone(-math.inf, limiter.threshold_v), element=limiter.name) for limiter in self._limiters
-        )
+        self._kinks += tuple(Kink.deadzone(-math.inf, limiter.threshold_v, limiter.name) for limiter in self._limiters)
         self._kinks += tuple(kink for function in self._functions for kink in function.kinks)
         self._recovering = tuple(amp for amp in self._poles if amp.model.recovers)
-        self._kinks += tuple(replace(Kink.deadzone(*amp.model.swing_v), element=amp.name) for amp in self._recovering)
+        self._kinks += tuple(Kink.deadzone(*amp.model.swing_v, amp.name) for amp in self._recovering)
         self._sources = slice(first_source, len(self._kinks))
         self._kinks += tuple(Kink.none(part.name) for part in self._multipliers for _ in "xy")
         self._check_size()
@@ -153,7 +152,7 @@ class Nodal:
         self._right = np.zeros((size, self._columns + self._sources.stop - first_source))
         ends = [(switch.a, switch.b) for switch in self._switches]
         self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
-        parts = _Parts(self._capacitors, self._poles, self._multipliers, self._limiters, self._functions)
+        parts = _Parts(self._capacitors, self._poles, self._multipliers, self._limiters, self._functions, limits)
         self._laws = _Laws.of(self._row, self._branch, parts, len(self._state) + len(self._inputs))
         self._enter(circuit)
 
@@ -456,6 +455,8 @@ class _Parts(NamedTuple):
     multipliers: Sequence[Multiplier]
     limiters: Sequence[DiodeLimiter]
     functions: Sequence[Function]
+    limits: Sequence[Mapping[_Limit, Kink]]
+    """Those of each op-amp and multiplier with a pole."""
 
 
 @dataclass(frozen=True)
@@ -493,7 +494,7 @@ class _Laws:
     @classmethod
     def of(cls, row: Mapping[str, int], branch: Mapping[str, int], parts: _Parts, first_product: int) -> _Laws:
         """Laws of a circuit with numbered nodes (row) and branches."""
-        capacitors, poles, multipliers, limiters, functions = parts
+        capacitors, poles, multipliers, limiters, functions, limits = parts
         followers = [part for part in multipliers if part.model.has_state]
         bent = [function for function in functions for _ in function.kinks]
         ends = [(branch[capacitor.name], row[GROUND]) for capacitor in capacitors]
@@ -507,7 +508,8 @@ class _Laws:
         plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
         limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
         first, states = len(capacitors), len(capacitors) + len(limited)
-        kinds = [(i, part, limit) for i, part in enumerate(limited, first) for limit in _limits(part)]
+        parts_limits = enumerate(zip(limited, limits, strict=True), first)
+        kinds = [(i, part, limit) for i, (part, kinks) in parts_limits for limit in kinks]
         held = [(kink, i) for kink, (i, _, limit) in enumerate(kinds) if limit is not _Limit.SLEW]
         fed_back = [(kink, part) for kink, (_, part, limit) in enumerate(kinds) if limit is _Limit.CURRENT]
         last_source = len(kinds) + len(limiters) + len(bent) + len(recovering)
@@ -585,10 +587,10 @@ def _limits(part: OpAmp | Multiplier) -> dict[_Limit, Kink]:
     """Limits of an output with a pole, in the order of their kinks."""
     model, limits = part.model, {}
     if model.slews:
-        limits[_Limit.SLEW] = Kink.clip(model.slew_v_per_s)
+        limits[_Limit.SLEW] = Kink.clip(model.slew_v_per_s, part.name)
     if model.clamps:
-        limits[_Limit.SWING] = Kink.deadzone(*model.bounds_v)
+        limits[_Limit.SWING] = Kink.deadzone(*model.bounds_v, part.name)
     if isinstance(model, OpAmpModel) and model.limits_current:
         drop_v = model.rout_ohm * model.current_limit_a
-        limits[_Limit.CURRENT] = Kink.deadzone(-drop_v, drop_v)
+        limits[_Limit.CURRENT] = Kink.deadzone(-drop_v, drop_v, part.name)
     return limits

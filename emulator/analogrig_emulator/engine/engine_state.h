@@ -20,6 +20,7 @@
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>
+#include <string.h>
 
 #define TOP_LEVEL (ENGINE_LEVELS - 1)
 #define NEVER INT64_C(-1)
@@ -153,6 +154,10 @@ typedef struct {
     /// to = factor to + gain from; count is a multiple of PANEL.
     void (*add)(int count, double factor, const double* from, double gain, double* to);
 
+    /// Set PANEL values to those of a law at PANEL arguments p and the q after them, plus `driven`. Return their largest
+    /// change; INFINITY if one is not finite.
+    double (*apply)(const law_t* law, const double* arguments, const double* driven, double* values);
+
     /// Set w_there = matrix z, and judge it as the end of a step. growth: its length over that of the step before; 0 if
     /// there is none.
     judgement_t (*look)(engine_t* self, int columns, const double* panels, const double* z, double growth);
@@ -204,9 +209,13 @@ struct engine {
 
     drive_t drives[ENGINE_MAX_PRODUCTS];  // of the products
 
-    int64_t ahead;                                 // ticks; see engine_look_ahead()
-    double  weight[ORDER][ORDER];                  // moments of a polynomial from its values at the nodes
-    double  moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the products in the last step
+    int64_t ahead;                          // ticks; see engine_look_ahead()
+    double  weight[NODES * ORDER];          // panelled moments of a polynomial over its values at the nodes
+    double  binomial[NODES][ORDER][ORDER];  // (s + c)^k over s^l, with c each node
+    double  ratio;                          // length of a step over that of the one before
+    double  extension[NODES * ORDER];  // panelled values at the nodes of this step over the moments of the one before
+    double  moments[ENGINE_MAX_PRODUCTS][ORDER];  // of the products in the last step
+    double  contraction;  // ratio of the last change of the products in an iteration to the change before
 
     int64_t patience;                   // ticks; see engine_watch()
     int64_t outside[ENGINE_MAX_KINKS];  // tick at which a kink left its middle piece, or NEVER
@@ -243,9 +252,7 @@ static inline double kink_upper_bound(const engine_kink_t* kink, unsigned char p
 static inline int row_length(const engine_t* self) { return self->ahead > 0 ? 2 * self->outputs : self->outputs; }
 
 static inline void copy_z(const engine_t* self, const double* from, double* to) {
-    for (int j = 0; j < self->columns; j++) {
-        to[j] = from[j];
-    }
+    memcpy(to, from, (size_t)self->columns * sizeof to[0]);
 }
 
 // The functions below are shared by the chapters, but not exported by the library.

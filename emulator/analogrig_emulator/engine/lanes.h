@@ -141,6 +141,33 @@ INLINE bool KERNEL(is_any)(mask_t mask) {
     return LANES == 2 ? (mask[0] | mask[1]) != 0 : (mask[0] | mask[1] | mask[LANES - 2] | mask[LANES - 1]) != 0;
 }
 
+/// Value of a polynomial.
+INLINE lanes_t KERNEL(evaluate)(const double* coefficients, int degree, lanes_t at) {
+    const lanes_t zero  = { 0.0 };
+    lanes_t       value = zero + coefficients[degree];
+    for (int k = degree - 1; k >= 0; k--) {
+        value = value * at + coefficients[k];
+    }
+    return value;
+}
+
+TARGET static double KERNEL(apply)(const law_t* law, const double* arguments, const double* driven, double* values) {
+    double change[PANEL], most = 0.0;
+    for (int i = 0; i < PANEL; i += LANES) {
+        const lanes_t p = *(const lanes_t*)&arguments[i], q = *(const lanes_t*)&arguments[PANEL + i];
+        const lanes_t value =
+            KERNEL(evaluate)(law->factors.x, law->x_degree, p) * KERNEL(evaluate)(law->factors.y, law->y_degree, q) +
+            *(const lanes_t*)&driven[i];
+        *(lanes_t*)&change[i] = value - *(const lanes_t*)&values[i];
+        *(lanes_t*)&values[i] = value;
+    }
+    for (int i = 0; i < PANEL; i++) {
+        const double size = fabs(change[i]);
+        most              = size <= most ? most : isfinite(size) ? size : (double)INFINITY;
+    }
+    return most;
+}
+
 /// Part of look() for one group of lanes. w1: arguments at the end of the step.
 INLINE void KERNEL(judge_lanes)(const engine_t* self, int k, lanes_t w1, double growth, mask_t* inside, mask_t* near) {
     const lanes_t zero    = { 0.0 };
@@ -227,8 +254,8 @@ TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     return CLEAR;
 }
 
-static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose),
-                                           KERNEL(add),      KERNEL(look),    KERNEL(look_on) };
+static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose), KERNEL(add),
+                                           KERNEL(apply),    KERNEL(look),    KERNEL(look_on) };
 
 #undef INLINE
 #undef JOINED

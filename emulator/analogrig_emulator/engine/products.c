@@ -4,7 +4,8 @@
 ///     x(c h) = exp(A c h) x + [terms of u and 1] + sum over moments k of M_k(c) g_k,   f(s) = sum g_k (s / h)^k
 ///
 /// with M_k(c) the integral of exp(A (c h - s)) F (s / h)^k over 0 .. c h. Doubling h gives these matrices for one level of
-/// the ladder after another. The values at the nodes are found by iteration, on the arguments of the products alone.
+/// the ladder after another. The values at the nodes are found by iteration, on the arguments of the products alone. Values
+/// at the nodes beyond the beginning, and moments beyond g_0, are one panel for each product.
 
 #include "engine_state.h"
 
@@ -14,21 +15,28 @@
 #if ENGINE_DRIVE_TERMS != ORDER
 #error a drive must be a polynomial through the nodes of a step
 #endif
+#if NODES != PANEL
+#error the nodes of a step must fill a panel
+#endif
 
-#define MAX_MOMENTS (ORDER * ENGINE_MAX_PRODUCTS)
 #define MAX_VALUES (NODES * ENGINE_MAX_PRODUCTS)
 #define MAX_ARGUMENTS (2 * MAX_VALUES)
 #define MAX_WIDTH (MAX_COLUMNS + MAX_VALUES)
-#define MAX_BLOCK_STRIDE PADDED(MAX_COLUMNS + MAX_MOMENTS)
+#define MAX_BLOCK_STRIDE PADDED(MAX_WIDTH)
 #define MAX_BLOCK (ENGINE_MAX_STATES * MAX_BLOCK_STRIDE)
 
 /// Largest last Legendre coefficient of a product in a step, in V. Below GROWING of it the next step is twice as long.
 #define TAIL_V 1e-4
 #define GROWING 0.02
 
-/// Change of a product, in V, at which an iteration has converged.
+/// Error of a product, in V, at which an iteration has converged. It is estimated as the sum of all changes to come: each is
+/// the same part, the contraction, of the one before.
 #define CONVERGED_V 1e-7
 #define ITERATIONS 14
+
+/// Least change of a product, in V, of which a contraction is computed: smaller ones are rounding. A contraction of 0 would
+/// hold for all steps to come, since each step then ends after one iteration.
+#define ROUNDING_V 1e-15
 
 /// Passes after which products that feed one another without a state between must have settled.
 #define PASSES (2 * ENGINE_MAX_PRODUCTS + 2)
@@ -39,69 +47,64 @@
 
 static const double nodes[ORDER] = { 0.0, 0.17267316464601143, 0.5, 0.82732683535398857, 1.0 };
 
-/// Matrices of steps of one level, panelled. z is [x u 1] at the beginning, v the products at the other nodes.
+/// Matrices of steps of one level, panelled. z is [x u 1] at the beginning, g the moments of the products beyond g_0.
 typedef struct {
     double* block;
-    double* arguments;      // of the products at the other nodes, over z
-    double* feedback;       // the same, over v
-    double* change[NODES];  // of x up to each node, over [z v]
+    double* arguments;      // of each product p, then q, at the other nodes, over z
+    double* feedback;       // the same, over the values of the products at these nodes
+    double* change[NODES];  // of x up to each node, over [z g]
 } rung_t;
 
-/// The moments of a node are stored row-major: [x u 1 and k = 0 | k = 1 | .. | k = 4], as differences from x.
+/// The moments of a node are stored row-major over [z g], as differences from x.
 struct collocation {
     double* block;
-    double* map;             // [A B c] of one tick
+    double* map;             // [A B c] of one tick, and once more the columns of the product for each of its g
     double* moments[NODES];  // of the level `top`
     int     base, top;       // base: the level below which moments come from their series
-    bool    stiff;
     rung_t  rungs[ENGINE_LEVELS];
 };
 
 // ---------------------------------------------        MATRICES        ---------------------------------------------
 
-static int stride_of(const engine_t* const self) { return PADDED(self->columns + (ORDER - 1) * self->products); }
-
 static int width_of(const engine_t* const self) { return self->columns + NODES * self->products; }
 
-/// First column of a moment.
-static int column_of(const engine_t* const self, int moment) {
-    const int held = self->states + self->inputs - self->products;
-    return moment == 0 ? held : self->columns + (moment - 1) * self->products;
+static int stride_of(const engine_t* const self) { return PADDED(width_of(self)); }
+
+/// Column of a moment of a product.
+static int column_of(const engine_t* const self, int product, int moment) {
+    return moment == 0 ? self->states + self->inputs - self->products + product
+                       : self->columns + product * NODES + moment - 1;
 }
 
 /// Set the moments of all nodes of a step of `ticks` by their series.
 static void
 sum_series(const engine_t* const self, const collocation_t* matrices, double ticks, double* const* moments) {
-    const int n = self->states, columns = self->columns, stride = stride_of(self), held = column_of(self, 0);
-    double    a[MAX_BLOCK], power[MAX_BLOCK], next[MAX_BLOCK];
+    const int n = self->states, stride = stride_of(self);
+    double    a[MAX_BLOCK], power[MAX_BLOCK], next[MAX_BLOCK], scale[MAX_BLOCK_STRIDE] = { 0.0 };
+    double    part[NODES] = { 1.0, 1.0, 1.0, 1.0 };  // c^r / r!
     for (int i = 0; i < n * stride; i++) {
         a[i] = power[i] = matrices->map[i] * ticks;
     }
     for (int node = 0; node < NODES; node++) {
         memset(moments[node], 0, (size_t)(n * stride) * sizeof a[0]);
     }
-    double factorial = 1.0;  // of r
     for (int r = 1; r <= TERMS; r++) {
-        factorial *= (double)r;
         for (int node = 0; node < NODES; node++) {
-            const double c     = nodes[node + 1];
-            double       scale = 1.0;  // c^r / r!
-            for (int k = 0; k < r; k++) {
-                scale *= c;
+            const double c = nodes[node + 1];
+            part[node] *= c / (double)r;
+            double moment_part = part[node];  // c^(r + k) k! / (r + k)!
+            for (int j = 0; j < self->columns; j++) {
+                scale[j] = moment_part;
             }
-            scale /= factorial;
-            for (int i = 0; i < n; i++) {
-                double* const       row  = &moments[node][i * stride];
-                const double* const term = &power[i * stride];
-                for (int j = 0; j < columns; j++) {
-                    row[j] += scale * term[j];
+            for (int k = 1; k < ORDER; k++) {
+                moment_part *= c * (double)k / (double)(r + k);
+                for (int product = 0; product < self->products; product++) {
+                    scale[column_of(self, product, k)] = moment_part;
                 }
-                double moment_scale = scale;  // c^(r + k) k! / (r + k)!
-                for (int k = 1; k < ORDER; k++) {
-                    moment_scale *= c * (double)k / (double)(r + k);
-                    for (int j = 0; j < self->products; j++) {
-                        row[column_of(self, k) + j] += moment_scale * term[held + j];
-                    }
+            }
+            for (int i = 0; i < n * stride; i += stride) {
+                for (int j = 0; j < stride; j++) {
+                    moments[node][i + j] += scale[j] * power[i + j];
                 }
             }
         }
@@ -111,26 +114,24 @@ sum_series(const engine_t* const self, const collocation_t* matrices, double tic
 }
 
 /// Moments of a node for twice the step: the second half begins where the first ends, with s / h in 1/2 .. 1.
-static void double_moments(const engine_t* const self, double c, double* moments) {
-    const int n = self->states, products = self->products, stride = stride_of(self);
-    double    product[MAX_BLOCK], power[ORDER];
+static void double_moments(const engine_t* const self, int node, double* moments) {
+    const int n = self->states, stride = stride_of(self);
+    double    product[MAX_BLOCK];
     self->kernels->compose(n, n, stride, moments, moments, product);
-    power[0] = 1.0;
-    for (int k = 1; k < ORDER; k++) {
-        power[k] = power[k - 1] * c;
-    }
-    for (int i = 0; i < n; i++) {
-        double* const       row = &moments[i * stride];
-        const double* const fed = &product[i * stride];
-        for (int k = ORDER - 1; k > 0; k--) {  // each needs those below it
-            const int column = column_of(self, k);
-            for (int j = 0; j < products; j++) {
-                double sum = row[column + j] + fed[column + j], binomial = 1.0;
-                for (int l = k; l >= 0; l--) {
-                    sum += binomial * power[k - l] * row[column_of(self, l) + j];
-                    binomial *= (double)l / (double)(k - l + 1);
+    for (int i = 0; i < n * stride; i += stride) {
+        double* const       row = &moments[i];
+        const double* const fed = &product[i];
+        for (int j = 0; j < self->products; j++) {
+            const double        first = row[column_of(self, j, 0)];
+            double* const       g     = &row[column_of(self, j, 1)];
+            const double* const g_fed = &fed[column_of(self, j, 1)];
+            for (int k = ORDER - 1; k > 0; k--) {  // each needs those below it
+                const double* const binomial = self->binomial[node][k];
+                double              sum      = g[k - 1] + g_fed[k - 1] + binomial[0] * first;
+                for (int l = 1; l <= k; l++) {
+                    sum += binomial[l] * g[l - 1];
                 }
-                row[column + j] = sum / (double)(1 << k);
+                g[k - 1] = sum / (double)(1 << k);
             }
         }
         for (int j = 0; j < self->columns; j++) {
@@ -139,39 +140,38 @@ static void double_moments(const engine_t* const self, double c, double* moments
     }
 }
 
-/// change of x up to a node over [z v], row-major, from its moments.
-static void weigh(const engine_t* const self, const double* moments, int stride, double* change) {
-    const int held = column_of(self, 0), products = self->products;
-    memset(change, 0, (size_t)(self->states * stride) * sizeof change[0]);
-    for (int i = 0; i < self->states; i++) {
-        const double* const row = &moments[i * stride_of(self)];
-        double* const       out = &change[i * stride];
-        for (int j = 0; j < self->columns; j++) {
-            out[j] = row[j];
-        }
-        for (int j = 0; j < products; j++) {
-            out[held + j] = 0.0;
-            for (int k = 0; k < ORDER; k++) {
-                const double moment = row[column_of(self, k) + j];
-                out[held + j] += moment * self->weight[k][0];
-                for (int node = 0; node < NODES; node++) {
-                    out[self->columns + node * products + j] += moment * self->weight[k][node + 1];
-                }
+/// Turn a row over [z g] into one over z and the values of the products at the other nodes.
+static void weigh(const engine_t* const self, double* row) {
+    for (int i = 0; i < self->products; i++) {
+        double* const g               = &row[column_of(self, i, 1)];
+        double        by_value[ORDER] = { 0.0 };
+        for (int node = 0; node < ORDER; node++) {
+            for (int k = 0; k < NODES; k++) {
+                by_value[node] += g[k] * self->weight[node * PANEL + k];
             }
         }
+        row[column_of(self, i, 0)] += by_value[0];
+        memcpy(g, &by_value[1], NODES * sizeof g[0]);
     }
 }
 
-/// Matrices of the arguments at a node, row-major over [z v]: w of the state there.
-static void read_arguments(
-    const engine_t* const self, const double* w, int node, int stride, const double* change, double* arguments) {
-    const int n = self->states, count = 2 * self->products, held = column_of(self, 0);
-    self->kernels->compose(count, n, stride, w, change, arguments);
+/// Matrices of the arguments at a node, row-major over [z g]: w of the state there, with the products as they are there.
+static void
+read_arguments(const engine_t* const self, const double* w, int node, const double* moments, double* arguments) {
+    const int stride = stride_of(self), count = 2 * self->products;
+    double    there[2 * ENGINE_MAX_PRODUCTS * MAX_BLOCK_STRIDE];
+    self->kernels->compose(count, self->states, stride, w, moments, there);
     for (int i = 0; i < count; i++) {
-        double* const row = &arguments[i * stride];
-        for (int j = 0; j < self->columns; j++) {
-            const bool at_node = j >= held && j < held + self->products;
-            row[at_node ? self->columns + node * self->products + j - held : j] += w[i * stride + j];
+        double* const row = &arguments[(i * NODES + node) * stride];
+        for (int j = 0; j < stride; j++) {
+            row[j] = there[i * stride + j] + w[i * stride + j];
+        }
+        for (int j = 0; j < self->products; j++) {
+            double gain = w[i * stride + column_of(self, j, 0)];
+            for (int k = 1; k < ORDER; k++) {
+                gain *= nodes[node + 1];
+                row[column_of(self, j, k)] += gain;
+            }
         }
     }
 }
@@ -195,11 +195,10 @@ static bool allocate_rung(const engine_t* const self, rung_t* rung) {
 
 /// Fill a rung from the moments of its nodes.
 static void fill_rung(const engine_t* const self, double* const* moments, rung_t* rung) {
-    const int width = width_of(self), stride = PADDED(width), columns = self->columns, values = NODES * self->products;
+    const int width = width_of(self), stride = stride_of(self), columns = self->columns;
     const int count = 2 * self->products, first = self->kinks - count;
-    double    change[ENGINE_MAX_STATES * PADDED(MAX_WIDTH)];
-    double    w[2 * ENGINE_MAX_PRODUCTS * PADDED(MAX_WIDTH)] = { 0.0 };
-    double    arguments[MAX_ARGUMENTS * PADDED(MAX_WIDTH)];
+    double    w[2 * ENGINE_MAX_PRODUCTS * MAX_BLOCK_STRIDE] = { 0.0 };
+    double    arguments[MAX_ARGUMENTS * MAX_BLOCK_STRIDE];
     for (int i = 0; i < count; i++) {
         for (int j = 0; j < columns; j++) {
             const int row     = first + i;
@@ -207,12 +206,14 @@ static void fill_rung(const engine_t* const self, double* const* moments, rung_t
         }
     }
     for (int node = 0; node < NODES; node++) {
-        weigh(self, moments[node], stride, change);
-        panels_pack(self->states, width, stride, change, rung->change[node]);
-        read_arguments(self, w, node, stride, change, &arguments[node * count * stride]);
+        panels_pack(self->states, width, stride, moments[node], rung->change[node]);
+        read_arguments(self, w, node, moments[node], arguments);
+    }
+    for (int i = 0; i < NODES * count; i++) {
+        weigh(self, &arguments[i * stride]);
     }
     panels_pack(NODES * count, columns, stride, arguments, rung->arguments);
-    panels_pack(NODES * count, values, stride, &arguments[columns], rung->feedback);
+    panels_pack(NODES * count, NODES * self->products, stride, &arguments[columns], rung->feedback);
 }
 
 /// Matrices of the present mode for steps of a level. NULL if memory is short.
@@ -234,7 +235,7 @@ static const rung_t* reach(engine_t* const self, int level) {
     }
     for (; matrices->top < level; matrices->top++) {
         for (int node = 0; node < NODES; node++) {
-            double_moments(self, nodes[node + 1], matrices->moments[node]);
+            double_moments(self, node, matrices->moments[node]);
         }
     }
     fill_rung(self, matrices->moments, rung);
@@ -272,6 +273,9 @@ engine_status_t products_build(engine_t* const self, const double* a) {
         for (int j = 0; j < self->columns; j++) {
             matrices->map[i * stride + j] = a[i * from + j] * self->tick_s;
         }
+        for (int j = 0; j < NODES * self->products; j++) {
+            matrices->map[i * stride + self->columns + j] = matrices->map[i * stride + column_of(self, j / NODES, 0)];
+        }
     }
     matrices->base = matrices->top = mode->base;
     int    halvings                = 0;
@@ -283,7 +287,7 @@ engine_status_t products_build(engine_t* const self, const double* a) {
     sum_series(self, matrices, ticks, matrices->moments);
     for (; halvings > 0; halvings--) {
         for (int node = 0; node < NODES; node++) {
-            double_moments(self, nodes[node + 1], matrices->moments[node]);
+            double_moments(self, node, matrices->moments[node]);
         }
     }
     return ENGINE_OK;
@@ -299,7 +303,16 @@ void products_plan(engine_t* const self) {
         }
     }
     (void)engine_solve(ORDER, ORDER, powers, weight);  // a Vandermonde matrix of distinct nodes
-    memcpy(self->weight, weight, sizeof weight);
+    panels_pack(NODES, ORDER, ORDER, &weight[ORDER], self->weight);
+    for (int node = 0; node < NODES; node++) {
+        for (int k = 0; k < ORDER; k++) {
+            double binomial = 1.0;  // k! / (l! (k - l)!) c^(k - l)
+            for (int l = k; l >= 0; l--) {
+                self->binomial[node][k][l] = binomial;
+                binomial *= nodes[node + 1] * (double)l / (double)(k - l + 1);
+            }
+        }
+    }
 }
 
 // ---------------------------------------------         LAWS           ---------------------------------------------
@@ -312,29 +325,25 @@ static double evaluate(const double* coefficients, int degree, double at) {
     return value;
 }
 
-/// Values of all drives at an instant in ticks.
-static void follow_drives(const engine_t* const self, double tick, double* driven) {
-    for (int i = 0; i < self->products; i++) {
-        const drive_t* const drive = &self->drives[i];
-        driven[i]                  = 0.0;
-        if (drive->terms != NULL) {
-            const double  period = (double)ENGINE_TICKS_PER_SAMPLE;
-            const int64_t last = drive->first + drive->samples - 1, now = (int64_t)(tick / period),
-                          sample = now < last ? now : last;
-            const double since   = tick / period - (double)sample;
-            driven[i] = evaluate(&drive->terms[(sample - drive->first) * ENGINE_DRIVE_TERMS], ENGINE_DRIVE_TERMS - 1,
-                                 since < 1.0 ? since : 1.0);
-        }
-    }
+/// Add the value of a drive at an instant in ticks.
+static void follow_drive(const drive_t* drive, double tick, double* value) {
+    const double  period = (double)ENGINE_TICKS_PER_SAMPLE;
+    const int64_t last = drive->first + drive->samples - 1, now = (int64_t)(tick / period),
+                  sample = now < last ? now : last;
+    const double since   = tick / period - (double)sample;
+    *value += evaluate(&drive->terms[(sample - drive->first) * ENGINE_DRIVE_TERMS], ENGINE_DRIVE_TERMS - 1,
+                       since < 1.0 ? since : 1.0);
 }
 
-/// Evaluate all products of one instant, at which these are their drives.
-static void multiply_out(const engine_t* const self, const double* driven, const double* arguments, double* values) {
+/// Evaluate all products at the present instant.
+static void multiply_out(const engine_t* const self, const double* arguments, double* values) {
     const law_t* law = self->circuit->law;
     for (int i = 0; i < self->products; i++, law++, arguments += 2) {
         values[i] = evaluate(law->factors.x, law->x_degree, arguments[0]) *
-                        evaluate(law->factors.y, law->y_degree, arguments[1]) +
-                    driven[i];
+                    evaluate(law->factors.y, law->y_degree, arguments[1]);
+        if (self->drives[i].terms != NULL) {
+            follow_drive(&self->drives[i], (double)self->now, &values[i]);
+        }
     }
 }
 
@@ -354,16 +363,15 @@ void products_set_laws(const engine_t* self, const engine_product_t* products) {
 }
 
 engine_status_t products_solve(engine_t* const self) {
-    double* const held = &self->z[column_of(self, 0)];
-    double        values[ENGINE_MAX_PRODUCTS], driven[ENGINE_MAX_PRODUCTS];
-    follow_drives(self, (double)self->now, driven);
+    double* const held = &self->z[column_of(self, 0, 0)];
+    double        values[ENGINE_MAX_PRODUCTS];
     for (int pass = 0; pass < PASSES; pass++) {
         const engine_status_t status  = kinks_solve(self);
         bool                  settled = true;
         if (status != ENGINE_OK) {
             return status;
         }
-        multiply_out(self, driven, &self->w[self->kinks - 2 * self->products], values);
+        multiply_out(self, &self->w[self->kinks - 2 * self->products], values);
         for (int i = 0; i < self->products; i++) {
             settled = settled && fabs(values[i] - held[i]) <= SETTLED * fabs(held[i]);
             if (!isfinite(values[i])) {
@@ -382,83 +390,89 @@ engine_status_t products_solve(engine_t* const self) {
 
 /// One step under trial.
 typedef struct {
-    double values[ORDER * ENGINE_MAX_PRODUCTS];   // of the products at the nodes, the beginning first
-    double moments[ORDER * ENGINE_MAX_PRODUCTS];  // of the polynomials through them
-    double vector[MAX_WIDTH];                     // [z v]
-    double z[PADDED(MAX_COLUMNS)];                // at the end
+    double values[MAX_VALUES];      // of the products at the nodes beyond its beginning
+    double contraction;             // of their changes from one iteration to the next
+    double vector[MAX_WIDTH];       // [z g]
+    double z[PADDED(MAX_COLUMNS)];  // at the end
 } step_t;
 
 /// Extend the polynomials of the step before to the nodes of this one.
-static void predict(const engine_t* const self, int64_t ticks, step_t* step) {
-    const int    products = self->products;
-    const double ratio    = self->stride > 0 ? (double)ticks / (double)self->stride : 0.0;
-    memcpy(step->values, &self->z[column_of(self, 0)], (size_t)products * sizeof step->values[0]);
-    for (int node = 1; node < ORDER; node++) {
-        const double at = 1.0 + ratio * nodes[node];
-        for (int i = 0; i < products; i++) {
-            double value = step->values[i];
-            if (self->stride > 0) {
-                value = self->moments[NODES * products + i];
-                for (int k = NODES - 1; k >= 0; k--) {
-                    value = value * at + self->moments[k * products + i];
-                }
+static void predict(engine_t* const self, int64_t ticks, step_t* step) {
+    const double ratio = self->stride > 0 ? (double)ticks / (double)self->stride : 0.0;
+    if (ratio < self->ratio || ratio > self->ratio) {
+        self->ratio = ratio;
+        for (int node = 0; node < NODES; node++) {
+            double power = 1.0;
+            for (int k = 0; k < ORDER; k++) {
+                self->extension[k * PANEL + node] = power;
+                power *= 1.0 + ratio * nodes[node + 1];
             }
-            step->values[node * products + i] = value;
+        }
+    }
+    for (int i = 0; i < self->products; i++) {
+        double* const value = &step->values[i * NODES];
+        if (self->stride > 0) {
+            self->kernels->multiply(NODES, ORDER, self->extension, self->moments[i], value);
+        } else {
+            value[0] = value[1] = value[2] = value[3] = self->z[column_of(self, i, 0)];
         }
     }
 }
 
+/// Set [z g] of the polynomials through the products at the nodes.
+static void fit(const engine_t* const self, step_t* step) {
+    copy_z(self, self->z, step->vector);
+    for (int i = 0; i < self->products; i++) {
+        double value[ORDER] = { self->z[column_of(self, i, 0)] };
+        memcpy(&value[1], &step->values[i * NODES], NODES * sizeof value[0]);
+        self->kernels->multiply(NODES, ORDER, self->weight, value, &step->vector[column_of(self, i, 1)]);
+    }
+}
+
+/// Largest last Legendre coefficient of the products that are not driven.
+static double find_tail(const engine_t* const self, const step_t* step) {
+    double largest = 0.0;
+    for (int i = 0; i < self->products; i++) {
+        const double tail = fabs(step->vector[column_of(self, i, ORDER - 1)]) / LEADING;
+        largest           = self->drives[i].terms == NULL && tail > largest ? tail : largest;
+    }
+    return largest;
+}
+
 /// Find the products at the nodes of a step from now. Return false if the iteration does not converge.
 static bool iterate(const engine_t* const self, const rung_t* rung, int64_t ticks, step_t* step) {
-    const int     products = self->products, count = 2 * NODES * products, values = NODES * products;
-    double        fixed[MAX_ARGUMENTS], fed[MAX_ARGUMENTS], next[MAX_VALUES], driven[MAX_VALUES];
-    double* const v = &step->values[products];
-    self->kernels->multiply(count, self->columns, rung->arguments, self->z, fixed);
-    for (int node = 0; node < NODES; node++) {
-        follow_drives(self, (double)self->now + nodes[node + 1] * (double)ticks, &driven[node * products]);
+    const int values = NODES * self->products;
+    double    fixed[MAX_ARGUMENTS], fed[2 * NODES], driven[MAX_VALUES];
+    double    before = 0.0;
+    self->kernels->multiply(2 * values, self->columns, rung->arguments, self->z, fixed);
+    memset(driven, 0, (size_t)values * sizeof driven[0]);
+    for (int i = 0; i < self->products; i++) {
+        for (int node = 0; node < NODES && self->drives[i].terms != NULL; node++) {
+            follow_drive(&self->drives[i], (double)self->now + nodes[node + 1] * (double)ticks,
+                         &driven[i * NODES + node]);
+        }
     }
+    // Until the second change, that of the step before counts twice, and the more the longer this step is.
+    step->contraction = self->stride > 0 ? 2.0 * self->ratio * self->contraction : 1.0;
     for (int i = 0; i < ITERATIONS; i++) {
-        double moved     = 0.0;
-        bool   converged = true;
-        self->kernels->multiply(count, values, rung->feedback, v, fed);
-        for (int j = 0; j < count; j++) {
-            fed[j] += fixed[j];
+        double moved = 0.0;
+        for (int j = 0; j < values; j += NODES) {  // each product takes the new values of those before it
+            self->kernels->multiply(2 * NODES, values, &rung->feedback[2 * j * values], step->values, fed);
+            self->kernels->add(2 * NODES, 1.0, &fixed[2 * j], 1.0, fed);
+            const double change =
+                self->kernels->apply(&self->circuit->law[j / NODES], fed, &driven[j], &step->values[j]);
+            moved = change > moved ? change : moved;
         }
-        for (int node = 0; node < NODES; node++) {
-            multiply_out(self, &driven[node * products], &fed[node * 2 * products], &next[node * products]);
-        }
-        for (int j = 0; j < values; j++) {
-            const double change = fabs(next[j] - v[j]);
-            converged           = converged && change <= CONVERGED_V;
-            moved += change;
-            v[j] = next[j];
-        }
-        if (converged) {
+        step->contraction = i > 0 ? (moved > ROUNDING_V ? moved : ROUNDING_V) / before : step->contraction;
+        if (moved <= CONVERGED_V || step->contraction * moved <= CONVERGED_V * (1.0 - step->contraction)) {
             return true;
         }
         if (!isfinite(moved)) {
             return false;
         }
+        before = moved;
     }
     return false;
-}
-
-/// Set the polynomials through the products at the nodes. Return the largest last Legendre coefficient of those not driven.
-static double fit(const engine_t* const self, step_t* step) {
-    const int products = self->products;
-    double    largest  = 0.0;
-    for (int i = 0; i < products; i++) {
-        for (int k = 0; k < ORDER; k++) {
-            double sum = 0.0;
-            for (int node = 0; node < ORDER; node++) {
-                sum += self->weight[k][node] * step->values[node * products + i];
-            }
-            step->moments[k * products + i] = sum;
-        }
-        const double tail = fabs(step->moments[NODES * products + i]) / LEADING;
-        largest           = self->drives[i].terms == NULL && tail > largest ? tail : largest;
-    }
-    return largest;
 }
 
 /// Set z to the state at a node.
@@ -469,7 +483,9 @@ static void arrive(const engine_t* const self, const rung_t* rung, int node, con
     for (int i = 0; i < self->states; i++) {
         z[i] += change[i];
     }
-    memcpy(&z[column_of(self, 0)], &step->values[(node + 1) * self->products], (size_t)self->products * sizeof z[0]);
+    for (int i = 0; i < self->products; i++) {
+        z[column_of(self, i, 0)] = step->values[i * NODES + node];
+    }
 }
 
 /// True if an argument is beyond its bound at a node within a step.
@@ -493,7 +509,8 @@ static int choose_level(const engine_t* const self, int64_t tick) {
     int           level = self->look;
     while (level > 0) {
         const int64_t ticks = INT64_C(1) << level;
-        if ((ticks <= since || level <= self->mode->base) && self->now % ticks == 0 && self->now + ticks <= tick) {
+        if ((ticks <= since || level <= self->mode->base) && (self->now & (ticks - 1)) == 0 &&
+            self->now + ticks <= tick) {
             break;
         }
         level--;
@@ -511,13 +528,11 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
     if (!iterate(self, rung, ticks, step)) {
         return level > 0 ? TOO_LONG : FAILED;
     }
-    *tail = fit(self, step);
+    fit(self, step);
+    *tail = find_tail(self, step);
     if (level > 0 && !(*tail <= TAIL_V)) {
         return TOO_LONG;
     }
-    copy_z(self, self->z, step->vector);
-    memcpy(&step->vector[self->columns], &step->values[self->products],
-           (size_t)(NODES * self->products) * sizeof step->vector[0]);
     arrive(self, rung, NODES - 1, step, step->z);
     const double      growth    = self->stride > 0 ? (double)ticks / (double)self->stride : 0.0;
     const judgement_t judgement = self->kernels->look(self, self->columns, self->w_panels, step->z, growth);
@@ -529,14 +544,15 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
 
 /// Accept a step.
 static void accept(engine_t* const self, int level, const step_t* step) {
+    for (int i = 0; i < self->products; i++) {
+        self->moments[i][0] = self->z[column_of(self, i, 0)];
+        memcpy(&self->moments[i][1], &step->vector[column_of(self, i, 1)], NODES * sizeof self->moments[0][0]);
+    }
+    self->contraction = step->contraction;
     copy_z(self, step->z, self->z);
-    memcpy(self->moments, step->moments, (size_t)(ORDER * self->products) * sizeof self->moments[0]);
     self->clear = self->now;
     step_accept(self, INT64_C(1) << level);
     self->now = self->clear;
-    double driven[ENGINE_MAX_PRODUCTS];
-    follow_drives(self, (double)self->now, driven);
-    multiply_out(self, driven, &self->w[self->kinks - 2 * self->products], &self->z[column_of(self, 0)]);
 }
 
 engine_status_t products_advance(engine_t* const self, int64_t tick) {

@@ -182,14 +182,14 @@ class Kink:
     """Name of the element with this limit."""
 
     @classmethod
-    def clip(cls, limit: float) -> Kink:
+    def clip(cls, limit: float, element: str = "") -> Kink:
         """clip(w, -limit, +limit)."""
-        return cls(-limit, limit, (0.0, 1.0, 0.0))
+        return cls(-limit, limit, (0.0, 1.0, 0.0), element)
 
     @classmethod
-    def deadzone(cls, lower: float, upper: float) -> Kink:
+    def deadzone(cls, lower: float, upper: float, element: str = "") -> Kink:
         """Excess of w over lower..upper, 0 within."""
-        return cls(lower, upper, (1.0, 0.0, 1.0))
+        return cls(lower, upper, (1.0, 0.0, 1.0), element)
 
     @classmethod
     def none(cls, element: str = "") -> Kink:
@@ -200,8 +200,8 @@ class Kink:
     def intercepts(self) -> tuple[float, float, float]:
         """Constant terms of the pieces, such that they meet; 0 for a piece that an infinite bound removes."""
         below, between, above = self.slopes
-        at_lower = (between - below) * self.lower if np.isfinite(self.lower) else 0.0
-        at_upper = (between - above) * self.upper if np.isfinite(self.upper) else 0.0
+        at_lower = (between - below) * self.lower if math.isfinite(self.lower) else 0.0
+        at_upper = (between - above) * self.upper if math.isfinite(self.upper) else 0.0
         return at_lower, 0.0, at_upper
 
     def piece(self, w: float, now: int) -> int:

@@ -585,11 +585,12 @@ class AnalogComputer:
 
     def _check_uncharged(self, initial_v: Mapping[str, float]) -> None:
         """Raise CircuitError for an integrator without initial voltage: it would drift into its limit."""
-        ends = [frozenset(part.nodes) for part in self._patched.elements if not isinstance(part, Capacitor | OpAmp)]
         for amp in self._patched.of(OpAmp):
             patch = self._patches[amp.name]
-            fed_back = any({patch.junction, patch.out} <= nodes for nodes in ends)
-            if patch.capacitors and not fed_back and amp.name not in initial_v:
+            if not patch.capacitors or amp.name in initial_v:
+                continue
+            parts = (part for part in self._patched.elements if not isinstance(part, Capacitor | OpAmp))
+            if not any({patch.junction, patch.out} <= set(part.nodes) for part in parts):
                 raise CircuitError(f"{label(amp)}: an integrator needs an initial voltage, if only {amp.name}: 0.0")
 
     # ---- reading pots

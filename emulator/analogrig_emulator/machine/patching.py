@@ -7,6 +7,7 @@ junction, and every cord leads from an output to an input; this module rejects a
 from __future__ import annotations
 
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,7 +20,10 @@ from analogrig_emulator.circuit.circuit import (
     OpAmp,
     Pot,
     VoltageSource,
+    Ways,
     label,
+    neighbours,
+    reachable,
 )
 from analogrig_emulator.circuit.components import is_part_of
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
@@ -70,10 +74,11 @@ class _Wiring:
 def _patches(panel: _Wiring) -> dict[str, Patch]:
     circuit = panel.circuit
     drivers = _drivers(circuit)
+    passive = neighbours(bond for element in circuit.elements for bond in _passive_bonds(element))
     _check_ends(circuit)
-    _check_feeds(circuit, drivers)
+    _check_feeds(circuit, drivers, passive)
     for amp in circuit.of(OpAmp):
-        _check_feedback(circuit, amp, drivers)
+        _check_feedback(circuit, amp, reachable(amp.minus, passive, drivers | {GROUND}))
     found = {amp.name: _patch(circuit, amp) for amp in circuit.of(OpAmp)}
     for amp in circuit.of(OpAmp):
         if amp.plus == GROUND and not found[amp.name].inputs:
@@ -103,7 +108,7 @@ def _output(element: Element) -> str | None:
 
 def _check_ends(circuit: Circuit) -> None:
     """Raise CircuitError for a node with one end, unless that is an output."""
-    ends = Counter(node for element in circuit.elements for node in element.nodes)
+    ends = Counter(itertools.chain.from_iterable(element.nodes for element in circuit.elements))
     for element in circuit.elements:
         for node in element.nodes:
             if ends[node] == 1 and node not in (GROUND, _output(element)):
@@ -118,26 +123,27 @@ def _open_end(element: Element, node: str) -> str:
     return f"nothing feeds its node {node}"
 
 
-def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
+def _check_feeds(circuit: Circuit, drivers: set[str], passive: Ways) -> None:
     """Raise CircuitError for passive elements that neither reach an output nor ground an input."""
-    junctions = {amp.minus for amp in circuit.of(OpAmp)}
     drivers = drivers | {node for source in circuit.of(CurrentSource) for node in source.nodes}
     rests = {amp.plus for amp in circuit.of(OpAmp)}
-    bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
+    held = drivers | {amp.minus for amp in circuit.of(OpAmp)} | {GROUND}
+    fed = set(held)
     for element in circuit.elements:
         for node in element.nodes:
-            if node in drivers | junctions | {GROUND}:
+            if node in fed:
                 continue
-            reached = _reachable(node, bonds, drivers | junctions | {GROUND})
+            fed.add(node)
+            reached = reachable(node, passive, held)
             if not reached & drivers and not (GROUND in reached and reached & rests):
                 raise CircuitError(f"{label(element)}: nothing feeds its node {node}")
 
 
-def _check_feedback(circuit: Circuit, amp: OpAmp, drivers: set[str]) -> None:
-    bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
+def _check_feedback(circuit: Circuit, amp: OpAmp, reached: set[str]) -> None:
+    """Raise CircuitError if what the junction reaches is no feedback."""
     computing: tuple[Multiplier | Function, ...] = (*circuit.of(Multiplier), *circuit.of(Function))
     fed_back = {amp.out} | {part.out for part in computing if amp.out in part.nodes[:-1]}
-    if amp.minus != amp.out and not fed_back & _reachable(amp.minus, bonds, drivers | {GROUND}):
+    if amp.minus != amp.out and not fed_back & reached:
         raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
 
@@ -149,12 +155,11 @@ def _patch(circuit: Circuit, amp: OpAmp) -> Patch:
 
 def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
     """Elements at the junction that also connect to something other than the amplifier's own output."""
-    bonds = [bond for element in circuit.elements for bond in element.bonds]
-    elsewhere = _reachable(GROUND, bonds, {amp.minus, amp.out}) - {amp.minus, amp.out, GROUND}
+    own = {amp.minus, amp.out}
+    elsewhere = reachable(GROUND, circuit.ways, own) - own - {GROUND}
     for element in circuit.elements:
-        if (
-            isinstance(element, OpAmp | VoltageSource | Capacitor | Multiplier | Function)
-            or amp.minus not in element.nodes
+        if amp.minus not in element.nodes or isinstance(
+            element, OpAmp | VoltageSource | Capacitor | Multiplier | Function
         ):
             continue
         if not is_part_of(element, amp.name) and elsewhere.intersection(element.nodes):
@@ -163,13 +168,3 @@ def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
 
 def _passive_bonds(element: Element) -> tuple[tuple[str, str], ...]:
     return () if isinstance(element, OpAmp | VoltageSource | Multiplier | Function) else element.bonds
-
-
-def _reachable(start: str, bonds: list[tuple[str, str]], borders: set[str]) -> set[str]:
-    """Nodes that bonds join to start, up to and including borders."""
-    reached, fresh = {start}, {start}
-    while fresh:
-        fresh = {node for bond in bonds if fresh.intersection(bond) for node in bond} - reached
-        reached |= fresh
-        fresh = fresh - borders
-    return reached
