@@ -151,6 +151,27 @@ def test_change_after_the_last_sample_acts_on_the_next_record(instrument: Lucida
     assert np.abs(instrument.record(100).volts - before.volts)[:, 1].max() > 0.02
 
 
+def test_record_of_a_program_with_a_squared_parameter_is_that_program(
+    instrument: LucidacInstrument, tmp_path: Path
+) -> None:
+    (file := tmp_path / "squared.toml").write_text("""
+name = "squared"
+speed = 1000
+channels = ["u", "x"]
+equations = "x' = w**2*u - d*x"
+inputs = { u = { full = 1.0, trial = [0.0, 0.1] } }
+states = { x = { full = 1.2 } }
+[parameters]
+w = { value = 1.5, range = [1.0, 2.0] }
+d = { value = 1.0, range = [0.5, 2.0] }
+""")
+    instrument.patch(str(file))
+    computer = SuspensionComputer(Program.load(str(file)).circuit, opamp="ideal")
+    ideal = np.concatenate(list(computer.play(dataclasses.replace(SQUARE, low_v=0.1, high_v=4.0), 100, [])))
+    instrument.set_excitation(dataclasses.replace(SQUARE, low_v=0.02, high_v=0.8))
+    np.testing.assert_allclose(5.0 * instrument.record(100).volts, ideal, atol=0.02)
+
+
 def test_overload_names_the_element_and_the_run(instrument: LucidacInstrument) -> None:
     """The first run is well: it is not named."""
     assert instrument.pots is not None
