@@ -348,7 +348,7 @@ class LucidacServer(TcpServer):
             await enter(states.DONE)
         except EmulatorError as error:
             await enter(states.ERROR, str(error))
-        except (OSError, TimeoutError):
+        except OSError:
             client.hang_up()
 
     async def _next_block(self, blocks: Iterator[NDArray[np.int16]]) -> NDArray[np.int16] | None:
