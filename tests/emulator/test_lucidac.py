@@ -41,6 +41,7 @@ VAN_DER_POL = {
     7: LucidacLane(0, 11),
 }
 
+TONE = SignalGenerator("sine", 1e6, 0.0, 0.5, sleep=False)
 
 EXACT = LucidacParts(
     computing=OpAmpModel(avol=1e8, gbw_hz=8e9, swing_v=(-2.5, 2.5)),
@@ -157,7 +158,7 @@ def test_calibration_of_the_gain_replaces_the_correction_of_the_client() -> None
 def test_overload_is_flagged_and_halts_the_run_where_that_is_wanted() -> None:
     machine = prepared(configuration({0: LucidacLane(15, 0, -0.5)}, (0,), constant=1.0))
     assert sum(map(len, machine.play(200, RATE_HZ, halt_on_overload=True))) in (22, 23)  # 1.05 units at 210 us
-    assert machine.overloads == {("M0", 0): True}
+    assert machine.overloads == {("M0", 0)}
     values = played(machine, 200)
     assert len(values) == 200 and values[-1, 0] > 1.2
     healthy = prepared(configuration(SINE, ic0=-1.0))
@@ -202,9 +203,15 @@ def test_wave_of_the_generator_has_its_course_between_the_samples(
     assert np.abs(values - integral[::4000]).max() < 6e-5  # an LSB is 3.8e-5
 
 
+def test_run_of_no_samples_is_empty_with_a_sine_too() -> None:
+    patch = Configuration(lanes={27: LucidacLane(None, 0)}, external=frozenset({3}), adc=(0,), generator=TONE)
+    machine = Lucidac(replace(EXACT, cables={"sine": 3}))
+    machine.configure(patch)
+    assert played(machine, 0).shape == (0, 1)
+
+
 def test_sine_that_takes_too_many_points_is_refused() -> None:
-    generator = SignalGenerator("sine", 1e6, 0.0, 0.5, sleep=False)
-    patch = Configuration(lanes={27: LucidacLane(None, 0)}, external=frozenset({3}), adc=(0,), generator=generator)
+    patch = Configuration(lanes={27: LucidacLane(None, 0)}, external=frozenset({3}), adc=(0,), generator=TONE)
     with pytest.raises(CircuitError, match=r"1e\+06 Hz may last 0.2 s, not 0.3 s: shorten the run, or lower"):
         played(prepared(patch, replace(EXACT, cables={"sine": 3})), 30_000)
 

@@ -254,7 +254,7 @@ class Held(Lucidac):
         del rate_hz, halt_on_overload
         self.computes.set()
         self.released.wait(LONG_S)
-        self.overloads["M0", 0] = True
+        self.overloads.add(("M0", 0))
         yield np.zeros((samples, 0), np.int16)
 
 

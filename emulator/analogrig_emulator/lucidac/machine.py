@@ -58,8 +58,8 @@ class Lucidac:
         self._offsets = self.parts.adc_offset * draws[1]
         self._calibrated_gain = self._calibrated_offset = False
         self._wiring = LucidacCircuit(Configuration(), self.parts)
-        self.overloads: dict[tuple[str, int], bool] = {}
-        """Flags by block and index of the element; they stay until cleared."""
+        self.overloads: set[tuple[str, int]] = set()
+        """Overloaded elements by block and index, until cleared."""
 
     @property
     def configuration(self) -> Configuration:
@@ -117,13 +117,13 @@ class Lucidac:
         for values, overload in self.volts(samples, rate_hz):
             stop = len(values) if overload < 0 or not halt_on_overload else overload + 1
             yield self._codes(values[:stop])
-            if stop < len(values) or (halt_on_overload and overload >= 0):
+            if halt_on_overload and overload >= 0:
                 return
 
     def volts(self, samples: int, rate_hz: float) -> Iterator[tuple[NDArray[np.float64], int]]:
         """Volts of the converter's outputs in blocks, each with the first overloaded sample, or -1."""
         configuration = self.configuration
-        if not configuration.used:
+        if not samples or not configuration.used:
             yield np.zeros((samples, len(configuration.adc))), -1
             return
         points = _points(self._wiring, rate_hz)
@@ -136,7 +136,7 @@ class Lucidac:
             rows = np.flatnonzero(beyond.any(axis=1))
             for element, node in self._wiring.computing_nodes.items():
                 if beyond[:, nodes.index(node)].any():
-                    self.overloads[element] = True
+                    self.overloads.add(element)
             first = -1 if not rows.size else -(-(int(rows[0]) - run.phase) // points)
             yield volts[run.phase :: points, columns], first
 
