@@ -72,7 +72,7 @@ class RefusedError(Exception):
 def specimen(seed: int, settings: Sequence[str] = ()) -> Lucidac:
     """Machine drawn by a seed, with settings of its parameters as lines of TOML.
 
-    :raises ConfigurationError: a setting is none.
+    :raises ConfigurationError: a line sets no parameter.
     """
     table: Keys = {}
     for setting in settings:
