@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.catalogue import Change
 from analogrig.errors import ConfigurationError
-from analogrig_emulator import EmulatorError, Equations, ProgramError, ProgramParameter, equations_of, wired
+from analogrig_emulator import EmulatorError, Equations, PotError, ProgramError, ProgramParameter, equations_of, wired
 
 if TYPE_CHECKING:
     from analogrig_emulator import ProgramCircuit
@@ -30,6 +32,8 @@ _KEYS_OF_CHANGES = ("sample", "set", "ramp_n")
 
 _DIAGNOSES = tuple(change.name.lower() for change in (Change.MASS, Change.DAMPING, Change.STIFFNESS))
 """Parameters in the diagnoses of a device."""
+
+_EXACT = 1e-9
 
 
 @dataclass(frozen=True, repr=False)
@@ -171,18 +175,50 @@ class Program:
     def values_at(self, coefficients: Mapping[str, float]) -> dict[str, float]:
         """Values of the parameters whose pots have these coefficients under load.
 
-        :raises ConfigurationError: a pot stands at 0, or several parameters turn it.
+        Least squares of logarithms, as several pots may show one parameter.
+
+        :raises ConfigurationError: a pot stands at 0, or the pots do not determine the values.
         """
-        circuit, values = self.circuit, {}
-        for pot, row in circuit.pots.items():
-            if len(row.settings) != 1 or not coefficients[pot] > 0.0:
-                raise ConfigurationError(
-                    f"program {self.name}: pot {pot} with the coefficient {coefficients[pot]:g} shows no parameter"
-                )
-            (name,) = row.settings
-            at_one = circuit.pot_coefficient(pot, {name: 1.0})
-            values[name] = at_one / coefficients[pot] if name in self.inverse else coefficients[pot] / at_one
-        return values
+        circuit, values = self.circuit, self.equations.values
+        names, powers = self._powers
+        for pot in circuit.pots:
+            if not coefficients[pot] > 0.0:
+                raise ConfigurationError(f"program {self.name}: pot {pot} at 0 shows no parameter")
+        logs = [math.log(coefficients[pot] / circuit.pot_coefficient(pot, values)) for pot in circuit.pots]
+        found = np.linalg.lstsq(powers, np.array(logs), rcond=None)[0]
+        return {name: values[name] * math.exp(log) for name, log in zip(names, found, strict=True)}
+
+    @functools.cached_property
+    def _powers(self) -> tuple[list[str], NDArray[np.float64]]:
+        """Parameters that pots show, and their powers in the coefficients of the pots, (pots, parameters).
+
+        :raises ConfigurationError: a coefficient is no product of powers, or the pots do not determine the values.
+        """
+        pots = self.circuit.pots
+        names = list(dict.fromkeys(name for row in pots.values() for name in row.settings))
+        powers = np.array([[self._power(pot, name) for name in names] for pot in pots]).reshape(len(pots), len(names))
+        if np.linalg.matrix_rank(powers) < len(names):
+            raise ConfigurationError(
+                f"program {self.name}: its pots show only products of the parameters {', '.join(names)}:"
+                " write one parameter for each product"
+            )
+        return names, powers
+
+    def _power(self, pot: str, name: str) -> float:
+        """Power of a parameter in the coefficient of a pot."""
+        circuit, values = self.circuit, self.equations.values
+        if name not in circuit.pots[pot].settings:
+            return 0.0
+        try:
+            at = [circuit.pot_coefficient(pot, {**values, name: factor * values[name]}) for factor in (1.0, 2.0, 4.0)]
+        except PotError:
+            at = [math.nan] * 3
+        power, further = math.log2(at[1] / at[0]), math.log2(at[2] / at[1])
+        if not math.isclose(power, further, rel_tol=_EXACT, abs_tol=_EXACT):
+            raise ConfigurationError(
+                f"program {self.name}: the coefficient of pot {pot} is no power of {name}, whose value it cannot show"
+            )
+        return power
 
     def _rates(self, point: Any, values: Mapping[str, Any]) -> Any:
         """Rates of the states, and the output, at a point: states and input (n + 1, ...)."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from analogrig_emulator import CircuitError, Components, OpAmpModel
 from analogrig_emulator.lucidac.configuration import (
+    FAST,
     SLOW,
     Configuration,
     Integrator,
@@ -40,6 +41,7 @@ VAN_DER_POL = {
     7: LucidacLane(0, 11),
 }
 
+TONE = SignalGenerator("sine", 1e6, 0.0, 0.5, sleep=False)
 
 EXACT = LucidacParts(
     computing=OpAmpModel(avol=1e8, gbw_hz=8e9, swing_v=(-2.5, 2.5)),
@@ -156,7 +158,7 @@ def test_calibration_of_the_gain_replaces_the_correction_of_the_client() -> None
 def test_overload_is_flagged_and_halts_the_run_where_that_is_wanted() -> None:
     machine = prepared(configuration({0: LucidacLane(15, 0, -0.5)}, (0,), constant=1.0))
     assert sum(map(len, machine.play(200, RATE_HZ, halt_on_overload=True))) in (22, 23)  # 1.05 units at 210 us
-    assert machine.overloads == {("M0", 0): True}
+    assert machine.overloads == {("M0", 0)}
     values = played(machine, 200)
     assert len(values) == 200 and values[-1, 0] > 1.2
     healthy = prepared(configuration(SINE, ic0=-1.0))
@@ -177,6 +179,41 @@ def test_ports_take_the_voltages_of_the_generator_by_cable() -> None:
         [np.where(t_s * 1000 % 1 < 0.5, 0.7, -0.2), 0.2 + 0.6 * np.sin(2 * np.pi * 1000 * t_s), np.full(300, -0.8)], 1
     )
     assert np.abs(values - expected)[np.arange(300) % 50 > 0].max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("wave_form", "frequency_hz", "phase"),
+    [("sine", 250e3, 20.0), ("triangle", 7e3, 10.0), ("triangle", 12_345.6, 0.0)],
+)
+def test_wave_of_the_generator_has_its_course_between_the_samples(
+    wave_form: str, frequency_hz: float, phase: float
+) -> None:
+    """The integral of the wave, which errors between the samples would change too."""
+    generator = SignalGenerator(wave_form, frequency_hz, phase, 0.5, sleep=False)
+    lanes = {27: LucidacLane(None, 0)}
+    parts = replace(EXACT, cables={"sine": 3})
+    machine = Lucidac(parts)
+    machine.configure(Configuration(lanes=lanes, external=frozenset({3}), adc=(0,), generator=generator))
+    values = played(machine, 50)[:, 0]
+    fine = np.arange(50 * 4000) / (4000 * RATE_HZ)
+    turns = fine * frequency_hz + phase / 360.0
+    wave = np.sin(2 * np.pi * turns) if wave_form == "sine" else 1 - 4 * np.abs((turns + 0.25) % 1 - 0.5)
+    course = np.cumsum(0.5 * (wave[1:] + wave[:-1])) * (fine[1] - fine[0])
+    integral = -0.5 * FAST * np.append(0.0, course)
+    assert np.abs(values - integral[::4000]).max() < 6e-5  # an LSB is 3.8e-5
+
+
+def test_run_of_no_samples_is_empty_with_a_sine_too() -> None:
+    patch = Configuration(lanes={27: LucidacLane(None, 0)}, external=frozenset({3}), adc=(0,), generator=TONE)
+    machine = Lucidac(replace(EXACT, cables={"sine": 3}))
+    machine.configure(patch)
+    assert played(machine, 0).shape == (0, 1)
+
+
+def test_sine_that_takes_too_many_points_is_refused() -> None:
+    patch = Configuration(lanes={27: LucidacLane(None, 0)}, external=frozenset({3}), adc=(0,), generator=TONE)
+    with pytest.raises(CircuitError, match=r"1e\+06 Hz may last 0.2 s, not 0.3 s: shorten the run, or lower"):
+        played(prepared(patch, replace(EXACT, cables={"sine": 3})), 30_000)
 
 
 def test_a_perfect_machine_needs_no_calibration() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
 from analogrig.scenario import DEFAULT_SEED, PotChange, Scenario
+from analogrig_emulator import SuspensionComputer
 from tests.harness.runs import made_run
 
 from .plants import front
@@ -96,6 +98,53 @@ def test_program_is_linear_by_its_elements_whatever_its_scales(flow: str, linear
     program = Program.of(tables, "here")
     assert program.is_linear == linear
     assert judge(played(Scenario.of_program(program))).outcome in {"passed", "failed"}
+
+
+def powers(equations: str) -> Program:
+    """Program with the parameters w, d and s."""
+    full = "{ full = 12.0 }"
+    return Program.from_table(
+        tomllib.loads(f"""
+name = "powers"
+speed = 100
+channels = ["u", "x"]
+equations = '''{equations}'''
+inputs = {{ u = {{ full = 1.0 }} }}
+states = {{ {", ".join(f"{line[0]} = {full}" for line in equations.splitlines())} }}
+[parameters]
+w = {{ value = 2.0, range = [1.0, 3.0] }}
+d = {{ value = 1.0, range = [0.5, 2.0] }}
+s = {{ value = 1.0, range = [0.9, 1.1] }}
+"""),
+        "powers",
+    )
+
+
+@pytest.mark.parametrize(
+    "equations",
+    ["x' = w**2*u*s - d*x*s\nv' = d*x - v", "x' = s*u - x/w\nv' = w*x - d*v", "x' = u*sqrt(w) - d*x*s\nv' = d*x - v"],
+)
+def test_pots_show_the_values_that_turned_them(equations: str) -> None:
+    """Squares, a parameter on two pots, and products of parameters on one."""
+    program = powers(equations)
+    computer = SuspensionComputer(program.circuit)
+    values = {"w": 2.5, "d": 0.8, "s": 0.95}
+    computer.set(**values)
+    assert program.values_at(computer.coefficients) == pytest.approx(values, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("equations", "message"),
+    [
+        ("x' = w*d*s*u - x", "powers: its pots show only products of the parameters d, s, w: write one"),
+        ("x' = (w + 1)*u*s - d*x", "powers: the coefficient of pot P1 is no power of w, whose value it cannot show"),
+        ("x' = (5 - w)*u*s - d*x", "powers: the coefficient of pot P1 is no power of w"),
+    ],
+)
+def test_pots_that_do_not_determine_the_parameters_are_refused(equations: str, message: str) -> None:
+    program = powers(equations)
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
+        program.values_at(SuspensionComputer(program.circuit).coefficients)
 
 
 @pytest.mark.parametrize("name", sorted({*config.names("programs")} - {"silverbox"}))  # measured data stand for it

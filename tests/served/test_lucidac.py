@@ -177,16 +177,26 @@ class Talk:
                     return count, states
 
 
-def items(path: str = MAC, **fields: Any) -> Any:
-    pb = protocol()
-    return pb.Item(entity=pb.EntityId(path=path), **fields)
+PLACES = {
+    "coef_config": "/0/C",
+    "itor_config": "/0/M0",
+    "select_config": "/0/U",
+    "signal_generator_config": "/FP",
+    "sum_config": "/0/I",
+}
+
+
+def items(path: str = "", **fields: Any) -> Any:
+    """Item of one kind, for the entity that holds it or for another one."""
+    pb, (kind,) = protocol(), fields
+    return pb.Item(entity=pb.EntityId(path=path or MAC + PLACES.get(kind, "")), **fields)
 
 
 def ramp(factor: float = -0.5) -> list[Any]:
     """Integrator 0 integrates the constant; the converter reads it on eight channels."""
     pb = protocol()
     return [
-        items(f"{MAC}/0/C", coef_config=pb.CoefConfig(elements=[pb.CoefConfig.Element(idx=0, factor=factor)])),
+        items(coef_config=pb.CoefConfig(elements=[pb.CoefConfig.Element(idx=0, factor=factor)])),
         items(
             select_config=pb.SelectConfig(
                 constant=pb.SelectConfig.POS_REF, connections=[pb.SelectConnectionConfig(input=15, output=0)]
@@ -244,7 +254,7 @@ class Held(Lucidac):
         del rate_hz, halt_on_overload
         self.computes.set()
         self.released.wait(LONG_S)
-        self.overloads["M0", 0] = True
+        self.overloads.add(("M0", 0))
         yield np.zeros((samples, 0), np.int16)
 
 
@@ -310,6 +320,9 @@ def test_coefficients_can_be_written_in_op_by_the_client_of_the_run_where_the_pa
     ("item", "why"),
     [
         (lambda pb: items("AA-BB-CC-DD-EE-FF", adc_config=pb.AdcConfig()), "no entity is called"),
+        (lambda pb: items(f"{MAC}/7/C", coef_config=pb.CoefConfig()), f"no entity is called '{MAC}/7/C'"),
+        (lambda pb: items(f"{MAC}1", adc_config=pb.AdcConfig()), "no entity is called"),
+        (lambda pb: items(f"{MAC}/0/M0", coef_config=pb.CoefConfig()), f"entity '{MAC}/0/M0' of a LUCIDAC has no coef"),
         (lambda pb: items(coef_config=pb.CoefConfig(elements=[pb.CoefConfig.Element(idx=32)])), "0 to 31, not 32"),
         (lambda pb: items(adc_config=pb.AdcConfig(channels=[pb.AdcChannel(idx=16)])), "output must be 0 to 15, not 16"),
         (lambda pb: items(adc_config=pb.AdcConfig(channels=[pb.AdcChannel()] * 9)), "8 channels, not 9"),
@@ -361,6 +374,15 @@ def test_configuration_can_be_extracted_and_ping_is_answered(talk: Talk) -> None
     ping.generic.ping_command.SetInParent()
     talk.send(framed(ping))
     assert talk.next().generic.HasField("ping_response")
+
+
+def test_device_keeps_one_item_of_a_kind_however_its_entity_is_written(talk: Talk) -> None:
+    """A server that kept one for each way of writing would grow without end."""
+    pb = protocol()
+    paths = (MAC, f"/{MAC}", f"//{MAC.lower()}//")
+    talk.configure(*(items(path, device_config=pb.DeviceConfig()) for path in paths))
+    kept = talk.ask("extract_command", configuration=True).extract_response.module.items
+    assert [item.entity.path for item in kept] == [paths[-1]]
 
 
 def test_malformed_content_is_answered_and_the_connection_goes_on(talk: Talk) -> None:

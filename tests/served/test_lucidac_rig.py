@@ -8,6 +8,7 @@ import itertools
 import json
 import socket
 import threading
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,27 @@ def test_change_after_the_last_sample_acts_on_the_next_record(instrument: Lucida
     instrument.pots.schedule([DialChange(99.05 / 20e3, "K", 0.5)])
     np.testing.assert_allclose(instrument.record(100).volts, before.volts, atol=0.002)
     assert np.abs(instrument.record(100).volts - before.volts)[:, 1].max() > 0.02
+
+
+def test_record_of_a_program_with_a_squared_parameter_is_that_program(
+    instrument: LucidacInstrument, tmp_path: Path
+) -> None:
+    (file := tmp_path / "squared.toml").write_text("""
+name = "squared"
+speed = 1000
+channels = ["u", "x"]
+equations = "x' = w**2*u - d*x"
+inputs = { u = { full = 1.0, trial = [0.0, 0.1] } }
+states = { x = { full = 1.2 } }
+[parameters]
+w = { value = 1.5, range = [1.0, 2.0] }
+d = { value = 1.0, range = [0.5, 2.0] }
+""")
+    instrument.patch(str(file))
+    computer = SuspensionComputer(Program.load(str(file)).circuit, opamp="ideal")
+    ideal = np.concatenate(list(computer.play(dataclasses.replace(SQUARE, low_v=0.1, high_v=4.0), 100, [])))
+    instrument.set_excitation(dataclasses.replace(SQUARE, low_v=0.02, high_v=0.8))
+    np.testing.assert_allclose(5.0 * instrument.record(100).volts, ideal, atol=0.02)
 
 
 def test_overload_names_the_element_and_the_run(instrument: LucidacInstrument) -> None:
@@ -302,6 +324,25 @@ def test_program_that_cannot_be_patched_is_one_line(name: str) -> None:
 
 def test_other_linear_program_fits() -> None:
     assert len(factors("dc-motor")) == 5
+
+
+def test_lanes_of_ports_without_a_cable_are_free() -> None:
+    table = tomllib.loads("""
+name = "coupled"
+speed = 90_000
+channels = ["u", "a"]
+equations = '''
+a' = u*g - a - b - c - d
+b' = a - b - c - d
+c' = a + b - c
+d' = a - d
+'''
+inputs = { u = { full = 1.0, trial = [0.0, 0.5] } }
+states = { a = { full = 1.0 }, b = { full = 1.0 }, c = { full = 1.0 }, d = { full = 1.0 } }
+parameters = { g = { value = 1.0, range = [0.9, 1.1] } }
+""")
+    lanes = configured(LinearPatch(Program.from_table(table, "coupled"))).lanes
+    assert len(lanes) == 1 + 2 * 14 and lanes[26].source is None
 
 
 @pytest.mark.parametrize("name", ["front", "shock", "dc-motor"])
@@ -477,6 +518,14 @@ def test_run_that_is_given_up_is_stopped(
             connection.run(10, 1000, 1)
         connection.ask("extract_command")
     assert peer.heard == ["start_run_command", "stop_run_command", "extract_command"]
+
+
+def test_samples_and_end_of_an_earlier_run_are_not_taken_for_those_of_this_one() -> None:
+    stale, end, own = samples(10), entered("DONE"), samples(10)
+    stale.run_data_message.run.id = end.run_state_change_message.run.id = "earlier"
+    own.run_data_message.data.data = bytes((1, 0)) * 10
+    with Peer(a_run_with(stale, end, own, entered("DONE"))) as connection:
+        np.testing.assert_array_equal(connection.run(10, 1000, 1)[0], np.ones((10, 1)))
 
 
 def test_device_that_ignores_the_stop_costs_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -297,6 +297,17 @@ async def test_newcomer_replaces_the_longest_silent_client_unless_its_output_is_
 
 
 @in_time
+async def test_newcomers_that_come_together_replace_a_client_each() -> None:
+    async with bench(Counter(), idle_s=0.0) as served:
+        for client in [await served.client() for _ in range(MOST_CLIENTS)]:
+            assert await client.ask("COUNT?") == "0"
+        held = await asyncio.gather(*(served.client() for _ in range(4 * MOST_CLIENTS)))
+        assert len(served.server._clients) <= MOST_CLIENTS
+        assert await held[-1].ask("COUNT?") == "0"
+        assert len(served.server._clients) <= MOST_CLIENTS
+
+
+@in_time
 async def test_connections_have_keepalive() -> None:
     """Within half a minute: 15 s of silence, three questions of 5 s."""
     async with bench(Counter()) as served:

@@ -23,6 +23,15 @@ WATCH_HZ = 100e3
 MOST_DRIVEN_N = 2_000_000
 """Most points of a run with a sine or triangle, whose course is computed beforehand."""
 
+_SINE_POINTS = 10
+"""Least points in a period of a sine: its course between them is right within 1e-5 of its amplitude."""
+
+_TRIANGLE_POINTS = 10_000
+"""Points in a period of a triangle with corners between points: those are rounded by less than an LSB."""
+
+_MET = 1e-9
+"""Largest distance of a corner from its point, in points."""
+
 _HALF_RANGE = 1 << 15
 _BLOCK_POINTS = 1 << 14
 
@@ -49,8 +58,8 @@ class Lucidac:
         self._offsets = self.parts.adc_offset * draws[1]
         self._calibrated_gain = self._calibrated_offset = False
         self._wiring = LucidacCircuit(Configuration(), self.parts)
-        self.overloads: dict[tuple[str, int], bool] = {}
-        """Flags by block and index of the element; they stay until cleared."""
+        self.overloads: set[tuple[str, int]] = set()
+        """Overloaded elements by block and index, until cleared."""
 
     @property
     def configuration(self) -> Configuration:
@@ -108,16 +117,16 @@ class Lucidac:
         for values, overload in self.volts(samples, rate_hz):
             stop = len(values) if overload < 0 or not halt_on_overload else overload + 1
             yield self._codes(values[:stop])
-            if stop < len(values) or (halt_on_overload and overload >= 0):
+            if halt_on_overload and overload >= 0:
                 return
 
     def volts(self, samples: int, rate_hz: float) -> Iterator[tuple[NDArray[np.float64], int]]:
         """Volts of the converter's outputs in blocks, each with the first overloaded sample, or -1."""
         configuration = self.configuration
-        if not configuration.used:
+        if not samples or not configuration.used:
             yield np.zeros((samples, len(configuration.adc))), -1
             return
-        points = max(1, math.ceil(WATCH_HZ / rate_hz))
+        points = _points(self._wiring, rate_hz)
         run = _Run(lambda: self._wiring, samples, rate_hz * points, points)
         nodes = list(dict.fromkeys(self._wiring.computing_nodes.values()))
         columns = [nodes.index(self._wiring.output_node(output)) for output in configuration.adc]
@@ -127,7 +136,7 @@ class Lucidac:
             rows = np.flatnonzero(beyond.any(axis=1))
             for element, node in self._wiring.computing_nodes.items():
                 if beyond[:, nodes.index(node)].any():
-                    self.overloads[element] = True
+                    self.overloads.add(element)
             first = -1 if not rows.size else -(-(int(rows[0]) - run.phase) // points)
             yield volts[run.phase :: points, columns], first
 
@@ -186,7 +195,10 @@ class _Ports:
                 case "square" if generator.wave_form == "sine and square" and not generator.sleep:
                     self._squares[name] = _square(generator)
                 case "sine" if not generator.sleep and points > MOST_DRIVEN_N:
-                    raise CircuitError(f"signal generator: a sine may last {MOST_DRIVEN_N} points, not {points}")
+                    raise CircuitError(
+                        f"signal generator: {generator.frequency_hz:g} Hz may last {MOST_DRIVEN_N / rate_hz:.3g} s, not"
+                        f" {points / rate_hz:.3g} s: shorten the run, or lower the frequency"
+                    )
                 case "sine" if not generator.sleep:
                     self.drives[name] = Drive.sampled(_wave(generator, rate_hz), 0, points * TICKS_PER_SAMPLE)
                 case "dac0" | "dac1" as output:
@@ -208,6 +220,21 @@ class _Ports:
         if name in self._squares:
             return float(self._squares[name].edges(0, 1, self._rate_hz).levels_v[-1])
         return self._constants[name]
+
+
+def _points(wiring: LucidacCircuit, rate_hz: float) -> int:
+    """Points of each sample: enough to watch for overload, and for the course of a sine or triangle."""
+    generator, watched = wiring.configuration.generator, max(1, math.ceil(WATCH_HZ / rate_hz))
+    if generator.sleep or wiring.parts.cables.get("sine") not in wiring.port_sources:
+        return watched
+    is_triangle, samples = generator.wave_form == "triangle", rate_hz / generator.frequency_hz
+    most = max(watched, math.ceil((_TRIANGLE_POINTS if is_triangle else _SINE_POINTS) / samples))
+    if not is_triangle:
+        return most
+    points = np.arange(watched, min(most, MOST_DRIVEN_N) + 1)
+    at = np.outer((0.5, 0.25 - generator.phase / 360.0), points * samples)
+    met = points[(np.abs(at - np.rint(at)) < _MET).all(axis=0)]
+    return int(met[0]) if met.size else most
 
 
 def _square(generator: SignalGenerator) -> Excitation:

@@ -31,7 +31,7 @@ def add(commands: Any) -> None:
         "fit the emulator to a rig's recordings, and keep it as the rig's twin",
         "calibrate --rig emulator-real --out build/twin.toml",
         "calibrate --rig bench --op-amp 741 --components polyester",
-        "calibrate --rig lucidac --program dc-motor --fix R --out build/motor.toml",
+        "calibrate --rig emulator-real --program pendulum --out build/pendulum.toml",
         "calibrate --recording build/silverbox.npz --program silverbox --span 40000:130000 --check 0:40000",
     )
     add_rig(command)

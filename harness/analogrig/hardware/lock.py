@@ -1,4 +1,8 @@
-"""Per-machine instrument lock; a process that is ended by a signal still leaves the instrument safe."""
+"""Instrument lock among the processes of one user on one machine; after a signal too the instrument is safe.
+
+The lock is a file in the folder for temporary files, with the user's number in its name. Processes of other users, and
+those with another TMPDIR, do not see it.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +55,7 @@ def _lock(url: str, name: str, locks: contextlib.ExitStack) -> None:
 
 @contextlib.contextmanager
 def _exit_at_signals() -> Iterator[None]:
-    """Exit in good order at signals that have no handler yet; in the main thread only, as Python requires."""
+    """Raise SystemExit at signals that have no handler yet; in the main thread only, as Python requires."""
     is_main = threading.current_thread() is threading.main_thread()
     free = [number for number in _ENDING if is_main and signal.getsignal(number) is signal.SIG_DFL]
     for number in free:

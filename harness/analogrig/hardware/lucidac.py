@@ -132,11 +132,11 @@ class LucidacInstrument(Instrument):
         values, ends = self._play(self._patched, self._box, samples)
         if while_recording is not None:
             while_recording()
-        wanted = signs * values[:, channels]
-        codes = np.clip(np.rint(wanted / (FULL_SCALE / _HALF_RANGE)), -_HALF_RANGE, _HALF_RANGE - 1).astype(np.int32)
+        measured = signs * values[:, channels]
+        codes = np.clip(np.rint(measured / (FULL_SCALE / _HALF_RANGE)), -_HALF_RANGE, _HALF_RANGE - 1).astype(np.int32)
         at_end = ends[:, channels]
-        codes[at_end] = np.where(wanted[at_end] < 0.0, -_HALF_RANGE, _HALF_RANGE - 1)
-        return InputRecord(wanted * UNIT_V, codes, self.datasheet.bits)
+        codes[at_end] = np.where(measured[at_end] < 0.0, -_HALF_RANGE, _HALF_RANGE - 1)
+        return InputRecord(measured * UNIT_V, codes, self.datasheet.bits)
 
     def _play(
         self, patched: LinearPatch, box: _Coefficients, samples: int

@@ -138,11 +138,11 @@ class LucidacConnection:
 
     def _messages_of_run(self, samples: int, rate_hz: int, channels: int) -> Generator[Any, None, None]:
         """Start a run. Yield all messages until it is done; stop it if it is given up before."""
-        pb, op_ns, is_over = self._pb, math.ceil(samples / rate_hz * 1e9), False
+        pb, op_ns, is_over, run_id = self._pb, math.ceil(samples / rate_hz * 1e9), False, str(uuid.uuid4())
         try:
             self.ask(
                 "start_run_command",
-                run=pb.Run(id=str(uuid.uuid4())),
+                run=pb.Run(id=run_id),
                 run_config=pb.RunConfig(
                     ic_time=pb.Time(value=1, prefix=pb.MILLI), op_time=pb.Time(value=op_ns, prefix=pb.NANO)
                 ),
@@ -151,7 +151,7 @@ class LucidacConnection:
             within_s = self._timeout_s + op_ns * 1e-9
             deadline_s, spare = self._clock() + within_s, samples + _MOST_SPARE
             while not is_over:
-                message = self._next("the run", deadline_s)
+                message = self._next_of_run("the run", run_id, deadline_s)
                 if message.WhichOneof("kind") == "run_data_message" and message.run_data_message.data.sample_count:
                     deadline_s = self._clock() + within_s
                     spare -= message.run_data_message.data.sample_count
@@ -169,17 +169,25 @@ class LucidacConnection:
             raise
         finally:
             if not is_over:
-                self._stop_run()
+                self._stop_run(run_id)
 
     def _is_end(self, change: Any) -> bool:
         return change.new_ in (self._pb.RunState.DONE, self._pb.RunState.ERROR)
 
-    def _stop_run(self) -> None:
+    def _next_of_run(self, what: str, run_id: str, deadline_s: float) -> Any:
+        """Next message without those of an earlier run that outlived its stop."""
+        while True:
+            message = self._next(what, deadline_s)
+            of_run = (message.run_data_message, message.run_data_end_message, message.run_state_change_message)
+            if all(each.run.id in ("", run_id) for each in of_run):
+                return message
+
+    def _stop_run(self, run_id: str) -> None:
         """Stop the run, and await its end, as far as the device takes part within _STOP_S."""
         deadline_s = self._clock() + _STOP_S
         with contextlib.suppress(RigError):
             self._command("stop_run_command", within_s=_STOP_S)
-            while not self._is_end(self._next("stop", deadline_s).run_state_change_message):
+            while not self._is_end(self._next_of_run("stop", run_id, deadline_s).run_state_change_message):
                 pass
 
     def configuration(self) -> dict[tuple[str, str], bytes]:

@@ -42,6 +42,7 @@ from analogrig_emulator.lucidac.configuration import (
 SQUARE_PORT = 2
 """Port of the front panel for the square wave, as in the manufacturer's example."""
 
+_SQUARE_LANE = FIRST_PORT_LANE + SQUARE_PORT
 _INPUT = 8
 """Input of the first multiplier, whose identity shows the port."""
 
@@ -94,7 +95,7 @@ class LinearPatch:
         weights = self._weights(values)
         fast = _fast(weights)
         lanes = list(self._lanes(weights, fast))
-        numbers = [n for n in range(LANES) if not FIRST_PORT_LANE <= n < FIRST_PORT_LANE + PORTS]
+        numbers = [n for n in range(LANES) if n != _SQUARE_LANE]
         if len(lanes) > len(numbers):
             raise ConfigurationError(
                 f"program {self.program.name}: needs {len(lanes)} lanes, and {len(numbers)} are free: rescale it"
@@ -105,7 +106,7 @@ class LinearPatch:
         integrators += [Integrator()] * (INTEGRATORS - len(integrators))
         return Configuration(
             tuple(integrators),
-            {FIRST_PORT_LANE + SQUARE_PORT: LucidacLane(None, _INPUT)} | dict(zip(numbers, lanes, strict=False)),
+            {_SQUARE_LANE: LucidacLane(None, _INPUT)} | dict(zip(numbers, lanes, strict=False)),
             external=frozenset({SQUARE_PORT}),
             adc=(FIRST_IDENTITY, *range(len(self.states))),
             generator=generator,
@@ -195,58 +196,43 @@ def module_of(configuration: Configuration, mac: str) -> Any:
     sums: dict[int, list[int]] = {}
     for number, lane in lanes.items():
         sums.setdefault(lane.target, []).append(number)
-    select = [
+    elements = [pb.ItorConfig.Element(idx=i, ic=e.ic, k=e.k0) for i, e in enumerate(configuration.integrators)]
+    connections = [
         pb.SelectConnectionConfig(input=lane.source, output=n) for n, lane in lanes.items() if lane.source is not None
     ]
-    generator = configuration.generator
+    totals = pb.SumConfig(
+        connections=[pb.SumConnectionConfig(inputs=numbers, output=target) for target, numbers in sums.items()],
+        upscales=[pb.UpscaleConfig(lane=n, enabled=lane.upscaled) for n, lane in lanes.items()],
+    )
+    channels = [pb.AdcChannel(idx=output, gain=1.0, probe=i) for i, output in enumerate(configuration.adc)]
     states = [
         pb.PortConfig.EXTERNAL if port in configuration.external else pb.PortConfig.INTERNAL for port in range(PORTS)
     ]
     contents: list[tuple[str, str, Any]] = [
-        (
-            f"{cluster}/M0",
-            "itor_config",
-            pb.ItorConfig(
-                elements=[
-                    pb.ItorConfig.Element(idx=i, ic=e.ic, k=e.k0) for i, e in enumerate(configuration.integrators)
-                ]
-            ),
-        ),
-        (f"{cluster}/U", "select_config", pb.SelectConfig(connections=select)),
-        (
-            f"{cluster}/I",
-            "sum_config",
-            pb.SumConfig(
-                connections=[pb.SumConnectionConfig(inputs=numbers, output=target) for target, numbers in sums.items()],
-                upscales=[pb.UpscaleConfig(lane=n, enabled=lane.upscaled) for n, lane in lanes.items()],
-            ),
-        ),
-        (
-            mac,
-            "adc_config",
-            pb.AdcConfig(
-                channels=[pb.AdcChannel(idx=output, gain=1.0, probe=i) for i, output in enumerate(configuration.adc)]
-            ),
-        ),
+        (f"{cluster}/M0", "itor_config", pb.ItorConfig(elements=elements)),
+        (f"{cluster}/U", "select_config", pb.SelectConfig(connections=connections)),
+        (f"{cluster}/I", "sum_config", totals),
+        (mac, "adc_config", pb.AdcConfig(channels=channels)),
         (mac, "port_config", pb.PortConfig(states=states)),
-        (
-            f"{mac}/FP",
-            "signal_generator_config",
-            pb.SignalGeneratorConfig(
-                wave_form=pb.SignalGeneratorConfig.SINE_AND_SQUARE,
-                frequency=generator.frequency_hz,
-                phase=generator.phase,
-                amplitude=generator.amplitude,
-                offset=generator.offset,
-                square_voltage_low=generator.square[0],
-                square_voltage_high=generator.square[1],
-                sleep=generator.sleep,
-                dac_outputs=generator.dac,
-            ),
-        ),
+        (f"{mac}/FP", "signal_generator_config", _generator(configuration.generator)),
     ]
     items = [pb.Item(entity=pb.EntityId(path=path), **{kind: content}) for path, kind, content in contents]
     return pb.Module(items=[*items, *coefficients_of(configuration, mac).items])
+
+
+def _generator(generator: SignalGenerator) -> Any:
+    low, high = generator.square
+    return protocol().SignalGeneratorConfig(
+        wave_form=protocol().SignalGeneratorConfig.SINE_AND_SQUARE,
+        frequency=generator.frequency_hz,
+        phase=generator.phase,
+        amplitude=generator.amplitude,
+        offset=generator.offset,
+        square_voltage_low=low,
+        square_voltage_high=high,
+        sleep=generator.sleep,
+        dac_outputs=generator.dac,
+    )
 
 
 def coefficients_of(configuration: Configuration, mac: str) -> Any:

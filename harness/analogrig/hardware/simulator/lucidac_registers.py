@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,19 +24,28 @@ from analogrig_emulator.lucidac.configuration import (
 
 _CONSTANTS = {"GROUND": 0.0, "POS_REF": 1.0, "NEG_REF": -1.0}
 _WAVE_FORMS = {"SINE": "sine", "SINE_AND_SQUARE": "sine and square", "TRIANGLE": "triangle"}
-_WITHOUT_EFFECT = frozenset(
-    (
-        "cluster_config",
+_KINDS = {
+    "": (
+        "adc_config",
         "dependency_info",
         "device_config",
         "entity_specification",
-        "front_panel_config",
         "ip_lookup_table",
-        "mul_config",
-        "shift_hold_config",
-    )
-)
-"""Items that change no voltage here: lights, addresses, and corrections that the calibration finds itself."""
+        "port_config",
+    ),
+    "/0": ("cluster_config",),
+    "/0/C": ("coef_config",),
+    "/0/I": ("sum_config",),
+    "/0/M0": ("itor_config", "limiter_config"),
+    "/0/M1": ("mul_config",),
+    "/0/SH": ("shift_hold_config",),
+    "/0/U": ("select_config",),
+    "/FP": ("front_panel_config", "signal_generator_config"),
+}
+"""Kinds of items by the entity, below the device, that holds them: a limit to the items that a server keeps.
+
+Some change no voltage here: lights, addresses, and corrections that the calibration finds itself.
+"""
 
 
 @dataclass(frozen=True)
@@ -71,10 +80,10 @@ class Registers:
         """
         changed = copy.deepcopy(self)
         for item in items:
-            path = item.entity.path.strip("/").upper()
-            if path != mac and not path.startswith(f"{mac}/"):
+            entity = entity_of(item).removeprefix(mac)
+            if entity == entity_of(item) or entity not in _KINDS:
                 raise CircuitError(f"no entity is called {item.entity.path[:40]!r}: the device is {mac}")
-            changed._enter(item)  # noqa: SLF001 - a copy of its own
+            changed._enter(item, _KINDS[entity])  # noqa: SLF001 - a copy of its own
         return changed
 
     def configuration(self) -> Configuration:
@@ -94,7 +103,7 @@ class Registers:
             tuple(self.integrators), lanes, self.constant, frozenset(self.external), adc, self.generator
         )
 
-    def _enter(self, item: Any) -> None:
+    def _enter(self, item: Any, kinds: Collection[str]) -> None:
         entries: dict[str, Callable[[Any], None]] = {
             "adc_config": self._converter,
             "coef_config": self._coefficients,
@@ -106,10 +115,10 @@ class Registers:
             "sum_config": self._sums,
         }
         for kind, content in item.ListFields():
+            if kind.name != "entity" and kind.name not in kinds:
+                raise CircuitError(f"entity {item.entity.path[:40]!r} of a LUCIDAC has no {kind.name}")
             if kind.name in entries:
                 entries[kind.name](content)
-            elif kind.name != "entity" and kind.name not in _WITHOUT_EFFECT:
-                raise CircuitError(f"a LUCIDAC has no {kind.name}")
 
     def _coefficients(self, content: Any) -> None:
         for element in content.elements:
@@ -176,6 +185,11 @@ class Registers:
             (dac[0], dac[1]),
             content.sleep,
         )
+
+
+def entity_of(item: Any) -> str:
+    """Path of the entity of a configuration item, in the one form that registers know it by."""
+    return str(item.entity.path).strip("/").upper()
 
 
 def _index(number: int, count: int, what: str) -> int:

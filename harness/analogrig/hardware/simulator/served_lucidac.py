@@ -39,7 +39,7 @@ from analogrig.hardware.lucidac_messages import (
     parse_envelope,
     protocol,
 )
-from analogrig.hardware.simulator.lucidac_registers import Registers
+from analogrig.hardware.simulator.lucidac_registers import Registers, entity_of
 from analogrig.hardware.simulator.served import Keys, merge, parse_defect
 from analogrig.hardware.simulator.tcp_server import IDLE_S, SLOW_S, Client, TcpServer, now_s
 from analogrig.links.wire import Clock
@@ -72,7 +72,7 @@ class RefusedError(Exception):
 def specimen(seed: int, settings: Sequence[str] = ()) -> Lucidac:
     """Machine drawn by a seed, with settings of its parameters as lines of TOML.
 
-    :raises ConfigurationError: a setting is none.
+    :raises ConfigurationError: a line sets no parameter.
     """
     table: Keys = {}
     for setting in settings:
@@ -348,7 +348,7 @@ class LucidacServer(TcpServer):
             await enter(states.DONE)
         except EmulatorError as error:
             await enter(states.ERROR, str(error))
-        except (OSError, TimeoutError):
+        except OSError:
             client.hang_up()
 
     async def _next_block(self, blocks: Iterator[NDArray[np.int16]]) -> NDArray[np.int16] | None:
@@ -391,5 +391,5 @@ def _chunks(codes: NDArray[np.int16]) -> Iterator[NDArray[np.int16]]:
 
 def _merged(items: list[Any], newer: list[Any]) -> list[Any]:
     """Items, each replaced by the newer one of the same entity and kind."""
-    merged = {(item.entity.path.upper(), item.WhichOneof("kind")): item for item in (*items, *newer)}
+    merged = {(entity_of(item), item.WhichOneof("kind")): item for item in (*items, *newer)}
     return list(merged.values())

@@ -1,4 +1,4 @@
-"""TCP server of one instrument for many clients. Survives malformed input and slow clients.
+"""Base of the TCP servers of one instrument for many clients. It survives malformed input and slow clients.
 
 Limits of a client:
 
@@ -110,10 +110,10 @@ class TcpServer:
             client.writer.close()
             async with asyncio.timeout(self.slow_s):
                 await client.writer.wait_closed()
-        except (OSError, TimeoutError, asyncio.CancelledError) as error:
+        except (OSError, asyncio.CancelledError) as error:
             _log.info("client disconnected: %r", error)
         finally:
-            del self._clients[task]
+            self._clients.pop(task, None)
             client.hang_up()
             self.release(client)
 
@@ -122,12 +122,12 @@ class TcpServer:
         if len(self._clients) < MOST_CLIENTS:
             return True
         silent = min(
-            (client for client in self._clients.values() if not self.keeps_place(client)),
-            key=lambda client: client.heard_s,
+            (task for task, client in self._clients.items() if not self.keeps_place(client)),
+            key=lambda task: self._clients[task].heard_s,
         )
-        if now_s() - silent.heard_s < self._idle_s:
+        if now_s() - self._clients[silent].heard_s < self._idle_s:
             return False
-        silent.hang_up()
+        self._clients.pop(silent).hang_up()  # at once, as its task ends only after other newcomers may have come
         return True
 
     async def drain(self, client: Client) -> None:
