@@ -74,9 +74,8 @@ def add(commands: Any) -> None:
     )
     command.add_argument(
         "--op-amp",
-        default="tl07x",
         choices=("tl07x", "741", "opa627", "ideal"),
-        help="type of the amplifiers (default: %(default)s)",
+        help="type of the amplifiers (default: ideal with --recording, tl07x for a rig)",
     )
     command.add_argument(
         "--components",
@@ -103,6 +102,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
+    if arguments.op_amp is None:
+        arguments.op_amp = "tl07x" if arguments.recording is None else "ideal"
     if arguments.recording is not None:
         return fit_recording(arguments)
     if arguments.program not in PROGRAMS:
