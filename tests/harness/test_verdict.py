@@ -64,6 +64,13 @@ def test_undetectable_change_without_an_alarm_passes() -> None:
     assert verdict.outcome == "passed"
 
 
+def test_alarm_after_a_change_without_information_is_false() -> None:
+    verdict = judge(made_run(np.zeros(800), CHANGE, alarms=[404]))
+    assert verdict.false_alarms == (404,)
+    assert verdict.tweaks[0].result == "unseeable"
+    assert verdict.outcome == "failed"
+
+
 def test_late_alarm_fails_and_names_its_deadline() -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[500]))
     assert verdict.tweaks[0].late

@@ -1,8 +1,8 @@
 """The verdict on a Run, computed from the Run alone, so that a recording can be judged again.
 
-An alarm is attributed to the change in whose segment it falls. The first alarm of a segment is the detection. Every
-other alarm is a false alarm, except alarms during a ramp. A detection is late if the information I(n) accumulated
-until the alarm was many times the information needed.
+An alarm is attributed to the change in whose segment it falls, unless the segment holds next to no information on the
+change. The first alarm of a segment is the detection. Every other alarm is a false alarm, except alarms during a ramp.
+A detection is late if the information I(n) accumulated until the alarm was many times the information needed.
 
 If the instant of a change is known only as an interval, the run is judged under three hypotheses: all changes at their
 earliest, their likeliest, and their latest instants. A finding holds if it holds under all three: an alarm before the
@@ -35,6 +35,9 @@ from analogrig.wording import number_of
 
 LARGEST_LEVEL = 700.0
 """Largest argument of exp() whose result is finite."""
+
+_LEAST_INFORMATION = 0.5
+"""Least information on a change in its segment, in nats, for an alarm there to be attributed to it."""
 
 _NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
 
@@ -583,7 +586,7 @@ def _attribute_alarms(
         if start in run.conditions.records:
             continue  # a device that restarts has no earlier plant to compare with
         # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
-        in_segment = [index for index in alarms if start < index <= end]
+        in_segment = [index for index in alarms if start < index <= end] if _may_alarm(gathered) else []
         detection = in_segment[0] if in_segment else None
         detected |= alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
@@ -605,6 +608,11 @@ def _attribute_alarms(
             )
         )
     return tuple(tweaks), tuple(sorted(set(alarms) - detected))
+
+
+def _may_alarm(gathered: NDArray[np.float64]) -> bool:
+    """True if a change with the information I(1), I(2), ... may raise an alarm; empty: unknown."""
+    return not len(gathered) or bool(gathered[-1] >= _LEAST_INFORMATION)
 
 
 def _judge_diagnosis(
