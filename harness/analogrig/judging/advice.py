@@ -74,6 +74,11 @@ def _orders(run: Run) -> Iterator[str]:
     elif model.na < program.order:
         cure = ' set orders = "program" under [estimator]' if estimator else " choose a model of that order"
         yield f"the device models {model.na} of the {program.order} poles of the program {program.name}:{cure}"
+    elif model.na < (states := len(program.equations.states)):
+        yield (
+            f"the program {program.name} is not linear and has {states} states, the device models order {model.na}:"
+            " if it does not fit, raise na and nb in a device file"
+        )
 
 
 def _unjudged_quantities(run: Run, verdict: Verdict) -> Iterator[str]:

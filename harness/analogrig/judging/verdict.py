@@ -67,11 +67,12 @@ DIAGNOSABLE = {change: change.name.lower().replace("_", " ") for change in Chang
 """Changes that a device can diagnose, with their names: ``mass``, ``several``, ``force offset``."""
 
 CURES: Mapping[str, str] = {
-    "drift": "remove the mean of the displacement by a high-pass filter, or make the run shorter",
+    "drift": "remove the mean of the output by a high-pass filter, or make the run shorter",
     "hum": "shield the sensor and its cable, or sample synchronously with the mains",
-    "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card',
+    "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card if it has its own',
     "nonlinear": "reduce the amplitude of the excitation, or raise the orders na and nb",
-    "noise": "shield or filter the displacement; without noise_estimated, set noise_variance as measured at rest",
+    "noise": "shield or filter the output; without noise_estimated, set noise_variance as measured at rest; or raise"
+    " the orders na and nb",
     "slow plant": "lower the sample rate, or use a converter with more bits",
     "excitation": "raise the amplitude of the excitation",
 }
