@@ -146,13 +146,16 @@ def test_a_parameter_that_the_excitation_does_not_show_is_named(
     assert "+-" not in line
 
 
-def test_an_output_of_another_plant_is_a_caveat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_twin_of_another_plant_is_kept_on_demand_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "a.npz", u=multisine(800), y=1e-3 * np.cos(np.arange(800.0)))
     command = ["import", str(tmp_path / "a.npz"), "--input", "u", "--output", "y", "--rate", "610"]
     assert main([*command, "--out", str(tmp_path / "r.npz")]) == 0
     command = ["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "silverbox"]
-    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 0
-    assert "caveat: the machine differs by more than the output moves" in capsys.readouterr().out
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 1
+    told = capsys.readouterr().out
+    assert "caveat: the machine differs by more than half of what the output moves" in told
+    assert "nothing kept" in told and not (tmp_path / "twin.toml").exists()
+    assert main([*command, "--most-rms", "1", "--out", str(tmp_path / "twin.toml")]) == 0
 
 
 def test_a_beginning_that_does_not_fit_names_the_cure(

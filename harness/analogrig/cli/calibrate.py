@@ -70,7 +70,11 @@ def add(commands: Any) -> None:
         help="course of the input between the samples of the recording (default: the one that fits better)",
     )
     command.add_argument(
-        "--most-rms", type=float, metavar="X", help="largest rms difference of a twin to keep, in the output's unit"
+        "--most-rms",
+        type=float,
+        metavar="X",
+        help="largest rms difference of a twin to keep, in the"
+        " output's unit (default: half the rms of the fitted output about its mean)",
     )
     command.add_argument(
         "--op-amp",

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from analogrig.run import Run
 
 
+_MOST_OF_OUTPUT = 0.5
+"""Largest rms difference of a twin to keep by default, in the rms of the fitted output about its mean."""
+
+
 def fit_recording(arguments: argparse.Namespace) -> int:
     """Fit a program to a recording, and keep it as a program file with the fitted values."""
     from analogrig.config import locate
@@ -93,7 +97,11 @@ def _fit(
         twin = fit_program(plant, span, reconstruction=arguments.reconstruction or reconstruction, fixed=fixed)
         checked = check and check[0].difference(twin.values, check[1], twin.reconstruction)
     unit = plant.output_unit
-    is_twin = arguments.most_rms is None or (checked or twin.fit).rms <= arguments.most_rms
+    if arguments.most_rms is None:
+        judged, most_rms = twin.fit, _MOST_OF_OUTPUT * twin.output_rms
+    else:
+        judged, most_rms = checked or twin.fit, arguments.most_rms
+    is_twin = judged.rms <= most_rms
     lines = [
         *(_parameter_line(each) for each in twin.estimates),
         f"samples {span.first} to {span.end - 1}, fitted: {_words(twin.fit, unit)}",
@@ -117,7 +125,7 @@ def _fit(
         table |= {"check": checked and vars(checked), "file": str(arguments.out) if is_twin else None}
         show_result(table, arguments)
     else:
-        unkept = f"no twin: more than {arguments.most_rms or 0.0:g} {unit}; nothing kept"
+        unkept = f"no twin: more than {most_rms:.4g} {unit}; nothing kept"
         show("\n".join([*lines, f"kept as {arguments.out}" if is_twin else unkept]))
     return PASSED if is_twin else FAILED
 
@@ -142,10 +150,10 @@ def _reconstruction_line(twin: ProgramTwin, unit: str) -> str:
 def _caveats(twin: ProgramTwin) -> list[str]:
     """Reasons to doubt the values, with their cures, one line each."""
     lines = []
-    if twin.fit.rms > twin.output_rms:
+    if twin.fit.rms > _MOST_OF_OUTPUT * twin.output_rms:
         lines.append(
-            f"caveat: the machine differs by more than the output moves ({twin.output_rms:.4g} rms): check program,"
-            " columns and units"
+            f"caveat: the machine differs by more than half of what the output moves ({twin.output_rms:.4g} rms): check"
+            " program, columns, units and sample rate"
         )
     elif twin.may_jump_between_samples:
         lines.append(
