@@ -216,6 +216,8 @@ def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
     for tweak in verdict.tweaks:
         if tweak.bound_n is None and tweak.is_bounded and not tweak.unseen:
             yield f"{tweak.what} at {tweak.sample} is not judged: not detectable before the next change or the end"
+        elif tweak.is_cut and tweak.latency_n is None:
+            yield f"{tweak.what} at {tweak.sample} is not judged: the run ends before an alarm would be late"
 
 
 def _implausible_estimates(verdict: Verdict) -> Iterator[str]:

@@ -167,6 +167,9 @@ class ChangeVerdict:
     """Information bound of this change; None: not detectable before the next change or the end."""
     deadline_n: int | None
     """Latest alarm that is not late; None: no alarm is late."""
+    is_cut: bool = False
+    """True if the run ends fewer than ``late_slack_n`` samples after the bound: a change without an alarm is not
+    missed."""
     is_bounded: bool = True
     """False: the bound is unknown, and the change counts as detectable."""
     diagnosis: DiagnosisVerdict | None = None
@@ -211,8 +214,8 @@ class ChangeVerdict:
 
     @property
     def missed(self) -> bool:
-        """True if the change was detectable and raised no alarm."""
-        return self.latency_n is None and (self.bound_n is not None or not self.is_bounded)
+        """True if the change was detectable, raised no alarm, and the run left the time for one."""
+        return self.latency_n is None and not self.is_cut and (self.bound_n is not None or not self.is_bounded)
 
     @property
     def late(self) -> bool:
@@ -592,6 +595,7 @@ def _attribute_alarms(
         detected |= alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
         late = first_at_level(gathered, expect.late_information_ratio * level)
+        bound_n = first_at_level(gathered, level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -600,7 +604,8 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=first_at_level(gathered, level),
+                bound_n=bound_n,
+                is_cut=end == run.samples and bound_n is not None and start + bound_n + expect.late_slack_n > end,
                 is_bounded=is_bounded,
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
