@@ -41,8 +41,9 @@ NOTE = f"""\
 Each row is a machine with the program `silverbox`. `analogrig calibrate` fits its six parameters to
 samples {FITTED[0]:,} to {FITTED[1]:,} alone, the multisines. It then plays the arrow head, samples 0 to
 {GROWTH_END:,}, with the recorded input, and never sees the recorded output. The first 200 samples of
-either are not compared. Real parts are polyester capacitors, 1 % resistors, and multipliers with
-the errors of the AD633's data sheet. The pots are continuous.
+either are not compared. The amplifiers are TL07x (`--op-amp tl07x`). Real parts are polyester
+capacitors, 1 % resistors, and multipliers with the errors of the AD633's data sheet. The pots are
+continuous.
 
 The linear rows leave out the multipliers: the best that a mass, a damper and a linear spring do.
 The required rms is {MOST_V * 1e3:g} mV. The record itself is not part of the repository:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.config import fixtures
+from analogrig.hardware.calibration.recorded import _determined
 from analogrig_emulator import Excitation, RecordedExcitation, SuspensionComputer, load_program
 
 RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0}
@@ -29,14 +30,16 @@ def multisine(samples: int = SAMPLES) -> NDArray[np.float64]:
     return np.asarray(u * (0.05 / u.std()))
 
 
-def record(folder: Path, name: str, values: dict[str, float], played: RecordedExcitation | Excitation) -> Path:
+def record(
+    folder: Path, name: str, values: dict[str, float], played: RecordedExcitation | Excitation, *, noise_v: float = 5e-4
+) -> Path:
     """Recording of the first two channels of a program, with noise of 5e-5 of the output's full scale."""
     rate_hz = RATES_HZ[name]
     program = load_program(fixtures() / "programs" / f"{name}.toml")
-    computer = SuspensionComputer(program, sample_rate_hz=rate_hz * program.equations.speed)
+    computer = SuspensionComputer(program, opamp="ideal", sample_rate_hz=rate_hz * program.equations.speed)
     computer.set(**values)
     volts = np.concatenate([block[:, :2] for block in computer.play(played, SAMPLES)])
-    volts[:, 1] += 5e-4 * np.random.default_rng(3).normal(size=SAMPLES)
+    volts[:, 1] += noise_v * np.random.default_rng(3).normal(size=SAMPLES)
     u, y = (volts[:, at] * program.scales.full(each) / 10.0 for at, each in enumerate(program.channels[:2]))
     np.savez(folder / "measured.npz", u=u, y=y)
     command = ["import", str(folder / "measured.npz"), "--input", "u", "--output", "y", "--rate", str(rate_hz)]
@@ -77,6 +80,7 @@ def test_a_fit_finds_the_values_of_the_machine_and_keeps_them(
     assert told["reconstruction"] == "band-limited" and told["other_rms"] > 5.0 * told["fit"]["rms"]
     assert told["fit"]["rms"] == pytest.approx(2e-5, rel=0.2)
     assert told["check"]["rms"] == pytest.approx(2e-5, rel=0.3)
+    assert told["fit"]["noise"] == pytest.approx(2e-5, rel=0.2) and not told["caveats"] and told["rig"] is None
     kept = load_program(twin)
     assert kept.values == {each["name"]: each["value"] for each in told["parameters"]}
     assert kept.equations.channels == ("u", "y")
@@ -100,6 +104,14 @@ def test_an_input_that_is_held_between_samples_gives_no_bias(
         assert each["value"] == pytest.approx(FRONT[each["name"]], rel=2e-3)
     (mass, *_) = fit(measured, "front", capsys, "--reconstruction", "band-limited")["parameters"]
     assert abs(mass["value"] / FRONT["M"] - 1.0) > 0.02
+
+
+def test_noise_hides_no_course_of_a_held_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    levels_v = np.where(np.arange(SAMPLES) % 100 < 50, 9.0, 1.0)
+    measured = record(tmp_path, "front", FRONT, RecordedExcitation(levels_v, is_held=True), noise_v=0.2)
+    told = fit(measured, "front", capsys, "--fix", "K=23000")
+    assert told["reconstruction"] == "held" and told["other_is_fitted"]
+    assert told["fit"]["rms"] < told["other_rms"] < 1.5 * told["fit"]["rms"] and not told["caveats"]
 
 
 def test_edges_between_the_samples_are_a_caveat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -134,13 +146,16 @@ def test_a_parameter_that_the_excitation_does_not_show_is_named(
     assert "+-" not in line
 
 
-def test_an_output_of_another_plant_is_a_caveat(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_twin_of_another_plant_is_kept_on_demand_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "a.npz", u=multisine(800), y=1e-3 * np.cos(np.arange(800.0)))
     command = ["import", str(tmp_path / "a.npz"), "--input", "u", "--output", "y", "--rate", "610"]
     assert main([*command, "--out", str(tmp_path / "r.npz")]) == 0
     command = ["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "silverbox"]
-    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 0
-    assert "caveat: the machine differs by more than the output moves" in capsys.readouterr().out
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 1
+    told = capsys.readouterr().out
+    assert "caveat: the machine differs by more than half of what the output moves" in told
+    assert "nothing kept" in told and not (tmp_path / "twin.toml").exists()
+    assert main([*command, "--most-rms", "1", "--out", str(tmp_path / "twin.toml")]) == 0
 
 
 def test_a_beginning_that_does_not_fit_names_the_cure(
@@ -151,6 +166,30 @@ def test_a_beginning_that_does_not_fit_names_the_cure(
     assert "the recording did not begin at rest; pass a --settle above 0" in capsys.readouterr().out
     assert main([*command, "--settle", "300", "--out", str(tmp_path / "twin.toml")]) == 0
     assert "--settle" not in capsys.readouterr().out
+
+
+def test_a_plant_that_changes_unknown_to_the_recording_is_a_caveat(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    levels_v = np.where(np.arange(SAMPLES) % 100 < 50, 9.0, 1.0)
+    parts = []
+    for stiffness in (18e3, 26e3):
+        played = RecordedExcitation(levels_v, is_held=True)
+        measured = np.load(record(tmp_path, "front", FRONT | {"K": stiffness}, played).parent / "measured.npz")
+        parts.append({name: measured[name] for name in ("u", "y")})
+    u, y = (np.concatenate([part[name] for part in parts]) for name in ("u", "y"))
+    np.savez(tmp_path / "both.npz", u=u, y=y)
+    command = ["import", str(tmp_path / "both.npz"), "--input", "u", "--output", "y", "--rate", "100"]
+    assert main([*command, "--input-unit", "N", "--output-unit", "m", "--out", str(tmp_path / "r.npz")]) == 0
+    told = fit(tmp_path / "r.npz", "front", capsys, "--fix", "B", "--fix", "M")
+    (caveat,) = told["caveats"]
+    assert "times the noise of the output: the plant changed" in caveat
+
+
+def test_a_perfect_fit_of_an_output_that_nothing_moves_has_finite_errors() -> None:
+    found = _determined(np.stack([np.zeros(9), np.arange(9.0)], axis=1), 0.0)
+    assert found.is_unseen.tolist() == [True, False] and np.isfinite(found.errors).all()
+    assert np.isfinite(_determined(np.zeros((9, 2)), 0.0).errors).all()
 
 
 def test_a_program_is_fitted_to_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,6 +107,21 @@ def test_run_states_the_chosen_orders_and_the_step_response(tmp_path: Path, caps
     assert [each["end"] for each in json.loads(capsys.readouterr().out)["step_responses"]] == [1000, 1500]
 
 
+def test_run_states_that_a_nonlinear_program_has_more_states_than_the_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    equations = "a' = 5*(u - a - 0.5*a*a)\\nb' = 5*(a - b)\\nc' = 5*(b - c)"
+    states = "".join(f"{each} = {{ full = 1.0 }}\n" for each in "abc")
+    (tmp_path / "chain.toml").write_text(
+        f'name = "chain"\nspeed = 100\nchannels = ["u", "c"]\nequations = "{equations}"\n[states]\n{states}'
+        "[inputs]\nu = { full = 1.0, trial = [0.1, 0.9] }\n"
+    )
+    scenario = tmp_path / "chain-run.toml"
+    scenario.write_text('program = "chain.toml"\nsamples = 60\n[excitation]\nlow_v = 1.0\nfrequency_hz = 50.0\n')
+    main(["run", "--scenario", str(scenario), "--dut", "inproc", "--out", str(tmp_path / "run")])
+    assert "chain is not linear and has 3 states, the device models order 2" in capsys.readouterr().out
+
+
 def test_run_states_that_a_model_has_too_few_poles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["run", "--scenario", "two-mass", "--dut", described(tmp_path, GIVEN), "--out", str(tmp_path / "run")])
     assert 'models 2 of the 4 poles of the program two-mass: set orders = "program"' in capsys.readouterr().out

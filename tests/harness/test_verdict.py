@@ -57,11 +57,26 @@ def test_detectable_change_without_an_alarm_is_missed() -> None:
     assert verdict.reasons == ("missed 1 of 1 change (K at 400), at most 0 expected",)
 
 
+def test_change_just_before_the_end_without_an_alarm_is_not_missed() -> None:
+    late = judge(made_run(LOADED, [(0, FRONT), (785, SOFT)]))
+    assert late.tweaks[0].bound_n is not None
+    assert late.tweaks[0].result == "unseeable"
+    assert late.outcome == "passed"
+    assert judge(made_run(LOADED, [(0, FRONT), (760, SOFT)])).tweaks[0].missed
+
+
 def test_undetectable_change_without_an_alarm_passes() -> None:
     verdict = judge(made_run(np.zeros(800), CHANGE))
     assert verdict.tweaks[0].bound_n is None
     assert not verdict.tweaks[0].missed
     assert verdict.outcome == "passed"
+
+
+def test_alarm_after_a_change_without_information_is_false() -> None:
+    verdict = judge(made_run(np.zeros(800), CHANGE, alarms=[404]))
+    assert verdict.false_alarms == (404,)
+    assert verdict.tweaks[0].result == "unseeable"
+    assert verdict.outcome == "failed"
 
 
 def test_late_alarm_fails_and_names_its_deadline() -> None:

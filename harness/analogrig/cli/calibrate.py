@@ -70,13 +70,16 @@ def add(commands: Any) -> None:
         help="course of the input between the samples of the recording (default: the one that fits better)",
     )
     command.add_argument(
-        "--most-rms", type=float, metavar="X", help="largest rms difference of a twin to keep, in the output's unit"
+        "--most-rms",
+        type=float,
+        metavar="X",
+        help="largest rms difference of a twin to keep, in the"
+        " output's unit (default: half the rms of the fitted output about its mean)",
     )
     command.add_argument(
         "--op-amp",
-        default="tl07x",
         choices=("tl07x", "741", "opa627", "ideal"),
-        help="type of the amplifiers (default: %(default)s)",
+        help="type of the amplifiers (default: ideal with --recording, tl07x for a rig)",
     )
     command.add_argument(
         "--components",
@@ -103,6 +106,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
+    if arguments.op_amp is None:
+        arguments.op_amp = "tl07x" if arguments.recording is None else "ideal"
     if arguments.recording is not None:
         return fit_recording(arguments)
     if arguments.program not in PROGRAMS:

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from analogrig.run import Run
 
 
+_MOST_OF_OUTPUT = 0.5
+"""Largest rms difference of a twin to keep by default, in the rms of the fitted output about its mean."""
+
+
 def fit_recording(arguments: argparse.Namespace) -> int:
     """Fit a program to a recording, and keep it as a program file with the fitted values."""
     from analogrig.config import locate
@@ -93,37 +97,42 @@ def _fit(
         twin = fit_program(plant, span, reconstruction=arguments.reconstruction or reconstruction, fixed=fixed)
         checked = check and check[0].difference(twin.values, check[1], twin.reconstruction)
     unit = plant.output_unit
-    is_twin = arguments.most_rms is None or (checked or twin.fit).rms <= arguments.most_rms
+    if arguments.most_rms is None:
+        judged, most_rms = twin.fit, _MOST_OF_OUTPUT * twin.output_rms
+    else:
+        judged, most_rms = checked or twin.fit, arguments.most_rms
+    is_twin = judged.rms <= most_rms
     lines = [
         *(_parameter_line(each) for each in twin.estimates),
         f"samples {span.first} to {span.end - 1}, fitted: {_words(twin.fit, unit)}",
     ]
     if check and checked:
         lines.append(f"samples {check[1].first} to {check[1].end - 1}, not fitted: {_words(checked, unit)}")
-    lines += [_reconstruction_line(twin, unit), *_caveats(twin)]
-    lines += _settling_lines(twin.fit, checked, _settling_n(arguments))
+    caveats = [*_caveats(twin), *_settling_lines(twin.fit, checked, _settling_n(arguments))]
+    lines += [_reconstruction_line(twin, unit), *caveats]
     if is_twin:
         with replace_file(arguments.out) as out:
             out.write(_program_toml(file, twin.values, lines, arguments).encode("utf-8"))
     if arguments.json:
         table = {"program": str(file), "unit": unit, "plays": twin.plays}
-        table |= {"recording": arguments.recording and str(arguments.recording), "rig": arguments.rig}
+        recording, rig = (str(arguments.recording), None) if arguments.recording else (None, arguments.rig)
+        table |= {"recording": recording, "rig": rig}
         table |= {"parameters": [vars(each) for each in twin.estimates], "fit": vars(twin.fit)}
         table |= {"reconstruction": twin.reconstruction, "other_rms": twin.other_rms}
-        table |= {"output_rms": twin.output_rms}
+        table |= {"other_is_fitted": twin.other_is_fitted, "output_rms": twin.output_rms, "caveats": caveats}
         table |= {"may_jump_between_samples": twin.may_jump_between_samples}
         table |= {"unseen": twin.unseen, "inseparable": twin.inseparable, "surplus": twin.surplus}
         table |= {"check": checked and vars(checked), "file": str(arguments.out) if is_twin else None}
         show_result(table, arguments)
     else:
-        unkept = f"no twin: more than {arguments.most_rms or 0.0:g} {unit}; nothing kept"
+        unkept = f"no twin: more than {most_rms:.4g} {unit}; nothing kept"
         show("\n".join([*lines, f"kept as {arguments.out}" if is_twin else unkept]))
     return PASSED if is_twin else FAILED
 
 
 def _parameter_line(each: FittedParameter) -> str:
     if each.standard_error is None:
-        return f"{each.name:12} {each.value:12.6g} not determined"
+        return f"{each.name:12} {each.value:12.6g} {'not determined':23} {each.place}"
     return f"{each.name:12} {each.value:12.6g} +- {each.standard_error:9.3g} {each.unit:10} {each.place}"
 
 
@@ -134,21 +143,27 @@ def _reconstruction_line(twin: ProgramTwin, unit: str) -> str:
     if twin.other_rms is None:
         return line
     (other,) = (each for each in RECONSTRUCTIONS if each != twin.reconstruction)
-    return f"{line} ({other}: within {twin.other_rms:.4g} {unit} rms)"
+    about = "within" if twin.other_is_fitted else "about"
+    return f"{line} ({other}: {about} {twin.other_rms:.4g} {unit} rms)"
 
 
 def _caveats(twin: ProgramTwin) -> list[str]:
     """Reasons to doubt the values, with their cures, one line each."""
     lines = []
-    if twin.fit.rms > twin.output_rms:
+    if twin.fit.rms > _MOST_OF_OUTPUT * twin.output_rms:
         lines.append(
-            f"caveat: the machine differs by more than the output moves ({twin.output_rms:.4g} rms): check program,"
-            " columns and units"
+            f"caveat: the machine differs by more than half of what the output moves ({twin.output_rms:.4g} rms): check"
+            " program, columns, units and sample rate"
         )
-    if twin.may_jump_between_samples:
+    elif twin.may_jump_between_samples:
         lines.append(
             "caveat: the input jumps, and neither course of it fits much better: its edges may lie between the samples;"
             " record faster, or on the generator's clock"
+        )
+    elif twin.fit.is_settled and not twin.fit.is_noise:
+        lines.append(
+            f"caveat: the residual is {twin.fit.rms / twin.fit.noise:.0f} times the noise of the output: the plant"
+            " changed, or the program does not describe it; the standard errors do not hold"
         )
     if twin.unseen:
         names = ", ".join(twin.unseen)

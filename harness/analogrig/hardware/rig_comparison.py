@@ -18,17 +18,12 @@ from numpy.typing import NDArray
 from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.campaigns.comparison import Comparison, compare
 from analogrig.campaigns.rows import Row, changes, row
+from analogrig.hardware.calibration.averages import noise_variance
 from analogrig.judging.bursts import bound_rate
 from analogrig.judging.statistics import mean_interval, upper_rate
 from analogrig.judging.verdict import judge
 from analogrig.run import INPUT, Run
 from analogrig.scenario import Scenario
-
-_THIRD_DIFFERENCE = (1.0, -3.0, 3.0, -1.0)
-_NORMAL_MAD = 1.482602
-"""Standard deviation over median absolute deviation of normal noise."""
-_KEPT_SIGMAS, _KEPT_VARIANCE = 3.0, 0.973337
-"""Largest deviation that counts as noise, and the variance of a standard normal number within it."""
 
 _SMOOTHED_N = 5
 """Samples over which a difference is averaged before its largest value is found."""
@@ -191,7 +186,7 @@ def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence:
     """Difference of one channel in two plays or more, without clipped samples and those at edges of the force."""
     differences, compared, apart = zip(*(_difference(a, b, channel) for a, b in runs), strict=True)
     pairs = list(zip(differences, compared, strict=True))
-    noise = math.sqrt(float(np.mean([_noise_variance(each) for each in differences])))
+    noise = math.sqrt(float(np.mean([noise_variance(each) for each in differences])))
     squares = np.array([np.mean(np.square(each[use])) for each, use in pairs])
     mean_square, _, most_square = mean_interval(squares - noise**2, 2.0 * confidence - 1.0)
     largest, at = max((_largest(each, use) for each, use in pairs), key=lambda found: abs(found[0]))
@@ -239,14 +234,6 @@ def _at_edges(run: Run, samples: int) -> NDArray[np.bool_]:
     for away in (-1, 0, 1, 2):
         near[np.clip(jump + away, 0, samples - 1)] = True
     return near
-
-
-def _noise_variance(difference: NDArray[np.float64]) -> float:
-    """Variance of white noise on a smooth signal: a 20th of that of its third differences, without outliers."""
-    third = np.convolve(difference, _THIRD_DIFFERENCE, mode="valid")
-    sigma = _NORMAL_MAD * float(np.median(np.abs(third)))
-    kept = third[np.abs(third) <= _KEPT_SIGMAS * sigma]
-    return float(np.mean(np.square(kept))) / _KEPT_VARIANCE / float(np.square(_THIRD_DIFFERENCE).sum())
 
 
 def _largest(difference: NDArray[np.float64], counted: NDArray[np.bool_]) -> tuple[float, int]:

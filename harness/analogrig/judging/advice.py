@@ -74,6 +74,11 @@ def _orders(run: Run) -> Iterator[str]:
     elif model.na < program.order:
         cure = ' set orders = "program" under [estimator]' if estimator else " choose a model of that order"
         yield f"the device models {model.na} of the {program.order} poles of the program {program.name}:{cure}"
+    elif model.na < (states := len(program.equations.states)):
+        yield (
+            f"the program {program.name} is not linear and has {states} states, the device models order {model.na}:"
+            " if it does not fit, raise na and nb in a device file"
+        )
 
 
 def _unjudged_quantities(run: Run, verdict: Verdict) -> Iterator[str]:
@@ -211,6 +216,8 @@ def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
     for tweak in verdict.tweaks:
         if tweak.bound_n is None and tweak.is_bounded and not tweak.unseen:
             yield f"{tweak.what} at {tweak.sample} is not judged: not detectable before the next change or the end"
+        elif tweak.is_cut and tweak.latency_n is None:
+            yield f"{tweak.what} at {tweak.sample} is not judged: the run ends before an alarm would be late"
 
 
 def _implausible_estimates(verdict: Verdict) -> Iterator[str]:

@@ -1,8 +1,8 @@
 """The verdict on a Run, computed from the Run alone, so that a recording can be judged again.
 
-An alarm is attributed to the change in whose segment it falls. The first alarm of a segment is the detection. Every
-other alarm is a false alarm, except alarms during a ramp. A detection is late if the information I(n) accumulated
-until the alarm was many times the information needed.
+An alarm is attributed to the change in whose segment it falls, unless the segment holds next to no information on the
+change. The first alarm of a segment is the detection. Every other alarm is a false alarm, except alarms during a ramp.
+A detection is late if the information I(n) accumulated until the alarm was many times the information needed.
 
 If the instant of a change is known only as an interval, the run is judged under three hypotheses: all changes at their
 earliest, their likeliest, and their latest instants. A finding holds if it holds under all three: an alarm before the
@@ -36,6 +36,9 @@ from analogrig.wording import number_of
 LARGEST_LEVEL = 700.0
 """Largest argument of exp() whose result is finite."""
 
+_LEAST_INFORMATION = 0.5
+"""Least information on a change in its segment, in nats, for an alarm there to be attributed to it."""
+
 _NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
 
 Outcome = Literal["passed", "failed", "inconclusive", "unjudged"]
@@ -64,11 +67,12 @@ DIAGNOSABLE = {change: change.name.lower().replace("_", " ") for change in Chang
 """Changes that a device can diagnose, with their names: ``mass``, ``several``, ``force offset``."""
 
 CURES: Mapping[str, str] = {
-    "drift": "remove the mean of the displacement by a high-pass filter, or make the run shorter",
+    "drift": "remove the mean of the output by a high-pass filter, or make the run shorter",
     "hum": "shield the sensor and its cable, or sample synchronously with the mains",
-    "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card',
+    "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card if it has its own',
     "nonlinear": "reduce the amplitude of the excitation, or raise the orders na and nb",
-    "noise": "shield or filter the displacement; without noise_estimated, set noise_variance as measured at rest",
+    "noise": "shield or filter the output; without noise_estimated, set noise_variance as measured at rest; or raise"
+    " the orders na and nb",
     "slow plant": "lower the sample rate, or use a converter with more bits",
     "excitation": "raise the amplitude of the excitation",
 }
@@ -163,6 +167,9 @@ class ChangeVerdict:
     """Information bound of this change; None: not detectable before the next change or the end."""
     deadline_n: int | None
     """Latest alarm that is not late; None: no alarm is late."""
+    is_cut: bool = False
+    """True if the run ends fewer than ``late_slack_n`` samples after the bound: a change without an alarm is not
+    missed."""
     is_bounded: bool = True
     """False: the bound is unknown, and the change counts as detectable."""
     diagnosis: DiagnosisVerdict | None = None
@@ -207,8 +214,8 @@ class ChangeVerdict:
 
     @property
     def missed(self) -> bool:
-        """True if the change was detectable and raised no alarm."""
-        return self.latency_n is None and (self.bound_n is not None or not self.is_bounded)
+        """True if the change was detectable, raised no alarm, and the run left the time for one."""
+        return self.latency_n is None and not self.is_cut and (self.bound_n is not None or not self.is_bounded)
 
     @property
     def late(self) -> bool:
@@ -583,11 +590,12 @@ def _attribute_alarms(
         if start in run.conditions.records:
             continue  # a device that restarts has no earlier plant to compare with
         # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
-        in_segment = [index for index in alarms if start < index <= end]
+        in_segment = [index for index in alarms if start < index <= end] if _may_alarm(gathered) else []
         detection = in_segment[0] if in_segment else None
         detected |= alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
         late = first_at_level(gathered, expect.late_information_ratio * level)
+        bound_n = first_at_level(gathered, level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -596,7 +604,8 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=first_at_level(gathered, level),
+                bound_n=bound_n,
+                is_cut=end == run.samples and bound_n is not None and start + bound_n + expect.late_slack_n > end,
                 is_bounded=is_bounded,
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
@@ -605,6 +614,11 @@ def _attribute_alarms(
             )
         )
     return tuple(tweaks), tuple(sorted(set(alarms) - detected))
+
+
+def _may_alarm(gathered: NDArray[np.float64]) -> bool:
+    """True if a change with the information I(1), I(2), ... may raise an alarm; empty: unknown."""
+    return not len(gathered) or bool(gathered[-1] >= _LEAST_INFORMATION)
 
 
 def _judge_diagnosis(

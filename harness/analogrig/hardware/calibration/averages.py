@@ -44,6 +44,12 @@ _MARGIN = 0.1
 FORCE, DISPLACEMENT = range(2)
 """Columns of a recording: input and output of the program."""
 
+_THIRD_DIFFERENCE = (1.0, -3.0, 3.0, -1.0)
+_NORMAL_MAD = 1.482602
+"""Standard deviation over median absolute deviation of normal noise."""
+_KEPT_SIGMAS, _KEPT_VARIANCE = 3.0, 0.973337
+"""Largest deviation that counts as noise, and the variance of a standard normal number within it."""
+
 _COLUMNS = [INPUT, OUTPUT]
 _GRID = ("low_v", "lsb_v")
 
@@ -246,3 +252,11 @@ def _remove_rounding(variance: float) -> float:
         return noise_lsb**2 + 1.0 / 12.0 - rounding_variance(noise_lsb) - variance
 
     return float(brentq(excess, 0.0, 1.0 + math.sqrt(variance))) if excess(0.0) < 0.0 else 0.0
+
+
+def noise_variance(values: NDArray[np.float64]) -> float:
+    """Variance of white noise on a smooth signal: a 20th of that of its third differences, without outliers."""
+    third = np.convolve(values, _THIRD_DIFFERENCE, mode="valid")
+    sigma = _NORMAL_MAD * float(np.median(np.abs(third)))
+    kept = third[np.abs(third) <= _KEPT_SIGMAS * sigma]
+    return float(np.mean(np.square(kept))) / _KEPT_VARIANCE / float(np.square(_THIRD_DIFFERENCE).sum())

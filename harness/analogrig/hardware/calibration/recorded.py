@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
+from analogrig.hardware.calibration.averages import noise_variance
+from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import (
@@ -26,6 +28,7 @@ from analogrig_emulator import (
     RecordedExcitation,
     SuspensionComputer,
 )
+from analogrig_emulator.machine.compiler import MACHINE_V
 
 SETTLING_N = 200
 """Samples at the beginning of a span that are played and not compared, by default: the machine starts from rest."""
@@ -39,7 +42,6 @@ Reconstruction = Literal["band-limited", "held"]
 RECONSTRUCTIONS: tuple[Reconstruction, ...] = ("band-limited", "held")
 """Courses of the input between its samples: that before an anti-alias filter, and that after a converter."""
 
-_MACHINE_V = 10.0
 _STEP = 1e-3
 """Relative step of the numerical derivatives."""
 _LEAST_SINGULAR = 5e-5
@@ -53,7 +55,11 @@ _LEAST_ERROR = 0.1
 _JUMP = 0.5
 """Least step of the input from one sample to the next, as part of its range, that is a jump."""
 _ALIKE_RMS = 1.5
-"""Largest ratio of the rms of two courses of the input that explain the output alike."""
+"""Largest ratio of the rms of two courses of the input, without the noise, that explain the output alike."""
+_NOISE_ALONE = 1.1
+"""Largest rms of a residual, in that of the noise, that may be noise alone."""
+_MOST_COLOURED = 3.0
+"""Largest rms, in that of the noise, of a residual that the noise of the output explains."""
 _BEGINNING = 0.1
 """Part of the compared samples that is their beginning."""
 _MOST_AT_BEGINNING = 3.0
@@ -74,6 +80,11 @@ class Span:
     valid: NDArray[np.bool_]
     """(n,): samples to compare: measured, and after the settling time."""
 
+    def residual(self, played: NDArray[np.float64]) -> Residual:
+        """Difference between an output (n,) and the recorded one."""
+        steps = np.diff(np.unique(self.y[self.valid]))
+        return Residual.of((played - self.y)[self.valid], float(steps.min()) if len(steps) else 0.0)
+
 
 @dataclass(frozen=True)
 class Residual:
@@ -83,18 +94,37 @@ class Residual:
     largest: float
     beginning: float
     """Rms of the first tenth of the samples that are compared, over that of the others."""
+    noise: float
+    """Rms of the white noise in the difference, at least that of the rounding of the output."""
 
     @classmethod
-    def of(cls, left: NDArray[np.float64]) -> Residual:
-        """Summary of differences (n,)."""
+    def of(cls, left: NDArray[np.float64], lsb: float) -> Residual:
+        """Summary of differences (n,).
+
+        :param lsb: resolution of the recorded output.
+        """
         begins = math.ceil(_BEGINNING * len(left))
         first, others = (float(np.sqrt(np.mean(part**2))) for part in (left[:begins], left[begins:]))
-        return cls(float(np.sqrt(np.mean(left**2))), float(np.abs(left).max()), first / others if others else 1.0)
+        return cls(
+            rms=float(np.sqrt(np.mean(left**2))),
+            largest=float(np.abs(left).max()),
+            beginning=first / others if others else 1.0,
+            noise=math.sqrt(max(noise_variance(left), lsb**2 * QUANTISATION_VARIANCE_LSB2)),
+        )
 
     @property
     def is_settled(self) -> bool:
         """True if the beginning fits like the rest."""
         return self.beginning <= _MOST_AT_BEGINNING
+
+    @property
+    def is_noise(self) -> bool:
+        """True if the noise of the output explains it, for the greater part."""
+        return self.rms <= _MOST_COLOURED * self.noise
+
+    def excess(self, rms: float) -> float:
+        """Rms beyond the noise, of this or another difference from the same samples."""
+        return math.sqrt(max(0.0, rms**2 - (_NOISE_ALONE * self.noise) ** 2))
 
 
 @dataclass(frozen=True)
@@ -126,7 +156,9 @@ class ProgramTwin:
     reconstruction: Reconstruction
     """Course of the input between its samples with which the machine was played."""
     other_rms: float | None
-    """Rms of the other course, for which the parameters were fitted too; None if the caller chose."""
+    """Rms of the other course; None if the caller chose."""
+    other_is_fitted: bool = False
+    """True if the parameters were fitted for the other course too; False: its rms is that after one step."""
     may_jump_between_samples: bool = False
     """True if the input jumps, and neither course explains the output much better than the other."""
     unseen: tuple[str, ...] = ()
@@ -217,15 +249,15 @@ class RecordedPlant:
         self.plays += 1
         scales = self.program.scales
         self._computer.set(**{name: value for name, value in values.items() if name in self.program.values})
-        played = RecordedExcitation(span.u * _MACHINE_V / scales.full(self.input), reconstruction == "held")
+        played = RecordedExcitation(span.u * MACHINE_V / scales.full(self.input), reconstruction == "held")
         volts = np.concatenate([block[:, self._at] for block in self._computer.play(played, span.end - span.first)])
-        return np.asarray(volts * scales.full(self.output) / _MACHINE_V)
+        return np.asarray(volts * scales.full(self.output) / MACHINE_V)
 
     def difference(
         self, values: Mapping[str, float], span: Span, reconstruction: Reconstruction = "band-limited"
     ) -> Residual:
         """Difference between the machine and a span."""
-        return Residual.of((self.simulate(values, span, reconstruction) - span.y)[span.valid])
+        return span.residual(self.simulate(values, span, reconstruction))
 
 
 def fit_program(
@@ -244,16 +276,26 @@ def fit_program(
         is unstable with the program's values.
     """
     fit = _ProgramFit(plant, span, fixed, progress)
-    found, other_rms = fit.minimum(fit.start, reconstruction or "band-limited"), None
+    found, other = fit.minimum(fit.start, reconstruction or "band-limited"), None
     chosen = reconstruction or "band-limited"
     if reconstruction is None:
-        other_rms = fit.rms_after_a_step(found, "held")
-        if other_rms < fit.rms(found):
+        other = fit.after_a_step(found, "held")
+        if other.rms < fit.rms(found):
             held = fit.minimum(found.x, "held")
+            other = other._replace(rms=fit.rms(held), is_fitted=True)
             if held.cost < found.cost:
-                found, other_rms, chosen = held, fit.rms(found), "held"
+                found, other, chosen = held, other._replace(rms=fit.rms(found)), "held"
     slopes = fit.slopes(found.x, chosen)
-    return fit.twin(found, slopes, chosen, other_rms)
+    return fit.twin(found, slopes, chosen, other)
+
+
+class _OtherCourse(NamedTuple):
+    """Fit with the other course of the input between its samples, in the unit of the output."""
+
+    rms: float
+    is_fitted: bool
+    apart: float
+    """Rms difference between the outputs with the two courses, for the same parameters."""
 
 
 class _ProgramFit:
@@ -297,11 +339,14 @@ class _ProgramFit:
         """Rms difference at a minimum, in the unit of the output."""
         return self._scale * math.sqrt(2.0 * found.cost / len(self._y))
 
-    def rms_after_a_step(self, found: Any, reconstruction: Reconstruction) -> float:
-        """Rms difference that one step of Gauss and Newton from a minimum promises for another reconstruction."""
+    def after_a_step(self, found: Any, reconstruction: Reconstruction) -> _OtherCourse:
+        """Another reconstruction as one step of Gauss and Newton from a minimum predicts it."""
         left = self._residuals(found.x, reconstruction)
         step, *_ = np.linalg.lstsq(found.jac, left)
-        return self._scale * float(np.sqrt(np.mean((left - found.jac @ step) ** 2)))
+        rms, apart = (
+            self._scale * float(np.sqrt(np.mean(each**2))) for each in (left - found.jac @ step, left - found.fun)
+        )
+        return _OtherCourse(rms, is_fitted=False, apart=apart)
 
     def slopes(self, logs: NDArray[np.float64], reconstruction: Reconstruction) -> NDArray[np.float64]:
         """Derivatives (n, parameters) of the residuals by central differences."""
@@ -318,7 +363,7 @@ class _ProgramFit:
         return np.stack(columns, axis=1)
 
     def twin(
-        self, found: Any, slopes: NDArray[np.float64], reconstruction: Reconstruction, other_rms: float | None
+        self, found: Any, slopes: NDArray[np.float64], reconstruction: Reconstruction, other: _OtherCourse | None
     ) -> ProgramTwin:
         """Values at a minimum with their standard errors, as far as the samples determine them."""
         plant, values = self._plant, self._values_at(found.x)
@@ -336,18 +381,22 @@ class _ProgramFit:
             for name, error, is_known in zip(self._names, errors, ~(is_unseen | is_alike), strict=True)
         )
         every = dict(plant.program.equations.values) | self._fixed | values
+        fit = plant.difference(every, self._span, reconstruction)
+        jumps = float(np.abs(np.diff(self._span.u)).max()) > _JUMP * float(np.ptp(self._span.u))
         return ProgramTwin(
             values=every,
             estimates=estimates,
-            fit=plant.difference(every, self._span, reconstruction),
+            fit=fit,
             output_rms=float(self._y.std()),
             plays=plant.plays,
             reconstruction=reconstruction,
-            other_rms=other_rms,
+            other_rms=other and other.rms,
+            other_is_fitted=other is not None and other.is_fitted,
             may_jump_between_samples=(
-                other_rms is not None
-                and other_rms < _ALIKE_RMS * self.rms(found)
-                and float(np.abs(np.diff(self._span.u)).max()) > _JUMP * float(np.ptp(self._span.u))
+                other is not None
+                and jumps
+                and fit.excess(other.rms) < _ALIKE_RMS * fit.excess(fit.rms)
+                and fit.rms <= other.apart  # edges between the samples explain no more
             ),
             unseen=tuple(names[is_unseen].tolist()),
             inseparable=tuple(names[is_alike].tolist()),
@@ -397,7 +446,7 @@ def _determined(slopes: NDArray[np.float64], deviation: float) -> _Determined:
     """Singular values of the sensitivities to logarithms, for which an error of 0.5 is one of 50 %."""
     norms = np.sqrt((slopes**2).sum(axis=0))
     resolved = _LEAST_SINGULAR * norms.max()
-    is_unseen = norms < max(resolved, deviation / _MOST_ERROR)
+    is_unseen = norms <= max(resolved, deviation / _MOST_ERROR)
     _, singular, rows = np.linalg.svd(slopes[:, ~is_unseen], full_matrices=False)
     by_direction = np.where(
         singular < resolved, _UNKNOWN, np.minimum(deviation / np.maximum(singular, resolved), _UNKNOWN)
