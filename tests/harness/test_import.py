@@ -490,9 +490,20 @@ def test_the_reader_is_bounded_in_memory(tmp_path: Path) -> None:
 
 def test_a_reader_that_crashes_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.csv").write_text("u,y\n1,2\n")
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(RecordingError, match=r"a.csv: its reader ended with status 1"):
+    reader = tmp_path / "reader"
+    reader.write_text("#!/bin/sh\necho of its own >&2\necho the cause >&2\nexit 1\n")
+    reader.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(reader))
+    with pytest.raises(RecordingError, match=r"a.csv: its reader ended with status 1 \(the cause\): the file"):
         read_columns(tmp_path / "a.csv")
+
+
+def test_modules_beside_the_data_are_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.csv").write_text("u,y\n1,2\n")
+    (tmp_path / "csv.py").write_text("raise SystemExit('run')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path])
+    assert read_columns(Path("a.csv")).names == ("u", "y")
 
 
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
