@@ -43,6 +43,9 @@ MAX_CODES = 1 << 16
 _LEAST_MAGNITUDE, _MOST_MAGNITUDE = 1e-12, 1e9
 """Limits of every plausible unit, time or noise, exclusive."""
 
+IMPORTED = "import"
+"""Kind, in the rig's description, of measured data that no device has seen."""
+
 INPUT, OUTPUT = 0, 1
 """Columns of the plant's input and output, which every rig measures and every device receives."""
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.recordings import column_reader, columns
+from analogrig.judging.verdict import UNDETECTABLE, judge
+from analogrig.recordings import column_reader, columns, replace_scenario
 from analogrig.recordings.columns import read_columns
 from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
 from analogrig.rigs.description import open_rig
@@ -252,6 +253,89 @@ def test_measured_data_alone_is_inconclusive_and_names_the_next_step(
     assert "measured data has no device: name one with --dut" in capsys.readouterr().err
 
 
+def write_thesis(path: Path) -> None:
+    """Force in N, displacement in m and instants of the machine of a play of the scenario thesis."""
+    with open_rig("emulator") as rig:
+        played = rig.perform(Scenario.load("thesis"), 7)
+        codes = np.concatenate([block.codes for block in played.blocks])
+    u, y = (
+        played.channels[name].physical(codes[:, at]) for at, name in ((FORCE, "force"), (DISPLACEMENT, "displacement"))
+    )
+    np.savez(path, u=u, y=y, t=np.arange(len(u)) * played.sample_period_s)
+
+
+NEWTON, METRE = ImportedColumn("u", "N"), ImportedColumn("y", "m")
+
+
+@pytest.mark.parametrize("settings", [{"rate_hz": 100.0, "clock": "plant"}, {"time": "t", "clock": "machine"}])
+@pytest.mark.usefixtures("in_this_process")
+def test_columns_are_judged_in_the_time_of_the_plant(settings: dict[str, Any], tmp_path: Path) -> None:
+    write_thesis(tmp_path / "a.npz")
+    described = ImportDescription(NEWTON, METRE, **settings)
+    recording, blind, out = (tmp_path / name for name in ("recording.npz", "blind.npz", "out"))
+    import_columns(tmp_path / "a.npz", described, Scenario.load("thesis")).save(recording)
+    import_columns(tmp_path / "a.npz", described, None).save(blind)
+    for options in ([str(recording)], [str(blind), "--scenario", "thesis"]):
+        assert main(["replay", *options, "--dut", "inproc", "--out", str(out)]) == 0
+        run = Run.load(out / "run.npz")
+        verdict = judge(run)
+        assert run.conditions.time_scale == 200.0
+        assert run.conditions.sample_period_problem_s == pytest.approx(0.01)
+        assert all(tweak.bound_n is not None for tweak in verdict.tweaks)
+        error = verdict.estimates[0].error
+        assert error and all(abs(each) < 0.1 for each in error.values())
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_data_that_show_no_change_of_the_scenario_prove_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_thesis(tmp_path / "a.npz")
+    tiny, recording = ImportedColumn("u", "N", scale=1e-6), tmp_path / "recording.npz"
+    described = ImportDescription(tiny, METRE, rate_hz=100.0, clock="plant")
+    import_columns(tmp_path / "a.npz", described, Scenario.load("thesis")).save(recording)
+    assert main(["replay", str(recording), "--dut", "inproc", "--out", str(tmp_path / "out")]) == 3
+    assert UNDETECTABLE in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("output", "complaint"),
+    [
+        (ImportedColumn("y"), "displacement of program front is in m, displacement of the recording in V: import it"),
+        (ImportedColumn("y", "mm"), "in mm: import it with --output-unit m, and --output-scale m per number in its"),
+    ],
+)
+@pytest.mark.usefixtures("in_this_process")
+def test_a_column_in_another_unit_than_the_scenario_is_refused(
+    output: ImportedColumn, complaint: str, tmp_path: Path
+) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals())
+    described, scenario = description(input=NEWTON, output=output), Scenario.load("thesis")
+    with pytest.raises(ConfigurationError, match=complaint):
+        import_columns(tmp_path / "a.npz", described, scenario)
+    with pytest.raises(ConfigurationError, match=complaint):
+        replace_scenario(import_columns(tmp_path / "a.npz", described, None), scenario)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_rate_that_no_machine_has_is_refused(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals())
+    described = description(input=NEWTON, output=METRE, rate_hz=1e8, clock="plant")
+    with pytest.raises(ConfigurationError, match=r"2e\+10 samples per second of the machine, more than 1e\+09"):
+        import_columns(tmp_path / "a.npz", described, Scenario.load("thesis"))
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_the_clock_of_a_faster_machine_must_be_stated(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals())
+    described, scenario = description(input=NEWTON, output=METRE), Scenario.load("thesis")
+    complaint = "program front: the machine runs at 200 times the speed of the plant: import the recording with --clock"
+    with pytest.raises(ConfigurationError, match=complaint):
+        import_columns(tmp_path / "a.npz", described, scenario)
+    with pytest.raises(ConfigurationError, match=complaint):
+        replace_scenario(import_columns(tmp_path / "a.npz", described, None), scenario)
+
+
 @pytest.mark.usefixtures("in_this_process")
 def test_a_recording_longer_than_its_scenario_is_refused(tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", *made_signals(2000))
@@ -442,6 +526,7 @@ def test_fields_of_structured_arrays_are_columns(tmp_path: Path) -> None:
 DEEP = "[" * 2000 + "]" * 2000
 
 BAD_SETTINGS = {
+    "clock": ('clock = "wall"', [], "clock: must be one of 'plant', 'machine'"),
     "deep toml": (f"rate_hz = {DEEP}", [], "nested deeper than 32 levels"),
     "unknown key": ("speed = 3", [], "unknown key 'speed'"),
     "table": ("input = 3", [], "must be a table"),

@@ -44,6 +44,12 @@ def add(commands: Any) -> None:
         )
     command.add_argument("--rate", type=float, metavar="HZ", help="sample rate (default: that of the file)")
     command.add_argument("--time", metavar="COLUMN", help="column of the instants in seconds, instead of --rate")
+    command.add_argument(
+        "--clock",
+        choices=("plant", "machine"),
+        help="clock of --rate and --time: that of the plant, or of a machine that plays it faster; needed with a"
+        " scenario whose program has a speed other than 1",
+    )
     command.add_argument("--bits", type=int, metavar="N", help="bits of the converter (default: 16)")
     command.add_argument("--first", type=int, metavar="N", help="first row (default: 0)")
     command.add_argument("--samples", type=int, metavar="N", help="number of rows (default: all)")
@@ -103,7 +109,7 @@ def _table(arguments: argparse.Namespace) -> dict[str, Any]:
 
     table = read_toml(arguments.map) if arguments.map else {}
     given = {"rate_hz": arguments.rate} | {
-        name: getattr(arguments, name) for name in ("time", "bits", "first", "samples", "skip_lines")
+        name: getattr(arguments, name) for name in ("time", "clock", "bits", "first", "samples", "skip_lines")
     }
     table |= {name: value for name, value in given.items() if value is not None}
     for side in _SIDES:
@@ -134,6 +140,7 @@ def _as_json(run: Run, arguments: argparse.Namespace) -> dict[str, Any]:
         "samples": run.samples,
         "missing": int(run.missing.sum()),
         "rate_hz": 1.0 / conditions.sample_period_s,
+        "plant_rate_hz": 1.0 / conditions.sample_period_problem_s,
         "channels": {name: vars(channel) for name, channel in conditions.channels.items()},
         "truth": bool(conditions.segments),
         "caveats": _caveats(run),
@@ -159,8 +166,10 @@ def _caveats(run: Run) -> list[str]:
 
 def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
     conditions = run.conditions
-    rate_hz = 1.0 / conditions.sample_period_s
-    lines = [f"{arguments.out}: {run.samples} samples at {rate_hz:.6g} Hz, {int(run.missing.sum())} of them missing"]
+    rate = f"{1.0 / conditions.sample_period_s:.6g} Hz"
+    if conditions.time_scale != 1.0:
+        rate += f" of the machine, {1.0 / conditions.sample_period_problem_s:.6g} Hz of the plant"
+    lines = [f"{arguments.out}: {run.samples} samples at {rate}, {int(run.missing.sum())} of them missing"]
     for name, channel in conditions.channels.items():
         high = channel.low_v + channel.codes * channel.lsb_v
         low, high = (volts * channel.unit_per_v for volts in (channel.low_v, high))

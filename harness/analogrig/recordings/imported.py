@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,9 @@ from analogrig import config
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import MAX_SAMPLES, Segment
 from analogrig.program import Program
+from analogrig.recordings.capture import scaled_to_program
 from analogrig.recordings.columns import ColumnFile, read_columns
-from analogrig.run import Channel, Conditions, Run
+from analogrig.run import IMPORTED, Channel, Conditions, Run
 from analogrig.scenario import DEFAULT_PROGRAM, Scenario
 from analogrig.wording import number_of
 from analogrig_emulator import Excitation
@@ -26,9 +27,6 @@ if TYPE_CHECKING:
 
 UNSEEN = "no device has seen these samples: pass the recording to analogrig replay"
 """Fault of a recording that was imported and not played."""
-
-KIND = "import"
-"""Kind in the rig's table of an imported recording."""
 
 LEAST_BITS, MOST_BITS = 2, 16
 
@@ -74,6 +72,11 @@ class ImportDescription:
     """Sample rate; None: that of ``time``, or the one that the file states."""
     time: str = ""
     """Column of the sample instants in seconds; they must be evenly spaced."""
+    clock: Literal["plant", "machine"] | None = None
+    """Clock of the rate and the instants: the plant's, or that of a machine that plays a program at its speed.
+
+    None: not stated; only a program with speed 1 can then be compared with the data.
+    """
     bits: int = MOST_BITS
     """Resolution of the converter."""
     first: int = 0
@@ -115,7 +118,7 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
 
     :param scenario: the truth about plant and changes; None: unknown.
     :raises RecordingError: the file cannot be read, or its columns give no samples.
-    :raises ConfigurationError: the recording is longer than the scenario.
+    :raises ConfigurationError: the recording is longer than the scenario, or in other units than its program.
     """
     found = read_columns(path, described.columns, described.skip_lines)
     rows = slice(described.first, None if described.samples is None else described.first + described.samples)
@@ -140,10 +143,11 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         if clipped[:, at].all():
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range")
     rate_hz = _rate_hz(path, described, columns, found)
-    rig = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), **dataclasses.asdict(described)}
+    rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
     rig["blank_lines"] = found.blank_lines
     truth = _truth(path, samples, 1.0 / rate_hz, scenario)
-    return unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
+    run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
+    return run if scenario is None else dataclasses.replace(run, conditions=scaled_to_program(run.conditions))
 
 
 def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scenario) -> Run:
@@ -172,7 +176,8 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
         raise RecordingError(f"{path}: has codes that rig {rig.description()['name']} does not have: name its rig")
     if not np.isin(clipped, (0.0, 1.0)).all():
         raise RecordingError(f"{path}: a flag of a clipped sample is neither 0 nor 1")
-    description = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), "rig": dict(rig.description())}
+    description: dict[str, Any] = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path)}
+    description["rig"] = dict(rig.description())
     return unanswered(
         codes.astype(np.uint16),
         clipped.astype(np.bool_),
@@ -290,7 +295,7 @@ def unanswered(
             segments=segments,
             scenario=scenario.as_table(),
             rig=rig,
-            dut={"name": "none", "kind": KIND, "datasheet": {"alarms": False}},
+            dut={"name": "none", "kind": IMPORTED, "datasheet": {"alarms": False}},
             link="none",
             faults=(UNSEEN,),
             program=scenario.program,
