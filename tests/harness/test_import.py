@@ -536,7 +536,8 @@ BAD_SETTINGS = {
     "rate": ("rate_hz = nan", [], "rate_hz"),
     "rate twice": ('rate_hz = 1.0\ntime = "t"', [], "state the rate twice"),
     "unit": ('[input]\ncolumn = "u"\nunit = "a\\nb"', [], "unit must be"),
-    "scale": ("", ["--input-scale", "0"], "scale must be within"),
+    "scale": ("", ["--input-scale", "0"], "scale must have a magnitude between 1e-9 and 1e9, not 0"),
+    "all beyond": ("", ["--input-range", "50", "60", "--rate", "1"], "column u: no value lies within its range: give"),
     "first": ("", ["--first", "-3"], "must not be negative"),
     "beyond": ("", ["--first", "700", "--rate", "1"], "has no row 700"),
     "too many": ("", ["--samples", "700", "--rate", "1"], "has 600 rows from row 0 on, not 700"),
@@ -607,6 +608,14 @@ def test_codes_that_the_rig_lacks_are_refused(tmp_path: Path, capsys: pytest.Cap
         (tmp_path / "a.csv").write_text(f"sample,{names}\n0,{code},1,1,1,0,0,0,0\n")
         assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
         assert complaint in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_signals_without_a_sample_of_a_channel_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ",".join(f"{name}_{kind}" for kind in ("code", "clipped") for name in CHANNELS)
+    (tmp_path / "a.csv").write_text(f"sample,{names}\n0,1,1,1,1,0,1,0,0\n1,2,2,2,2,0,1,0,0\n")
+    assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
+    assert capsys.readouterr().err == f"analogrig: {tmp_path}/a.csv: every sample of displacement is clipped\n"
 
 
 def test_signals_of_another_program_need_its_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

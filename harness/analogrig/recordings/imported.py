@@ -57,7 +57,7 @@ class ImportedColumn:
         if not self.unit or len(self.unit) > 20 or not self.unit.isprintable():
             raise ValueError(f"unit must be 1 to 20 printable characters, not {self.unit[:40]!r}")
         if not 1e-9 < abs(self.scale) < 1e9:
-            raise ValueError(f"scale must be within +-1e9 and not 0, not {self.scale:g}")
+            raise ValueError(f"scale must have a magnitude between 1e-9 and 1e9, not {self.scale:g}")
         if self.range is not None and not self.range[0] < self.range[1]:
             raise ValueError(f"range must ascend, not [{self.range[0]:g}, {self.range[1]:g}]")
 
@@ -141,7 +141,7 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         channels[name] = _channel(path, each, described.bits, values)
         codes[:, at], clipped[:, at] = _converted(values, channels[name], is_ranged=each.range is not None)
         if clipped[:, at].all():
-            raise RecordingError(f"{path}: column {each.column}: no value lies within its range")
+            raise RecordingError(f"{path}: column {each.column}: no value lies within its range: give a wider range")
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
     rig["blank_lines"] = found.blank_lines
@@ -176,6 +176,9 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
         raise RecordingError(f"{path}: has codes that rig {rig.description()['name']} does not have: name its rig")
     if not np.isin(clipped, (0.0, 1.0)).all():
         raise RecordingError(f"{path}: a flag of a clipped sample is neither 0 nor 1")
+    for name in played.program.measured:
+        if clipped[:, names.index(name)].all():
+            raise RecordingError(f"{path}: every sample of {name} is clipped")
     description: dict[str, Any] = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path)}
     description["rig"] = dict(rig.description())
     return unanswered(
