@@ -1,7 +1,8 @@
 """Trial play of a program: its equations under square waves, for the range of every quantity.
 
 The inputs switch between their trial levels, the first with the program's period, each further one with twice the
-period of the one before. The parameters take their values, then each in turn the ends of its range.
+period of the one before: every combination of levels occurs. The parameters take their values, then each in turn the
+ends of its range.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.program_file import Equations
 from analogrig_emulator.machine.stages import StageKind, Stages
 
-_HALF_PERIODS = 4
+_MOST_INPUTS = 4
+_GROWTH_HALVES = 4
+"""Half periods in which the growth of a state is measured."""
+
 _POINTS = 200
 """Instants per half period at which quantities are taken."""
 
@@ -89,7 +93,7 @@ def _played(
     levels = _levels(equations)
     state = np.zeros((len(equations.states), len(every)))
     stretches = []
-    for half in range(_HALF_PERIODS):
+    for half in range(_half_periods(equations)):
         known = parameters | {name: each[half] for name, each in levels.items()}
         stretch = solve(slopes, known, state, instants_s)
         state = stretch[-1]
@@ -99,9 +103,20 @@ def _played(
     return inputs, np.concatenate(stretches)
 
 
+def _half_periods(equations: Equations) -> int:
+    """Half periods with every combination of levels. Raises ProgramError for too many inputs."""
+    count = len(equations.inputs)
+    if count > _MOST_INPUTS:
+        raise ProgramError(
+            f"inputs: {count} of them; the trial play combines the levels of at most {_MOST_INPUTS}: make the others"
+            " parameters"
+        )
+    return max(2**count, _GROWTH_HALVES)
+
+
 def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:
     """Level of each input in each half period."""
-    halves = np.arange(_HALF_PERIODS)
+    halves = np.arange(_half_periods(equations))
     return {
         name: np.array(quantity.trial)[1 - (halves >> place) % 2]
         for place, (name, quantity) in enumerate(equations.inputs.items())
@@ -115,7 +130,7 @@ def _check_bounded(
     peaks = np.array([np.abs(stretch).max(axis=0) for stretch in stretches])  # (halves, states, settings)
     with np.errstate(all="ignore"):
         grows = ~(peaks[-1] < _LARGEST)
-        if len(peaks) == _HALF_PERIODS:
+        if len(peaks) == _GROWTH_HALVES:
             grows |= peaks[-1] > _MOST_GROWTH * peaks[1]
     if not grows.any():
         return
