@@ -100,14 +100,14 @@ def _fit(
     ]
     if check and checked:
         lines.append(f"samples {check[1].first} to {check[1].end - 1}, not fitted: {_words(checked, unit)}")
-    lines += [_reconstruction_line(twin, unit), *_caveats(twin)]
+    lines += [_reconstruction_line(twin, unit), *_caveats(twin), *_diagram_lines(plant, arguments.out)]
     lines += _settling_lines(twin.fit, checked, _settling_n(arguments))
     if is_twin:
         with replace_file(arguments.out) as out:
             out.write(_program_toml(file, twin.values, lines, arguments).encode("utf-8"))
     if arguments.json:
         table = {"program": str(file), "unit": unit, "plays": twin.plays}
-        table |= {"recording": arguments.recording and str(arguments.recording), "rig": arguments.rig}
+        table |= {"recording": arguments.recording and str(arguments.recording), "rig": None if arguments.recording else arguments.rig}
         table |= {"parameters": [vars(each) for each in twin.estimates], "fit": vars(twin.fit)}
         table |= {"reconstruction": twin.reconstruction, "other_rms": twin.other_rms}
         table |= {"output_rms": twin.output_rms}
@@ -160,6 +160,13 @@ def _caveats(twin: ProgramTwin) -> list[str]:
             " another excitation or output"
         )
     return lines
+
+
+def _diagram_lines(plant: RecordedPlant, out: Path) -> list[str]:
+    diagram = plant.program.equations.diagram
+    if not diagram:
+        return []
+    return [f"note: fitted with the patch of the equations; a run of {out} plays the diagram {diagram}"]
 
 
 def _settling_lines(fit: Residual, checked: Residual | None, settling_n: int) -> list[str]:
