@@ -29,7 +29,10 @@ _MOST_EVALUATIONS = 20_000
 _TOLERANCE = 1e-5
 _LARGEST = 1e30
 _MOST_GROWTH = 100.0
-"""Largest peak in the second period, in that of the first: four integrators in series grow 16 times."""
+"""Largest peak in the second period, in that of the first: four integrators in series grow 16 times.
+
+The end of a long chain of lags grows more; it stays below the first peak of the states before it.
+"""
 _States = NDArray[np.float64]
 """(states, settings)"""
 
@@ -131,7 +134,7 @@ def _check_bounded(
     with np.errstate(all="ignore"):
         grows = ~(peaks[-1] < _LARGEST)
         if len(peaks) == _GROWTH_HALVES:
-            grows |= peaks[-1] > _MOST_GROWTH * peaks[1]
+            grows |= (peaks[-1] > _MOST_GROWTH * peaks[1]) & (peaks[-1] > peaks[1].max(axis=0))
     if not grows.any():
         return
     at, place = (int(each[0]) for each in np.nonzero(grows))
