@@ -249,6 +249,31 @@ states.y = {{ full = 12.0 }}
     assert all((found[name].low, found[name].high) == (-10.0, 1.0) for name in names)
 
 
+@pytest.mark.parametrize(
+    ("equations", "is_stable"),
+    [("v' = u\nx' = v", True), ("v' = u - x\nx' = v", True), ("v' = u - x + 0.01*v\nx' = v", False)],
+)
+def test_a_slow_growth_is_refused_and_an_integrator_is_not(equations: str, is_stable: bool) -> None:  # noqa: FBT001
+    text = f"""
+name = "slow"
+speed = 1
+period_s = 1.0
+channels = ["u", "x"]
+equations = '''
+{equations}
+'''
+inputs.u = {{ full = 10.0 }}
+states.v = {{ full = 100.0 }}
+states.x = {{ full = 100.0 }}
+"""
+    stages = stages_of(parse_program(text, "slow.toml"))
+    if is_stable:
+        assert reaches(stages)["x"].peak > 1.0
+        return
+    with pytest.raises(ProgramError, match=r"the trial play grows without end: state [vx] reaches .* is unstable"):
+        reaches(stages)
+
+
 def test_plan_adds_up_changes_of_parameters_that_share_a_pot() -> None:
     battery = SuspensionComputer(program_of("rc-battery"), opamp="ideal")
     first, second = battery.plan([PotTurn(5, {"R1": 0.01}), PotTurn(9, {"C1": 1000.0})], 20)

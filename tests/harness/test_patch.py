@@ -62,7 +62,11 @@ def test_json_has_scales_and_dials(capsys: pytest.CaptureFixture[str]) -> None:
     [
         ("name = 3", [], "bad.toml: "),
         (MOTOR.read_text().replace("k*omega", "k*omga"), [], "bad.toml: equations, line 1: unknown name 'omga'; did"),
-        (MOTOR.read_text(), ["--netlist", "motor.cir", "--machine", "that"], "--netlist: there is no deck of THE ANALOG"),
+        (
+            MOTOR.read_text(),
+            ["--netlist", "motor.cir", "--machine", "that"],
+            "--netlist: there is no deck of THE ANALOG",
+        ),
         (MOTOR.read_text(), ["--drawing", "motor.png"], "motor.png: the file's name must end with .svg"),
     ],
 )

@@ -19,8 +19,7 @@ from analogrig_emulator.machine.program_file import Equations
 from analogrig_emulator.machine.stages import StageKind, Stages
 
 _MOST_INPUTS = 4
-_GROWTH_HALVES = 4
-"""Half periods in which the growth of a state is measured."""
+_LEAST_HALVES = 4
 
 _POINTS = 200
 """Instants per half period at which quantities are taken."""
@@ -28,11 +27,8 @@ _POINTS = 200
 _MOST_EVALUATIONS = 20_000
 _TOLERANCE = 1e-5
 _LARGEST = 1e30
-_MOST_GROWTH = 100.0
-"""Largest peak in the second period, in that of the first: four integrators in series grow 16 times.
-
-The end of a long chain of lags grows more; it stays below the first peak of the states before it.
-"""
+_LEAST_GROWTH = 1e-6
+"""Least real part of a growing mode, in magnitudes of the fastest one: less may be the rounding of an integrator."""
 _States = NDArray[np.float64]
 """(states, settings)"""
 
@@ -95,13 +91,18 @@ def _played(
     parameters = {name: np.array([values[name] for values in every]) for name in equations.parameters}
     levels = _levels(equations)
     state = np.zeros((len(equations.states), len(every)))
-    stretches = []
+    stretches: list[NDArray[np.float64]] = []
     for half in range(_half_periods(equations)):
         known = parameters | {name: each[half] for name, each in levels.items()}
         stretch = solve(slopes, known, state, instants_s)
         state = stretch[-1]
         stretches.append(stretch)
-        _check_bounded(equations, every, stretches)
+        _check_bounded(equations, every, stretches, ~(np.abs(state) < _LARGEST))
+    if stages.is_linear:
+        first = {name: each[0] for name, each in levels.items()}
+        is_unstable = _is_unstable(_system(slopes, parameters | first, state))
+        growth = np.abs(stretches[-1]).max(axis=0) / np.maximum(np.abs(stretches[1]).max(axis=0), 1.0 / _LARGEST)
+        _check_bounded(equations, every, stretches, is_unstable & (growth == growth.max(axis=0)))
     inputs = {name: np.repeat(each, _POINTS) for name, each in levels.items()}
     return inputs, np.concatenate(stretches)
 
@@ -114,7 +115,7 @@ def _half_periods(equations: Equations) -> int:
             f"inputs: {count} of them; the trial play combines the levels of at most {_MOST_INPUTS}: make the others"
             " parameters"
         )
-    return max(2**count, _GROWTH_HALVES)
+    return max(2**count, _LEAST_HALVES)
 
 
 def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:
@@ -126,15 +127,19 @@ def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:
     }
 
 
+def _is_unstable(system: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """True for each setting with a growing mode, (settings,); integrators have none."""
+    modes = np.linalg.eigvals(system[:, :-1, :-1])
+    return np.asarray(modes.real.max(axis=1) > _LEAST_GROWTH * np.abs(modes).max(axis=1))
+
+
 def _check_bounded(
-    equations: Equations, every: Sequence[Mapping[str, float]], stretches: Sequence[NDArray[np.float64]]
+    equations: Equations,
+    every: Sequence[Mapping[str, float]],
+    stretches: Sequence[NDArray[np.float64]],
+    grows: NDArray[np.bool_],
 ) -> None:
-    """Raise ProgramError for a state that overflows, or peaks far higher in each period than in the one before."""
-    peaks = np.array([np.abs(stretch).max(axis=0) for stretch in stretches])  # (halves, states, settings)
-    with np.errstate(all="ignore"):
-        grows = ~(peaks[-1] < _LARGEST)
-        if len(peaks) == _GROWTH_HALVES:
-            grows |= (peaks[-1] > _MOST_GROWTH * peaks[1]) & (peaks[-1] > peaks[1].max(axis=0))
+    """Raise ProgramError if a state grows without end, (states, settings)."""
     if not grows.any():
         return
     at, place = (int(each[0]) for each in np.nonzero(grows))
@@ -188,12 +193,8 @@ def _check_domains(stages: Stages, found: Mapping[str, Reach]) -> None:
 _Slopes = Callable[[Mapping[str, Any], _States], _States]
 
 
-def _solved_linear(
-    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Exact solution by matrix exponentials, for equal steps: (instants, states, settings)."""
-    from scipy.linalg import expm
-
+def _system(slopes: _Slopes, known: Mapping[str, Any], state: _States) -> NDArray[np.float64]:
+    """Matrices (settings, n + 1, n + 1) of linear equations, for the states and 1."""
     n, count = state.shape
     constant = slopes(known, np.zeros_like(state))
     system = np.zeros((count, n + 1, n + 1))
@@ -204,6 +205,17 @@ def _solved_linear(
         system[:, :n, i] = (slopes(known, unit) - constant).T
     if not np.isfinite(system).all():
         raise ProgramError("trial play: a coefficient is not finite; change a value or range of a parameter")
+    return system
+
+
+def _solved_linear(
+    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Exact solution by matrix exponentials, for equal steps: (instants, states, settings)."""
+    from scipy.linalg import expm
+
+    n, count = state.shape
+    system = _system(slopes, known, state)
     step = expm(system * (instants_s[1] - instants_s[0]))
     rows = [np.concatenate((state, np.ones((1, count))))]
     for _ in instants_s[1:]:

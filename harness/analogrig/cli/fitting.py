@@ -107,7 +107,10 @@ def _fit(
             out.write(_program_toml(file, twin.values, lines, arguments).encode("utf-8"))
     if arguments.json:
         table = {"program": str(file), "unit": unit, "plays": twin.plays}
-        table |= {"recording": arguments.recording and str(arguments.recording), "rig": None if arguments.recording else arguments.rig}
+        table |= {
+            "recording": arguments.recording and str(arguments.recording),
+            "rig": None if arguments.recording else arguments.rig,
+        }
         table |= {"parameters": [vars(each) for each in twin.estimates], "fit": vars(twin.fit)}
         table |= {"reconstruction": twin.reconstruction, "other_rms": twin.other_rms}
         table |= {"output_rms": twin.output_rms}

@@ -36,7 +36,9 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--drawing", type=Path, metavar=FILE, help="drawing of the patch on that machine, an .svg file"
     )
-    command.add_argument("--netlist", type=Path, metavar=FILE, help="SPICE deck of the own machine's patch, for ngspice")
+    command.add_argument(
+        "--netlist", type=Path, metavar=FILE, help="SPICE deck of the own machine's patch, for ngspice"
+    )
     add_json(command)
     command.set_defaults(command=_patch)
 
