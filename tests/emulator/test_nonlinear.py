@@ -401,7 +401,7 @@ def test_a_deck_without_a_term_of_a_multiplier_is_refused() -> None:
         def product(self, scale_v: float, element: str = "") -> Product:
             return Product((0.0, 1.0 / scale_v, 1e-3), (0.0, 1.0), element)
 
-    with pytest.raises(CircuitError, match="multiplier M1: the deck has no term of power 2 of its x input"):
+    with pytest.raises(CircuitError, match="multiplier M1: the deck has no power 2 of its x input"):
         Deck(duffing(multiplier=Bent()), samples=2, edges={"F": square(2, 8.0)}).text()
 
 

@@ -65,7 +65,7 @@ def test_json_has_scales_and_dials(capsys: pytest.CaptureFixture[str]) -> None:
         (
             MOTOR.read_text(),
             ["--netlist", "motor.cir", "--machine", "that"],
-            "--netlist: there is no deck of THE ANALOG",
+            "--netlist: there is no deck of",
         ),
         (MOTOR.read_text(), ["--drawing", "motor.png"], "motor.png: the file's name must end with .svg"),
     ],

@@ -115,7 +115,7 @@ def _half_periods(equations: Equations) -> int:
             f"inputs: {count} of them; the trial play combines the levels of at most {_MOST_INPUTS}: make the others"
             " parameters"
         )
-    return max(2**count, _LEAST_HALVES)
+    return max(1 << count, _LEAST_HALVES)
 
 
 def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:

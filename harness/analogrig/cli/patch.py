@@ -45,7 +45,6 @@ def add(commands: Any) -> None:
 
 def _patch(arguments: argparse.Namespace) -> int:
     from analogrig.config import locate
-    from analogrig.errors import ConfigurationError
     from analogrig.output import move_aside
     from analogrig.program import Program
     from analogrig.rigs.emulator import emulator_errors
@@ -56,12 +55,7 @@ def _patch(arguments: argparse.Namespace) -> int:
     from analogrig_emulator.machine.sheet import dials, scaling_sheet
     from analogrig_emulator.machine.that_drawing import that_drawing
 
-    if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
-        raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
-    if arguments.drawing is not None and arguments.drawing == arguments.netlist:
-        raise ConfigurationError(f"{arguments.drawing}: named for the drawing and for the netlist: name two files")
-    if arguments.netlist is not None and arguments.machine == "that":
-        raise ConfigurationError("--netlist: there is no deck of THE ANALOG THING: leave out --machine that")
+    _check_options(arguments)
     wanted = [path for path in (arguments.drawing, arguments.netlist) if path is not None]
     file = locate("programs", arguments.program)
     for path in wanted:
@@ -89,6 +83,18 @@ def _patch(arguments: argparse.Namespace) -> int:
         for path in wanted:
             show(f"written: {path}")
     return PASSED
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """:raises ConfigurationError: the options exclude each other, or name a wrong file."""
+    from analogrig.errors import ConfigurationError
+
+    if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
+        raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
+    if arguments.drawing is not None and arguments.drawing == arguments.netlist:
+        raise ConfigurationError(f"{arguments.drawing}: named for the drawing and for the netlist: name two files")
+    if arguments.netlist is not None and arguments.machine == "that":
+        raise ConfigurationError("--netlist: there is no deck of THE ANALOG THING: leave out --machine that")
 
 
 def _that_sheet(program: PatchedProgram) -> ThatSheet:
