@@ -91,7 +91,10 @@ _OPTIONAL_ARRAYS = _DIAGNOSIS_ARRAYS | _MISFIT_ARRAYS
 
 @dataclass(frozen=True)
 class Channel:
-    """Scale of one channel: volts = low_v + code * lsb_v, physical = volts * unit_per_v."""
+    """Scale of one channel: volts = low_v + code * lsb_v, physical = volts * unit_per_v.
+
+    Imported columns have no volts at a rig: unit_per_v is 1, and low_v and lsb_v are in ``unit``.
+    """
 
     low_v: float
     lsb_v: float

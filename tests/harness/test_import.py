@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.judging.courses import first_at_level
+from analogrig.judging.information import change_information
 from analogrig.judging.verdict import UNDETECTABLE, judge
 from analogrig.recordings import column_reader, columns, replace_scenario
 from analogrig.recordings.columns import read_columns
@@ -264,6 +266,11 @@ def write_thesis(path: Path) -> None:
     np.savez(path, u=u, y=y, t=np.arange(len(u)) * played.sample_period_s)
 
 
+def information_bounds(run: Run) -> list[int]:
+    """Samples to an information of 10; SAMPLES where it is not reached."""
+    return [first_at_level(each, 10.0) or SAMPLES for each in change_information(run)]
+
+
 NEWTON, METRE = ImportedColumn("u", "N"), ImportedColumn("y", "m")
 
 
@@ -284,6 +291,20 @@ def test_columns_are_judged_in_the_time_of_the_plant(settings: dict[str, Any], t
         assert all(tweak.bound_n is not None for tweak in verdict.tweaks)
         error = verdict.estimates[0].error
         assert error and all(abs(each) < 0.1 for each in error.values())
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_the_noise_of_a_column_makes_the_bounds_longer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_thesis(tmp_path / "a.npz")
+    command = ["import", str(tmp_path / "a.npz"), "--input", "u", "--input-unit", "N", "--output", "y"]
+    command += ["--output-unit", "m", "--rate", "100", "--clock", "plant", "--scenario", "thesis"]
+    bounds = {}
+    for noise in ("1e-4", "4e-4", ""):
+        out = tmp_path / f"noise{noise}.npz"
+        assert main([*command, *(["--output-noise", noise] if noise else []), "--out", str(out)]) == 0
+        assert ("caveat: no noise of the output is stated" in capsys.readouterr().out) == (not noise)
+        bounds[noise] = information_bounds(Run.load(out))
+    assert sum(bounds[""]) < sum(bounds["1e-4"]) < sum(bounds["4e-4"])
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -538,6 +559,8 @@ BAD_SETTINGS = {
     "unit": ('[input]\ncolumn = "u"\nunit = "a\\nb"', [], "unit must be"),
     "scale": ("", ["--input-scale", "0"], "scale must have a magnitude between 1e-9 and 1e9, not 0"),
     "all beyond": ("", ["--input-range", "50", "60", "--rate", "1"], "column u: no value lies within its range: give"),
+    "noise": ("", ["--output-noise", "-1"], "noise must be 0 to 1e+08, not -1"),
+    "vast noise": ("", ["--output-noise", "1e7", "--rate", "1"], "noise 1e+07 is far larger than its values"),
     "first": ("", ["--first", "-3"], "must not be negative"),
     "beyond": ("", ["--first", "700", "--rate", "1"], "has no row 700"),
     "too many": ("", ["--samples", "700", "--rate", "1"], "has 600 rows from row 0 on, not 700"),

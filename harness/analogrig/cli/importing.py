@@ -42,6 +42,9 @@ def add(commands: Any) -> None:
             metavar=("LOW", "HIGH"),
             help="range of its converter in units (default: one that holds all values)",
         )
+        command.add_argument(
+            f"--{side}-noise", type=float, metavar="X", help="its noise, rms in units (default: unknown)"
+        )
     command.add_argument("--rate", type=float, metavar="HZ", help="sample rate (default: that of the file)")
     command.add_argument("--time", metavar="COLUMN", help="column of the instants in seconds, instead of --rate")
     command.add_argument(
@@ -113,7 +116,7 @@ def _table(arguments: argparse.Namespace) -> dict[str, Any]:
     }
     table |= {name: value for name, value in given.items() if value is not None}
     for side in _SIDES:
-        names = {"column": side, **{name: f"{side}_{name}" for name in ("unit", "scale", "range")}}
+        names = {"column": side, **{name: f"{side}_{name}" for name in ("unit", "scale", "range", "noise")}}
         found = {key: value for key, name in names.items() if (value := getattr(arguments, name)) is not None}
         if found:
             own = table.get(side, {})
@@ -159,6 +162,8 @@ def _caveats(run: Run) -> list[str]:
         for name in run.conditions.program.measured
         if np.ptp(run.codes[~run.clipped[:, names.index(name)], names.index(name)]) == 0
     ]
+    if len(run.conditions.segments) > 1 and not run.conditions.output.noise_lsb:
+        lines.append("caveat: no noise of the output is stated: bounds count quantisation alone; pass --output-noise")
     if blank := run.conditions.rig.get("blank_lines"):
         lines.append(f"caveat: {number_of(blank, 'blank line')} between rows skipped: check that no sample is missing")
     return lines

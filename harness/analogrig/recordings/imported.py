@@ -50,6 +50,8 @@ class ImportedColumn:
 
     None: the range is symmetrical and holds all values.
     """
+    noise: float = 0.0
+    """Noise of the values before quantisation, rms in ``unit``; 0: unknown."""
 
     def __post_init__(self) -> None:
         if not self.column:
@@ -60,6 +62,8 @@ class ImportedColumn:
             raise ValueError(f"scale must have a magnitude between 1e-9 and 1e9, not {self.scale:g}")
         if self.range is not None and not self.range[0] < self.range[1]:
             raise ValueError(f"range must ascend, not [{self.range[0]:g}, {self.range[1]:g}]")
+        if not 0.0 <= self.noise < _MOST_MAGNITUDE:
+            raise ValueError(f"noise must be 0 to {_MOST_MAGNITUDE:g}, not {self.noise:g}")
 
 
 @dataclass(frozen=True)
@@ -212,7 +216,10 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
         raise RecordingError(
             f"{where}: {what}: a range must be wider than {_LEAST_WIDTH:g} and within +-{_MOST_MAGNITUDE:g}; scale it"
         )
-    return Channel(low, (high - low) / codes, described.unit, 1.0, 0.0, codes)
+    lsb = (high - low) / codes
+    if not (noise_lsb := described.noise / lsb) < _MOST_MAGNITUDE:
+        raise RecordingError(f"{where}: noise {described.noise:g} is far larger than its values: state it in the unit")
+    return Channel(low, lsb, described.unit, 1.0, noise_lsb, codes)
 
 
 def _converted(
