@@ -23,7 +23,7 @@ from analogrig.judging.information import change_information
 from analogrig.judging.verdict import UNDETECTABLE, judge
 from analogrig.recordings import column_reader, columns, replace_scenario
 from analogrig.recordings.columns import read_columns
-from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
+from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns, unit_in_name
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -439,6 +439,12 @@ BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     "two of one name": ("a.csv", b"u,u,y\n1,2,3\n", "2 columns are called 'u'"),
     "word for a number": ("a.csv", b"u,y\n1,2\n3,four\n", "line 3, column y: 'four' is no number"),
     "number with an underscore": ("a.csv", b"u,y\n1,2\n3,1_0\n", "line 3, column y: '1_0' is no number"),
+    "full-width number": ("a.csv", "u,y\n1,2\n3,\uff14\n".encode(), "line 3, column y: '\uff14' is no number"),
+    "units under the header": (
+        "a.csv",
+        b"u,y\nV,mm\n1,2\n",
+        "line 2 holds no number, perhaps units: delete it, or pass --skip-lines 2 and name the columns 0, 1",
+    ),
     "short row": ("a.csv", b"u,y\n1,2\n3\n", "line 3, column y: the line has no such cell"),
     "decimal commas": ("a.csv", b"u,y\n0,5,1,5\n", "line 2 has 4 cells, the first line 2: cells with decimal commas"),
     "no number at all": ("a.csv", b"u,y\n1,\n2,\n", "column y: holds no number"),
@@ -533,6 +539,21 @@ def test_doubtful_data_are_imported_with_a_caveat(
     assert main(["import", str(tmp_path / "a.csv"), *named]) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")]
     assert len(told) == 1 and told[0].startswith(caveat)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert [unit_in_name(each) for each in ("x", "x[2]", "x [m/s^2]", "x(mm) ")] == ["", "", "m/s^2", "mm"]
+    (tmp_path / "a.csv").write_text("t [ms];F (N)\n0;1\n1;2\n2;4\n")
+    named = ["import", str(tmp_path / "a.csv"), "--input", "F (N)", "--output", "F (N)", "--input-unit", "N"]
+    named += ["--out", str(tmp_path / "out.npz")]
+    assert main([*named, "--time", "t [ms]"]) == 2
+    assert "column t [ms]: must be in seconds: pass --rate HZ" in capsys.readouterr().err
+    assert main([*named, "--rate", "1000"]) == 0
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")] == [
+        "caveat: column F (N) is imported in V: pass --output-unit, and --output-scale to convert",
+        "caveat: input and output are the same column",
+    ]
 
 
 @pytest.mark.usefixtures("in_this_process")

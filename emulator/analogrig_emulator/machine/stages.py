@@ -235,6 +235,10 @@ class _Builder:
         return {(((node.text, 1),), ()): 1.0}
 
     def _number(self, node: Formula) -> float:
+        for part in node.parts:
+            number = self._number(part)
+            if isinstance(node, FunctionCall) and node.function == "sqrt" and number < 0.0:
+                raise ProgramError(f"{self.place}: {node} is the root of a negative number")
         try:
             with np.errstate(all="ignore"):
                 number = float(node.law(self.equations.functions)({}))

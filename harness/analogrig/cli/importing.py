@@ -154,17 +154,26 @@ def _caveats(run: Run) -> list[str]:
     """Reasons to doubt a recording, one line each."""
     import numpy as np
 
+    from analogrig.recordings.imported import unit_in_name
     from analogrig.wording import number_of
 
-    names = run.conditions.program.channels
+    names, rig = run.conditions.program.channels, run.conditions.rig
     lines = [
         f"caveat: {name.replace('_', ' ')} is constant: no plant can be identified"
         for name in run.conditions.program.measured
         if np.ptp(run.codes[~run.clipped[:, names.index(name)], names.index(name)]) == 0
     ]
+    for side in _SIDES if "rig" not in rig else ():
+        column, unit, scale = (rig[side][key] for key in ("column", "unit", "scale"))
+        if scale == 1.0 and unit_in_name(column) not in ("", unit):
+            lines.append(
+                f"caveat: column {column} is imported in {unit}: pass --{side}-unit, and --{side}-scale to convert"
+            )
+    if "rig" not in rig and rig["input"]["column"] == rig["output"]["column"]:
+        lines.append("caveat: input and output are the same column")
     if len(run.conditions.segments) > 1 and not run.conditions.output.noise_lsb:
         lines.append("caveat: no noise of the output is stated: bounds count quantisation alone; pass --output-noise")
-    if blank := run.conditions.rig.get("blank_lines"):
+    if blank := rig.get("blank_lines"):
         lines.append(f"caveat: {number_of(blank, 'blank line')} between rows skipped: check that no sample is missing")
     return lines
 

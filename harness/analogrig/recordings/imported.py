@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,6 +108,12 @@ class ImportDescription:
     def columns(self) -> tuple[str, ...]:
         """Columns to read, each once."""
         return tuple(dict.fromkeys(name for name in (self.input.column, self.output.column, self.time) if name))
+
+
+def unit_in_name(column: str) -> str:
+    """Unit in brackets at the end of a column's name, such as mm of ``stroke [mm]``; empty without one."""
+    found = re.search(r"[\[(]([^\[\]()\d][^\[\]()]*)[\])]$", column.strip())  # x[2] is part of an array
+    return found[1].strip() if found else ""
 
 
 def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
@@ -244,6 +251,8 @@ def _rate_hz(
         if found.rate_hz is None:
             raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN")
         return found.rate_hz
+    if unit_in_name(described.time) not in ("", "s"):
+        raise RecordingError(f"{path}: column {described.time}: must be in seconds: pass --rate HZ")
     instants_s = columns[described.time]
     if len(instants_s) < 2 or not np.isfinite(instants_s).all():
         raise RecordingError(f"{path}: column {described.time}: instants are missing")
