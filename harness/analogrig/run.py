@@ -43,6 +43,9 @@ MAX_CODES = 1 << 16
 _LEAST_MAGNITUDE, _MOST_MAGNITUDE = 1e-12, 1e9
 """Limits of every plausible unit, time or noise, exclusive."""
 
+IMPORTED = "import"
+"""Kind, in the rig's description, of measured data that no device has seen."""
+
 INPUT, OUTPUT = 0, 1
 """Columns of the plant's input and output, which every rig measures and every device receives."""
 
@@ -88,7 +91,10 @@ _OPTIONAL_ARRAYS = _DIAGNOSIS_ARRAYS | _MISFIT_ARRAYS
 
 @dataclass(frozen=True)
 class Channel:
-    """Scale of one channel: volts = low_v + code * lsb_v, physical = volts * unit_per_v."""
+    """Scale of one channel: volts = low_v + code * lsb_v, physical = volts * unit_per_v.
+
+    Imported columns have no volts at a rig: unit_per_v is 1, and low_v and lsb_v are in ``unit``.
+    """
 
     low_v: float
     lsb_v: float

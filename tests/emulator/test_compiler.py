@@ -26,7 +26,8 @@ from analogrig_emulator.circuit.pot import dial_for
 from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.compiler import INPUT_OHM, MACHINE_V, PatchedProgram, compile_program
 from analogrig_emulator.machine.program_file import parse_program
-from analogrig_emulator.machine.trial import settings
+from analogrig_emulator.machine.stages import StageKind, stages_of
+from analogrig_emulator.machine.trial import reaches, settings
 from tests.emulator.ideal_patch import IdealPatch
 from tests.emulator.programs import FILES, program_of
 from tests.emulator.random_programs import random_program
@@ -212,6 +213,65 @@ def test_pot_of_two_parameters_keeps_the_other() -> None:
     once = SuspensionComputer(program_of("rc-battery"), opamp="ideal")
     once.set(R1=0.01, C1=1000.0)
     assert battery.coefficients == once.coefficients != before
+
+
+def test_sums_that_differ_in_the_sixth_digit_are_two_stages() -> None:
+    text = """
+name = "alike"
+speed = 100
+channels = ["u", "y"]
+equations = "y' = max(0, 1.0000050*u - y) - max(0, 1.0000149*u - y) - max(0, 1.0000050*u - y)*y"
+inputs.u = { full = 10.0 }
+states.y = { full = 10.0 }
+"""
+    stages = stages_of(parse_program(text, "alike.toml"))
+    sums = {stage.name: stage.cords[0].number for stage in stages.stages if stage.kind is StageKind.SUMMER}
+    assert sums == {"1.00001*u - y": 1.000005, "1.0000149*u - y": 1.0000149}
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_the_trial_play_combines_every_level_of_the_inputs(count: int) -> None:
+    names = [f"u{i}" for i in range(count)]
+    tables = "".join(f"inputs.{name} = {{ full = 10.0, trial = [-10.0, 1.0] }}\n" for name in names)
+    text = f"""
+name = "inputs"
+speed = 100
+channels = ["u0", "y"]
+equations = "y' = ({" + ".join(names)})/{count} - y"
+states.y = {{ full = 12.0 }}
+{tables}"""
+    stages = stages_of(parse_program(text, "inputs.toml"))
+    if count > 4:
+        with pytest.raises(ProgramError, match="inputs: 5 of them; the trial play combines the levels of at most 4"):
+            reaches(stages)
+        return
+    found = reaches(stages)
+    assert all((found[name].low, found[name].high) == (-10.0, 1.0) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("equations", "is_stable"),
+    [("v' = u\nx' = v", True), ("v' = u - x\nx' = v", True), ("v' = u - x + 0.01*v\nx' = v", False)],
+)
+def test_a_slow_growth_is_refused_and_an_integrator_is_not(equations: str, is_stable: bool) -> None:  # noqa: FBT001
+    text = f"""
+name = "slow"
+speed = 1
+period_s = 1.0
+channels = ["u", "x"]
+equations = '''
+{equations}
+'''
+inputs.u = {{ full = 10.0 }}
+states.v = {{ full = 100.0 }}
+states.x = {{ full = 100.0 }}
+"""
+    stages = stages_of(parse_program(text, "slow.toml"))
+    if is_stable:
+        assert reaches(stages)["x"].peak > 1.0
+        return
+    with pytest.raises(ProgramError, match=r"the trial play grows without end: state [vx] reaches .* is unstable"):
+        reaches(stages)
 
 
 def test_plan_adds_up_changes_of_parameters_that_share_a_pot() -> None:

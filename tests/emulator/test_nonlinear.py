@@ -40,6 +40,7 @@ from analogrig_emulator import (
 from analogrig_emulator.circuit.components import MULTIPLIER_GRADES, OP_AMP_GRADES, Components, MultiplierGrade
 from analogrig_emulator.circuit.spice import Accuracy
 from analogrig_emulator.engine import engine as engine_module
+from analogrig_emulator.engine.system import Product
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]
@@ -393,6 +394,15 @@ def test_an_element_without_a_law_is_refused_by_name(element: Element, message: 
 def test_a_multiplier_model_out_of_range_is_refused_by_field(fields: dict[str, float], message: str) -> None:
     with pytest.raises(CircuitError, match=message):
         MultiplierModel(**fields)  # type: ignore[arg-type]
+
+
+def test_a_deck_without_a_term_of_a_multiplier_is_refused() -> None:
+    class Bent(MultiplierModel):
+        def product(self, scale_v: float, element: str = "") -> Product:
+            return Product((0.0, 1.0 / scale_v, 1e-3), (0.0, 1.0), element)
+
+    with pytest.raises(CircuitError, match="multiplier M1: the deck has no power 2 of its x input"):
+        Deck(duffing(multiplier=Bent()), samples=2, edges={"F": square(2, 8.0)}).text()
 
 
 def test_more_multipliers_than_the_engine_takes_are_refused() -> None:

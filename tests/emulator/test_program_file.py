@@ -300,6 +300,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "division by a zero after others": (equation("omega' = (torque - d*omega) / J / 0"), "line 3: a division by zero"),
     "division by zero": (equation("omega' = (torque - d*omega) / (0*J)"), "line 3: a division by zero"),
     "right side of zero": (equation("omega' = d*omega/J - omega*d/J"), "line 3: the right side is zero; delete"),
+    "root of a negative number": (
+        equation("omega' = (torque - (1 + sqrt(2 - 3))*d*omega) / J"),
+        "line 3: sqrt\\(2 - 3\\) is the root of a negative number",
+    ),
     "number of no value": (
         equation("omega' = (torque - log(0)*d*omega) / J"),
         "line 3: log\\(0\\) is no finite number",

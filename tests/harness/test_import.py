@@ -18,9 +18,12 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.recordings import column_reader, columns
+from analogrig.judging.courses import first_at_level
+from analogrig.judging.information import change_information
+from analogrig.judging.verdict import UNDETECTABLE, judge
+from analogrig.recordings import column_reader, columns, replace_scenario
 from analogrig.recordings.columns import read_columns
-from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
+from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns, unit_in_name
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -252,6 +255,108 @@ def test_measured_data_alone_is_inconclusive_and_names_the_next_step(
     assert "measured data has no device: name one with --dut" in capsys.readouterr().err
 
 
+def write_thesis(path: Path) -> None:
+    """Force in N, displacement in m and instants of the machine of a play of the scenario thesis."""
+    with open_rig("emulator") as rig:
+        played = rig.perform(Scenario.load("thesis"), 7)
+        codes = np.concatenate([block.codes for block in played.blocks])
+    u, y = (
+        played.channels[name].physical(codes[:, at]) for at, name in ((FORCE, "force"), (DISPLACEMENT, "displacement"))
+    )
+    np.savez(path, u=u, y=y, t=np.arange(len(u)) * played.sample_period_s)
+
+
+def information_bounds(run: Run) -> list[int]:
+    """Samples to an information of 10; SAMPLES where it is not reached."""
+    return [first_at_level(each, 10.0) or SAMPLES for each in change_information(run)]
+
+
+NEWTON, METRE = ImportedColumn("u", "N"), ImportedColumn("y", "m")
+
+
+@pytest.mark.parametrize("settings", [{"rate_hz": 100.0, "clock": "plant"}, {"time": "t", "clock": "machine"}])
+@pytest.mark.usefixtures("in_this_process")
+def test_columns_are_judged_in_the_time_of_the_plant(settings: dict[str, Any], tmp_path: Path) -> None:
+    write_thesis(tmp_path / "a.npz")
+    described = ImportDescription(NEWTON, METRE, **settings)
+    recording, blind, out = (tmp_path / name for name in ("recording.npz", "blind.npz", "out"))
+    import_columns(tmp_path / "a.npz", described, Scenario.load("thesis")).save(recording)
+    import_columns(tmp_path / "a.npz", described, None).save(blind)
+    for options in ([str(recording)], [str(blind), "--scenario", "thesis"]):
+        assert main(["replay", *options, "--dut", "inproc", "--out", str(out)]) == 0
+        run = Run.load(out / "run.npz")
+        verdict = judge(run)
+        assert run.conditions.time_scale == 200.0
+        assert run.conditions.sample_period_problem_s == pytest.approx(0.01)
+        assert all(tweak.bound_n is not None for tweak in verdict.tweaks)
+        error = verdict.estimates[0].error
+        assert error and all(abs(each) < 0.1 for each in error.values())
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_the_noise_of_a_column_makes_the_bounds_longer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_thesis(tmp_path / "a.npz")
+    command = ["import", str(tmp_path / "a.npz"), "--input", "u", "--input-unit", "N", "--output", "y"]
+    command += ["--output-unit", "m", "--rate", "100", "--clock", "plant", "--scenario", "thesis"]
+    bounds = {}
+    for noise in ("1e-4", "4e-4", ""):
+        out = tmp_path / f"noise{noise}.npz"
+        assert main([*command, *(["--output-noise", noise] if noise else []), "--out", str(out)]) == 0
+        assert ("caveat: no noise of the output is stated" in capsys.readouterr().out) == (not noise)
+        bounds[noise] = information_bounds(Run.load(out))
+    assert sum(bounds[""]) < sum(bounds["1e-4"]) < sum(bounds["4e-4"])
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_data_that_show_no_change_of_the_scenario_prove_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_thesis(tmp_path / "a.npz")
+    tiny, recording = ImportedColumn("u", "N", scale=1e-6), tmp_path / "recording.npz"
+    described = ImportDescription(tiny, METRE, rate_hz=100.0, clock="plant")
+    import_columns(tmp_path / "a.npz", described, Scenario.load("thesis")).save(recording)
+    assert main(["replay", str(recording), "--dut", "inproc", "--out", str(tmp_path / "out")]) == 3
+    assert UNDETECTABLE in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("output", "complaint"),
+    [
+        (ImportedColumn("y"), "displacement of program front is in m, displacement of the recording in V: import it"),
+        (ImportedColumn("y", "mm"), "in mm: import it with --output-unit m, and --output-scale m per number in its"),
+    ],
+)
+@pytest.mark.usefixtures("in_this_process")
+def test_a_column_in_another_unit_than_the_scenario_is_refused(
+    output: ImportedColumn, complaint: str, tmp_path: Path
+) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals())
+    described, scenario = description(input=NEWTON, output=output), Scenario.load("thesis")
+    with pytest.raises(ConfigurationError, match=complaint):
+        import_columns(tmp_path / "a.npz", described, scenario)
+    with pytest.raises(ConfigurationError, match=complaint):
+        replace_scenario(import_columns(tmp_path / "a.npz", described, None), scenario)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_rate_that_no_machine_has_is_refused(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals())
+    described = description(input=NEWTON, output=METRE, rate_hz=1e8, clock="plant")
+    with pytest.raises(ConfigurationError, match=r"2e\+10 samples per second of the machine, more than 1e\+09"):
+        import_columns(tmp_path / "a.npz", described, Scenario.load("thesis"))
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_the_clock_of_a_faster_machine_must_be_stated(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", *made_signals())
+    described, scenario = description(input=NEWTON, output=METRE), Scenario.load("thesis")
+    complaint = "program front: the machine runs at 200 times the speed of the plant: import the recording with --clock"
+    with pytest.raises(ConfigurationError, match=complaint):
+        import_columns(tmp_path / "a.npz", described, scenario)
+    with pytest.raises(ConfigurationError, match=complaint):
+        replace_scenario(import_columns(tmp_path / "a.npz", described, None), scenario)
+
+
 @pytest.mark.usefixtures("in_this_process")
 def test_a_recording_longer_than_its_scenario_is_refused(tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", *made_signals(2000))
@@ -334,6 +439,12 @@ BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     "two of one name": ("a.csv", b"u,u,y\n1,2,3\n", "2 columns are called 'u'"),
     "word for a number": ("a.csv", b"u,y\n1,2\n3,four\n", "line 3, column y: 'four' is no number"),
     "number with an underscore": ("a.csv", b"u,y\n1,2\n3,1_0\n", "line 3, column y: '1_0' is no number"),
+    "full-width number": ("a.csv", "u,y\n1,2\n3,\uff14\n".encode(), "line 3, column y: '\uff14' is no number"),
+    "units under the header": (
+        "a.csv",
+        b"u,y\nV,mm\n1,2\n",
+        "line 2 holds no number, perhaps units: delete it, or pass --skip-lines 2 and name the columns 0, 1",
+    ),
     "short row": ("a.csv", b"u,y\n1,2\n3\n", "line 3, column y: the line has no such cell"),
     "decimal commas": ("a.csv", b"u,y\n0,5,1,5\n", "line 2 has 4 cells, the first line 2: cells with decimal commas"),
     "no number at all": ("a.csv", b"u,y\n1,\n2,\n", "column y: holds no number"),
@@ -431,6 +542,21 @@ def test_doubtful_data_are_imported_with_a_caveat(
 
 
 @pytest.mark.usefixtures("in_this_process")
+def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert [unit_in_name(each) for each in ("x", "x[2]", "x [m/s^2]", "x(mm) ")] == ["", "", "m/s^2", "mm"]
+    (tmp_path / "a.csv").write_text("t [ms];F (N)\n0;1\n1;2\n2;4\n")
+    named = ["import", str(tmp_path / "a.csv"), "--input", "F (N)", "--output", "F (N)", "--input-unit", "N"]
+    named += ["--out", str(tmp_path / "out.npz")]
+    assert main([*named, "--time", "t [ms]"]) == 2
+    assert "column t [ms]: must be in seconds: pass --rate HZ" in capsys.readouterr().err
+    assert main([*named, "--rate", "1000"]) == 0
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")] == [
+        "caveat: column F (N) is imported in V: pass --output-unit, and --output-scale to convert",
+        "caveat: input and output are the same column",
+    ]
+
+
+@pytest.mark.usefixtures("in_this_process")
 def test_fields_of_structured_arrays_are_columns(tmp_path: Path) -> None:
     rows = np.zeros(5, [("u", "f8"), ("more", [("y", "f4"), ("three", "i2", (3,))])])
     rows["more"]["y"], rows["more"]["three"][:, 2] = 3.0, 7
@@ -442,6 +568,7 @@ def test_fields_of_structured_arrays_are_columns(tmp_path: Path) -> None:
 DEEP = "[" * 2000 + "]" * 2000
 
 BAD_SETTINGS = {
+    "clock": ('clock = "wall"', [], "clock: must be one of 'plant', 'machine'"),
     "deep toml": (f"rate_hz = {DEEP}", [], "nested deeper than 32 levels"),
     "unknown key": ("speed = 3", [], "unknown key 'speed'"),
     "table": ("input = 3", [], "must be a table"),
@@ -451,7 +578,10 @@ BAD_SETTINGS = {
     "rate": ("rate_hz = nan", [], "rate_hz"),
     "rate twice": ('rate_hz = 1.0\ntime = "t"', [], "state the rate twice"),
     "unit": ('[input]\ncolumn = "u"\nunit = "a\\nb"', [], "unit must be"),
-    "scale": ("", ["--input-scale", "0"], "scale must be within"),
+    "scale": ("", ["--input-scale", "0"], "scale must have a magnitude between 1e-9 and 1e9, not 0"),
+    "all beyond": ("", ["--input-range", "50", "60", "--rate", "1"], "column u: no value lies within its range: give"),
+    "noise": ("", ["--output-noise", "-1"], "noise must be 0 to 1e+08, not -1"),
+    "vast noise": ("", ["--output-noise", "1e7", "--rate", "1"], "noise 1e+07 is far larger than its values"),
     "first": ("", ["--first", "-3"], "must not be negative"),
     "beyond": ("", ["--first", "700", "--rate", "1"], "has no row 700"),
     "too many": ("", ["--samples", "700", "--rate", "1"], "has 600 rows from row 0 on, not 700"),
@@ -490,9 +620,20 @@ def test_the_reader_is_bounded_in_memory(tmp_path: Path) -> None:
 
 def test_a_reader_that_crashes_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.csv").write_text("u,y\n1,2\n")
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(RecordingError, match=r"a.csv: its reader ended with status 1"):
+    reader = tmp_path / "reader"
+    reader.write_text("#!/bin/sh\necho of its own >&2\necho the cause >&2\nexit 1\n")
+    reader.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(reader))
+    with pytest.raises(RecordingError, match=r"a.csv: its reader ended with status 1 \(the cause\): the file"):
         read_columns(tmp_path / "a.csv")
+
+
+def test_modules_beside_the_data_are_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.csv").write_text("u,y\n1,2\n")
+    (tmp_path / "csv.py").write_text("raise SystemExit('run')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path])
+    assert read_columns(Path("a.csv")).names == ("u", "y")
 
 
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -511,6 +652,14 @@ def test_codes_that_the_rig_lacks_are_refused(tmp_path: Path, capsys: pytest.Cap
         (tmp_path / "a.csv").write_text(f"sample,{names}\n0,{code},1,1,1,0,0,0,0\n")
         assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
         assert complaint in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_signals_without_a_sample_of_a_channel_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ",".join(f"{name}_{kind}" for kind in ("code", "clipped") for name in CHANNELS)
+    (tmp_path / "a.csv").write_text(f"sample,{names}\n0,1,1,1,1,0,1,0,0\n1,2,2,2,2,0,1,0,0\n")
+    assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
+    assert capsys.readouterr().err == f"analogrig: {tmp_path}/a.csv: every sample of displacement is clipped\n"
 
 
 def test_signals_of_another_program_need_its_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,6 +41,15 @@ def test_sheet_for_the_analog_thing_or_the_reason_against_one(
     assert "program two-mass: needs 5 summers, and THE ANALOG THING has 4" in capsys.readouterr().err
 
 
+def test_a_program_with_a_diagram_says_that_a_run_plays_another_circuit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    deck, told = tmp_path / "front.cir", "This patch is compiled from the equations; a run plays the diagram front."
+    assert main(["patch", "front", "--netlist", str(deck)]) == 0
+    assert told in capsys.readouterr().out.splitlines()
+    assert deck.read_text().startswith(f"* program front. {told}\n")
+
+
 def test_json_has_scales_and_dials(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["patch", str(MOTOR), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -53,6 +62,11 @@ def test_json_has_scales_and_dials(capsys: pytest.CaptureFixture[str]) -> None:
     [
         ("name = 3", [], "bad.toml: "),
         (MOTOR.read_text().replace("k*omega", "k*omga"), [], "bad.toml: equations, line 1: unknown name 'omga'; did"),
+        (
+            MOTOR.read_text(),
+            ["--netlist", "motor.cir", "--machine", "that"],
+            "--netlist: there is no deck of",
+        ),
         (MOTOR.read_text(), ["--drawing", "motor.png"], "motor.png: the file's name must end with .svg"),
     ],
 )

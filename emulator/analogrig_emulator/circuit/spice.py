@@ -412,6 +412,11 @@ def _opamp_instance(model: OpAmpModel) -> tuple[str, dict[str, float]]:
 
 def _multiplier_instance(element: Multiplier) -> tuple[str, dict[str, float]]:
     model, product = element.model, element.product
+    for side, factor in (("x", product.x), ("y", product.y)):
+        if unsaid := [power for power, number in enumerate(factor) if number and power not in (1, 3)]:
+            raise CircuitError(
+                f"multiplier {element.name}: the deck has no power {unsaid[0]} of its {side} input, only 1 and 3"
+            )
     _, x1, _, x3 = (*product.x, 0.0, 0.0)[:4]
     _, y1, _, y3 = (*product.y, 0.0, 0.0)[:4]
     law = {"x1": x1, "x3": x3, "y1": y1, "y3": y3}

@@ -16,12 +16,18 @@ def scaling_sheet(program: PatchedProgram) -> str:
     equations = program.equations
     head = f"{program.name}: {equations.description}" if equations.description else program.name
     parts = [
-        [head, f"1 s of the machine is {equations.speed:g} s of the plant."],
+        [head, f"1 s of the machine is {equations.speed:g} s of the plant.", *diagram_lines(program)],
         ["Quantities: 10 V stand for the full scale.", *table(_quantities(program))],
         ["Computing elements", *table(_elements(program))],
         ["Pots, set under load", *table(_pots(program))],
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
+
+
+def diagram_lines(program: PatchedProgram) -> list[str]:
+    """Difference between the patch of the equations and the circuit of a run, if there is one."""
+    diagram = program.equations.diagram
+    return [f"This patch is compiled from the equations; a run plays the diagram {diagram}."] if diagram else []
 
 
 def dials(program: PatchedProgram) -> dict[str, float]:

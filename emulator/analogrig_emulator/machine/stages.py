@@ -53,11 +53,19 @@ class Cord:
 
     @property
     def text(self) -> str:
-        """Term of a formula, with its sign."""
+        """Term of a formula, with its sign; the number is rounded for people."""
+        return self._text("g")
+
+    @property
+    def exact_text(self) -> str:
+        """Term with all digits of its number."""
+        return self._text("")
+
+    def _text(self, digits: str) -> str:
         above = [_power_text(name, power) for name, power in self.factors if power > 0]
         below = [_power_text(name, -power) for name, power in self.factors if power < 0]
         if abs(self.number) != 1:
-            above.insert(0, f"{abs(self.number):g}")
+            above.insert(0, format(abs(self.number), digits))
         if self.source != REFERENCE or not above:
             above.append(self.source if is_atom(self.source) else f"({self.source})")
         divisor = f"/({'*'.join(below)})" if len(below) > 1 else "".join(f"/{each}" for each in below)
@@ -227,6 +235,10 @@ class _Builder:
         return {(((node.text, 1),), ()): 1.0}
 
     def _number(self, node: Formula) -> float:
+        for part in node.parts:
+            number = self._number(part)
+            if isinstance(node, FunctionCall) and node.function == "sqrt" and number < 0.0:
+                raise ProgramError(f"{self.place}: {node} is the root of a negative number")
         try:
             with np.errstate(all="ignore"):
                 number = float(node.law(self.equations.functions)({}))
@@ -316,7 +328,10 @@ class _Builder:
     def _sum_of(self, cords: tuple[Cord, ...]) -> str:
         if cords == (Cord(cords[0].source),):
             return cords[0].source
-        return self._add(sum_text(cords), StageKind.SUMMER, cords)
+        name = sum_text(cords)
+        if name in self.stages and self.stages[name].cords != cords:
+            name = sum_text(cords, exact=True)
+        return self._add(name, StageKind.SUMMER, cords)
 
     def _cords(self, terms: _Terms) -> tuple[Cord, ...]:
         if not terms:
@@ -337,9 +352,9 @@ class _Builder:
 _TRICKS = dict.fromkeys(("sin", "cos"), ", or generate it with two states: s' = c*omega, c' = -s*omega")
 
 
-def sum_text(cords: Iterable[Cord]) -> str:
+def sum_text(cords: Iterable[Cord], *, exact: bool = False) -> str:
     """Formula of a sum of cords."""
-    text = " ".join(cord.text for cord in cords)
+    text = " ".join(cord.exact_text if exact else cord.text for cord in cords)
     return text.removeprefix("+ ").replace("- ", "-", text.startswith("- "))
 
 

@@ -1,7 +1,8 @@
 """Trial play of a program: its equations under square waves, for the range of every quantity.
 
 The inputs switch between their trial levels, the first with the program's period, each further one with twice the
-period of the one before. The parameters take their values, then each in turn the ends of its range.
+period of the one before: every combination of levels occurs. The parameters take their values, then each in turn the
+ends of its range.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.program_file import Equations
 from analogrig_emulator.machine.stages import StageKind, Stages
 
-_HALF_PERIODS = 4
+_MOST_INPUTS = 4
+_LEAST_HALVES = 4
+
 _POINTS = 200
 """Instants per half period at which quantities are taken."""
 
 _MOST_EVALUATIONS = 20_000
 _TOLERANCE = 1e-5
 _LARGEST = 1e30
-_MOST_GROWTH = 100.0
-"""Largest peak in the second period, in that of the first: four integrators in series grow 16 times."""
+_LEAST_GROWTH = 1e-6
+"""Least real part of a growing mode, in magnitudes of the fastest one: less may be the rounding of an integrator."""
 _States = NDArray[np.float64]
 """(states, settings)"""
 
@@ -88,35 +91,55 @@ def _played(
     parameters = {name: np.array([values[name] for values in every]) for name in equations.parameters}
     levels = _levels(equations)
     state = np.zeros((len(equations.states), len(every)))
-    stretches = []
-    for half in range(_HALF_PERIODS):
+    stretches: list[NDArray[np.float64]] = []
+    for half in range(_half_periods(equations)):
         known = parameters | {name: each[half] for name, each in levels.items()}
         stretch = solve(slopes, known, state, instants_s)
         state = stretch[-1]
         stretches.append(stretch)
-        _check_bounded(equations, every, stretches)
+        _check_bounded(equations, every, stretches, ~(np.abs(state) < _LARGEST))
+    if stages.is_linear:
+        first = {name: each[0] for name, each in levels.items()}
+        is_unstable = _is_unstable(_system(slopes, parameters | first, state))
+        growth = np.abs(stretches[-1]).max(axis=0) / np.maximum(np.abs(stretches[1]).max(axis=0), 1.0 / _LARGEST)
+        _check_bounded(equations, every, stretches, is_unstable & (growth == growth.max(axis=0)))
     inputs = {name: np.repeat(each, _POINTS) for name, each in levels.items()}
     return inputs, np.concatenate(stretches)
 
 
+def _half_periods(equations: Equations) -> int:
+    """Half periods with every combination of levels. Raises ProgramError for too many inputs."""
+    count = len(equations.inputs)
+    if count > _MOST_INPUTS:
+        raise ProgramError(
+            f"inputs: {count} of them; the trial play combines the levels of at most {_MOST_INPUTS}: make the others"
+            " parameters"
+        )
+    return max(1 << count, _LEAST_HALVES)
+
+
 def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:
     """Level of each input in each half period."""
-    halves = np.arange(_HALF_PERIODS)
+    halves = np.arange(_half_periods(equations))
     return {
         name: np.array(quantity.trial)[1 - (halves >> place) % 2]
         for place, (name, quantity) in enumerate(equations.inputs.items())
     }
 
 
+def _is_unstable(system: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """True for each setting with a growing mode, (settings,); integrators have none."""
+    modes = np.linalg.eigvals(system[:, :-1, :-1])
+    return np.asarray(modes.real.max(axis=1) > _LEAST_GROWTH * np.abs(modes).max(axis=1))
+
+
 def _check_bounded(
-    equations: Equations, every: Sequence[Mapping[str, float]], stretches: Sequence[NDArray[np.float64]]
+    equations: Equations,
+    every: Sequence[Mapping[str, float]],
+    stretches: Sequence[NDArray[np.float64]],
+    grows: NDArray[np.bool_],
 ) -> None:
-    """Raise ProgramError for a state that overflows, or peaks far higher in each period than in the one before."""
-    peaks = np.array([np.abs(stretch).max(axis=0) for stretch in stretches])  # (halves, states, settings)
-    with np.errstate(all="ignore"):
-        grows = ~(peaks[-1] < _LARGEST)
-        if len(peaks) == _HALF_PERIODS:
-            grows |= peaks[-1] > _MOST_GROWTH * peaks[1]
+    """Raise ProgramError if a state grows without end, (states, settings)."""
     if not grows.any():
         return
     at, place = (int(each[0]) for each in np.nonzero(grows))
@@ -170,12 +193,8 @@ def _check_domains(stages: Stages, found: Mapping[str, Reach]) -> None:
 _Slopes = Callable[[Mapping[str, Any], _States], _States]
 
 
-def _solved_linear(
-    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Exact solution by matrix exponentials, for equal steps: (instants, states, settings)."""
-    from scipy.linalg import expm
-
+def _system(slopes: _Slopes, known: Mapping[str, Any], state: _States) -> NDArray[np.float64]:
+    """Matrices (settings, n + 1, n + 1) of linear equations, for the states and 1."""
     n, count = state.shape
     constant = slopes(known, np.zeros_like(state))
     system = np.zeros((count, n + 1, n + 1))
@@ -186,6 +205,17 @@ def _solved_linear(
         system[:, :n, i] = (slopes(known, unit) - constant).T
     if not np.isfinite(system).all():
         raise ProgramError("trial play: a coefficient is not finite; change a value or range of a parameter")
+    return system
+
+
+def _solved_linear(
+    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Exact solution by matrix exponentials, for equal steps: (instants, states, settings)."""
+    from scipy.linalg import expm
+
+    n, count = state.shape
+    system = _system(slopes, known, state)
     step = expm(system * (instants_s[1] - instants_s[0]))
     rows = [np.concatenate((state, np.ones((1, count))))]
     for _ in instants_s[1:]:

@@ -42,8 +42,17 @@ def add(commands: Any) -> None:
             metavar=("LOW", "HIGH"),
             help="range of its converter in units (default: one that holds all values)",
         )
+        command.add_argument(
+            f"--{side}-noise", type=float, metavar="X", help="its noise, rms in units (default: unknown)"
+        )
     command.add_argument("--rate", type=float, metavar="HZ", help="sample rate (default: that of the file)")
     command.add_argument("--time", metavar="COLUMN", help="column of the instants in seconds, instead of --rate")
+    command.add_argument(
+        "--clock",
+        choices=("plant", "machine"),
+        help="clock of --rate and --time: that of the plant, or of a machine that plays it faster; needed with a"
+        " scenario whose program has a speed other than 1",
+    )
     command.add_argument("--bits", type=int, metavar="N", help="bits of the converter (default: 16)")
     command.add_argument("--first", type=int, metavar="N", help="first row (default: 0)")
     command.add_argument("--samples", type=int, metavar="N", help="number of rows (default: all)")
@@ -103,11 +112,11 @@ def _table(arguments: argparse.Namespace) -> dict[str, Any]:
 
     table = read_toml(arguments.map) if arguments.map else {}
     given = {"rate_hz": arguments.rate} | {
-        name: getattr(arguments, name) for name in ("time", "bits", "first", "samples", "skip_lines")
+        name: getattr(arguments, name) for name in ("time", "clock", "bits", "first", "samples", "skip_lines")
     }
     table |= {name: value for name, value in given.items() if value is not None}
     for side in _SIDES:
-        names = {"column": side, **{name: f"{side}_{name}" for name in ("unit", "scale", "range")}}
+        names = {"column": side, **{name: f"{side}_{name}" for name in ("unit", "scale", "range", "noise")}}
         found = {key: value for key, name in names.items() if (value := getattr(arguments, name)) is not None}
         if found:
             own = table.get(side, {})
@@ -134,6 +143,7 @@ def _as_json(run: Run, arguments: argparse.Namespace) -> dict[str, Any]:
         "samples": run.samples,
         "missing": int(run.missing.sum()),
         "rate_hz": 1.0 / conditions.sample_period_s,
+        "plant_rate_hz": 1.0 / conditions.sample_period_problem_s,
         "channels": {name: vars(channel) for name, channel in conditions.channels.items()},
         "truth": bool(conditions.segments),
         "caveats": _caveats(run),
@@ -144,23 +154,36 @@ def _caveats(run: Run) -> list[str]:
     """Reasons to doubt a recording, one line each."""
     import numpy as np
 
+    from analogrig.recordings.imported import unit_in_name
     from analogrig.wording import number_of
 
-    names = run.conditions.program.channels
+    names, rig = run.conditions.program.channels, run.conditions.rig
     lines = [
         f"caveat: {name.replace('_', ' ')} is constant: no plant can be identified"
         for name in run.conditions.program.measured
         if np.ptp(run.codes[~run.clipped[:, names.index(name)], names.index(name)]) == 0
     ]
-    if blank := run.conditions.rig.get("blank_lines"):
+    for side in _SIDES if "rig" not in rig else ():
+        column, unit, scale = (rig[side][key] for key in ("column", "unit", "scale"))
+        if scale == 1.0 and unit_in_name(column) not in ("", unit):
+            lines.append(
+                f"caveat: column {column} is imported in {unit}: pass --{side}-unit, and --{side}-scale to convert"
+            )
+    if "rig" not in rig and rig["input"]["column"] == rig["output"]["column"]:
+        lines.append("caveat: input and output are the same column")
+    if len(run.conditions.segments) > 1 and not run.conditions.output.noise_lsb:
+        lines.append("caveat: no noise of the output is stated: bounds count quantisation alone; pass --output-noise")
+    if blank := rig.get("blank_lines"):
         lines.append(f"caveat: {number_of(blank, 'blank line')} between rows skipped: check that no sample is missing")
     return lines
 
 
 def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
     conditions = run.conditions
-    rate_hz = 1.0 / conditions.sample_period_s
-    lines = [f"{arguments.out}: {run.samples} samples at {rate_hz:.6g} Hz, {int(run.missing.sum())} of them missing"]
+    rate = f"{1.0 / conditions.sample_period_s:.6g} Hz"
+    if conditions.time_scale != 1.0:
+        rate += f" of the machine, {1.0 / conditions.sample_period_problem_s:.6g} Hz of the plant"
+    lines = [f"{arguments.out}: {run.samples} samples at {rate}, {int(run.missing.sum())} of them missing"]
     for name, channel in conditions.channels.items():
         high = channel.low_v + channel.codes * channel.lsb_v
         low, high = (volts * channel.unit_per_v for volts in (channel.low_v, high))

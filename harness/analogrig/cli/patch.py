@@ -30,19 +30,21 @@ def add(commands: Any) -> None:
         "--machine",
         choices=("own", "that"),
         default="own",
-        help="own: scaling sheet of the emulated computer; that: patch sheet for THE ANALOG THING (default: own)",
+        help="own: scaling sheet of the equations' patch on the emulated computer; that: patch sheet for THE ANALOG"
+        " THING (default: own)",
     )
     command.add_argument(
         "--drawing", type=Path, metavar=FILE, help="drawing of the patch on that machine, an .svg file"
     )
-    command.add_argument("--netlist", type=Path, metavar=FILE, help="SPICE deck of the patch, for ngspice")
+    command.add_argument(
+        "--netlist", type=Path, metavar=FILE, help="SPICE deck of the own machine's patch, for ngspice"
+    )
     add_json(command)
     command.set_defaults(command=_patch)
 
 
 def _patch(arguments: argparse.Namespace) -> int:
     from analogrig.config import locate
-    from analogrig.errors import ConfigurationError
     from analogrig.output import move_aside
     from analogrig.program import Program
     from analogrig.rigs.emulator import emulator_errors
@@ -53,10 +55,7 @@ def _patch(arguments: argparse.Namespace) -> int:
     from analogrig_emulator.machine.sheet import dials, scaling_sheet
     from analogrig_emulator.machine.that_drawing import that_drawing
 
-    if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
-        raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
-    if arguments.drawing is not None and arguments.drawing == arguments.netlist:
-        raise ConfigurationError(f"{arguments.drawing}: named for the drawing and for the netlist: name two files")
+    _check_options(arguments)
     wanted = [path for path in (arguments.drawing, arguments.netlist) if path is not None]
     file = locate("programs", arguments.program)
     for path in wanted:
@@ -86,6 +85,18 @@ def _patch(arguments: argparse.Namespace) -> int:
     return PASSED
 
 
+def _check_options(arguments: argparse.Namespace) -> None:
+    """:raises ConfigurationError: the options exclude each other, or name a wrong file."""
+    from analogrig.errors import ConfigurationError
+
+    if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
+        raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
+    if arguments.drawing is not None and arguments.drawing == arguments.netlist:
+        raise ConfigurationError(f"{arguments.drawing}: named for the drawing and for the netlist: name two files")
+    if arguments.netlist is not None and arguments.machine == "that":
+        raise ConfigurationError("--netlist: there is no deck of THE ANALOG THING: leave out --machine that")
+
+
 def _that_sheet(program: PatchedProgram) -> ThatSheet:
     """:raises ConfigurationError: the program does not fit the machine."""
     from analogrig.errors import ConfigurationError
@@ -98,10 +109,11 @@ def _that_sheet(program: PatchedProgram) -> ThatSheet:
         raise ConfigurationError(str(error)) from error
 
 
-def _deck(program: Any) -> str:
+def _deck(program: PatchedProgram) -> str:
     """Deck of the patch under the square wave of the machine, between the levels of the trial play."""
     from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, Excitation, SuspensionComputer
     from analogrig_emulator.machine.compiler import MACHINE_V
+    from analogrig_emulator.machine.sheet import diagram_lines
 
     computer = SuspensionComputer(program)
     (name, quantity), *_ = program.equations.inputs.items()
@@ -109,4 +121,5 @@ def _deck(program: Any) -> str:
     excitation = Excitation(low_v=low_v, high_v=high_v)
     rate_hz = computer.sample_rate_hz
     edges = {SOURCE: excitation.edges(0, _SAMPLES * TICKS_PER_SAMPLE, rate_hz)}
-    return Deck(computer.circuit, _SAMPLES, rate_hz, edges, title=f"program {program.name}").text()
+    title = ". ".join([f"program {program.name}", *diagram_lines(program)])
+    return Deck(computer.circuit, _SAMPLES, rate_hz, edges, title=title).text()

@@ -29,7 +29,7 @@ from analogrig.judging import information
 from analogrig.judging.courses import Model, first_at_level
 from analogrig.judging.exposure import Exposure, exposures
 from analogrig.plant import Segment, estimated_parameters
-from analogrig.run import LOST, Run
+from analogrig.run import IMPORTED, LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
 
@@ -46,6 +46,12 @@ Outcome = Literal["passed", "failed", "inconclusive", "unjudged"]
 
 UNKNOWN_PLANT = "nothing is known of the plant and its changes: pass a scenario that holds them with --scenario"
 """Reason of an unjudged run."""
+
+UNDETECTABLE = (
+    "no change of the scenario is detectable in this recording: check scale, rate and clock of its import, and the"
+    " scenario"
+)
+"""Reason that imported data permit no verdict."""
 
 Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not judged"]
 """Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
@@ -346,6 +352,8 @@ def _judge(
     level = sheet.log_arl0(expect.arl0)
     results = _evaluate_hypotheses(run, model, expect, level)
     invalid = invalid_reasons(run, shown, expect)
+    if run.conditions.rig.get("kind") == IMPORTED and _shows_no_change(results):
+        invalid.append(UNDETECTABLE)
     outcome, reasons = _decide_outcome(results, expect)
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
     possible = {index for each in results for index in each.false_alarms}
@@ -540,6 +548,12 @@ def _decide_outcome(results: Sequence[_HypothesisResult], expect: Expectations) 
         )
     doubts = undecided if any(each.failures for each in results) else []
     return ("inconclusive" if doubts or unseen else "passed"), [*doubts, *unseen]
+
+
+def _shows_no_change(results: Sequence[_HypothesisResult]) -> bool:
+    """True if there are changes, and the bounds are known and permit the detection of none."""
+    tweaks = [tweak for each in results for tweak in each.tweaks]
+    return bool(tweaks) and all(tweak.is_bounded and tweak.bound_n is None for tweak in tweaks)
 
 
 def _fails_under_all_hypotheses(results: Sequence[_HypothesisResult], expect: Expectations) -> bool:

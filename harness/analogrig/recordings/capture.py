@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,14 +19,16 @@ from analogrig.recordings.decoder import CaptureDecoder, FrameDictionary
 from analogrig.recordings.ecu_decoder import EcuDecoder
 from analogrig.recordings.files import CapturedFrames
 from analogrig.rigs.rig import Block
-from analogrig.run import INPUT, LOST, OUTPUT, Conditions, Run
+from analogrig.run import IMPORTED, INPUT, LOST, OUTPUT, Conditions, Run
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
+    from analogrig_emulator import Equations
 
 _MOST_NAMED = 3
+_LEAST_PERIOD_S = 1e-9
 
 
 def import_run(
@@ -119,7 +121,8 @@ def _block(captured: CapturedRun, channels: int) -> Block:
 def replace_scenario(run: Run, scenario: Scenario) -> Run:
     """The same run with the plant and the expectations of another scenario.
 
-    :raises ConfigurationError: ``scenario`` has fewer samples than the run, or other channels.
+    :raises ConfigurationError: ``scenario`` has fewer samples than the run, other channels, or units other than those
+        of imported columns.
     """
     if run.samples > scenario.samples:
         raise ConfigurationError(
@@ -127,7 +130,8 @@ def replace_scenario(run: Run, scenario: Scenario) -> Run:
         )
     if scenario.program.channels != run.conditions.program.channels:
         there, here = (", ".join(each.channels) for each in (run.conditions.program, scenario.program))
-        raise ConfigurationError(f"the recording has the channels {there}, scenario {scenario.name} {here}")
+        cure = ": import it again with --scenario" if run.conditions.rig.get("kind") == IMPORTED else ""
+        raise ConfigurationError(f"the recording has the channels {there}, scenario {scenario.name} {here}{cure}")
     conditions = dataclasses.replace(
         run.conditions,
         program=scenario.program,
@@ -135,7 +139,47 @@ def replace_scenario(run: Run, scenario: Scenario) -> Run:
         segments=scenario.segments(),
         samples_asked=scenario.samples,
     )
-    return dataclasses.replace(run, conditions=conditions)
+    return dataclasses.replace(run, conditions=scaled_to_program(conditions))
+
+
+def scaled_to_program(conditions: Conditions) -> Conditions:
+    """Conditions of imported columns with the speed of their program; those of any other run as they are.
+
+    :raises ConfigurationError: a column is in another unit than its quantity of the program, its clock is not stated,
+        or the machine is too fast.
+    """
+    rig = conditions.rig
+    if rig.get("kind") != IMPORTED or "rig" in rig:  # a play, or data with the units and the rate of a rig
+        return conditions
+    program, clock = conditions.program, rig.get("clock")
+    check_units(conditions, program.equations, program.measured)
+    speed = program.equations.speed
+    if clock is None and speed != 1.0:
+        raise ConfigurationError(
+            f"program {program.name}: the machine runs at {speed:g} times the speed of the plant: import the recording"
+            " with --clock plant if its rate is in time of the plant, or with --clock machine"
+        )
+    period_s = conditions.sample_period_s if clock == "machine" else conditions.sample_period_problem_s / speed
+    if period_s < _LEAST_PERIOD_S:
+        raise ConfigurationError(
+            f"program {program.name}: the recording has {1.0 / period_s:.3g} samples per second of the machine, more"
+            f" than {1.0 / _LEAST_PERIOD_S:g}: check its rate and --clock"
+        )
+    return dataclasses.replace(conditions, sample_period_s=period_s, time_scale=speed)
+
+
+def check_units(conditions: Conditions, equations: Equations, quantities: Sequence[str]) -> None:
+    """Compare the units of the two measured channels with those of the quantities of a program.
+
+    :raises ConfigurationError: they differ; names both, and the options that convert a column.
+    """
+    for side, name, quantity in zip(("input", "output"), conditions.program.measured, quantities, strict=True):
+        unit, measured = equations.quantities[quantity].unit, conditions.channels[name].unit
+        if unit is not None and unit.text != measured:
+            raise ConfigurationError(
+                f"{quantity} of program {equations.name} is in {unit.text}, {name} of the recording in {measured}:"
+                f" import it with --{side}-unit {unit.text}, and --{side}-scale {unit.text} per number in its column"
+            )
 
 
 def _line_counts(decoder: CaptureDecoding, frames: CapturedFrames) -> dict[str, int]:

@@ -137,9 +137,14 @@ def _number(cell: str, delimiter: str) -> float:
     text = cell.strip()
     if not text:
         return float("nan")
-    if "_" in text:
-        raise ValueError(text)  # Python would read 1_0 as 10
+    if "_" in text or not text.isascii():
+        raise ValueError(text)  # Python would read 1_0 as 10, and the digits of every script
     return float(text.replace(",", ".") if delimiter != "," else text)
+
+
+def _is_word(cell: str) -> bool:
+    """True unless the cell is a number; an empty one is a word, too."""
+    return not cell.strip() or not _are_numbers([cell], _DELIMITERS[1])
 
 
 def _are_numbers(cells: Sequence[str], delimiter: str) -> bool:
@@ -210,6 +215,11 @@ def _read_rows(
             try:
                 column.append(_number(row[place], delimiter))
             except (IndexError, ValueError):
+                if not found[0] and all(map(_is_word, row)):
+                    raise ColumnError(
+                        f"line {number} holds no number, perhaps units: delete it, or pass --skip-lines {number} and"
+                        " name the columns 0, 1, ..."
+                    ) from None
                 where = f"line {number}, column {names[place][:_MOST_NAME]}"
                 why = f"{row[place][:40]!r} is no number" if place < len(row) else "the line has no such cell"
                 raise ColumnError(f"{where}: {why}; mend or delete the line") from None

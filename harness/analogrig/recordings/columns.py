@@ -62,8 +62,10 @@ def _ask(path: Path, request: str) -> dict[str, Any]:
 
     :raises RecordingError: it crashed, or took too long.
     """
-    settings = {"OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::", "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-m", "analogrig.recordings.column_reader", request]
+    # Modules of the current folder are as little trusted as the file, which often lies beside them.
+    paths = [each for each in sys.path if each not in ("", str(Path.cwd()))]
+    settings = {"OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::", "PYTHONPATH": os.pathsep.join(paths)}
+    command = [sys.executable, "-P", "-m", "analogrig.recordings.column_reader", request]
     try:
         reader = subprocess.run(
             command,
@@ -80,5 +82,7 @@ def _ask(path: Path, request: str) -> dict[str, Any]:
     except ValueError:
         status = reader.returncode
         why = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
-        raise RecordingError(f"{path}: its reader {why}: the file is damaged, or too large") from None
+        said = reader.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2]
+        last = f" ({said[:200]})" if said else ""
+        raise RecordingError(f"{path}: its reader {why}{last}: the file is damaged, or too large") from None
     return answer

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,9 @@ from analogrig import config
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import MAX_SAMPLES, Segment
 from analogrig.program import Program
+from analogrig.recordings.capture import scaled_to_program
 from analogrig.recordings.columns import ColumnFile, read_columns
-from analogrig.run import Channel, Conditions, Run
+from analogrig.run import IMPORTED, Channel, Conditions, Run
 from analogrig.scenario import DEFAULT_PROGRAM, Scenario
 from analogrig.wording import number_of
 from analogrig_emulator import Excitation
@@ -26,9 +28,6 @@ if TYPE_CHECKING:
 
 UNSEEN = "no device has seen these samples: pass the recording to analogrig replay"
 """Fault of a recording that was imported and not played."""
-
-KIND = "import"
-"""Kind in the rig's table of an imported recording."""
 
 LEAST_BITS, MOST_BITS = 2, 16
 
@@ -52,6 +51,8 @@ class ImportedColumn:
 
     None: the range is symmetrical and holds all values.
     """
+    noise: float = 0.0
+    """Noise of the values before quantisation, rms in ``unit``; 0: unknown."""
 
     def __post_init__(self) -> None:
         if not self.column:
@@ -59,9 +60,11 @@ class ImportedColumn:
         if not self.unit or len(self.unit) > 20 or not self.unit.isprintable():
             raise ValueError(f"unit must be 1 to 20 printable characters, not {self.unit[:40]!r}")
         if not 1e-9 < abs(self.scale) < 1e9:
-            raise ValueError(f"scale must be within +-1e9 and not 0, not {self.scale:g}")
+            raise ValueError(f"scale must have a magnitude between 1e-9 and 1e9, not {self.scale:g}")
         if self.range is not None and not self.range[0] < self.range[1]:
             raise ValueError(f"range must ascend, not [{self.range[0]:g}, {self.range[1]:g}]")
+        if not 0.0 <= self.noise < _MOST_MAGNITUDE:
+            raise ValueError(f"noise must be 0 to {_MOST_MAGNITUDE:g}, not {self.noise:g}")
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,11 @@ class ImportDescription:
     """Sample rate; None: that of ``time``, or the one that the file states."""
     time: str = ""
     """Column of the sample instants in seconds; they must be evenly spaced."""
+    clock: Literal["plant", "machine"] | None = None
+    """Clock of the rate and the instants: the plant's, or that of a machine that plays a program at its speed.
+
+    None: not stated; only a program with speed 1 can then be compared with the data.
+    """
     bits: int = MOST_BITS
     """Resolution of the converter."""
     first: int = 0
@@ -102,6 +110,12 @@ class ImportDescription:
         return tuple(dict.fromkeys(name for name in (self.input.column, self.output.column, self.time) if name))
 
 
+def unit_in_name(column: str) -> str:
+    """Unit in brackets at the end of a column's name, such as mm of ``stroke [mm]``; empty without one."""
+    found = re.search(r"[\[(]([^\[\]()\d][^\[\]()]*)[\])]$", column.strip())  # x[2] is part of an array
+    return found[1].strip() if found else ""
+
+
 def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
     """True if a file with columns of these names was written by ``analogrig emulate``."""
     if path.suffix == ".npz":
@@ -115,7 +129,7 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
 
     :param scenario: the truth about plant and changes; None: unknown.
     :raises RecordingError: the file cannot be read, or its columns give no samples.
-    :raises ConfigurationError: the recording is longer than the scenario.
+    :raises ConfigurationError: the recording is longer than the scenario, or in other units than its program.
     """
     found = read_columns(path, described.columns, described.skip_lines)
     rows = slice(described.first, None if described.samples is None else described.first + described.samples)
@@ -138,12 +152,13 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         channels[name] = _channel(path, each, described.bits, values)
         codes[:, at], clipped[:, at] = _converted(values, channels[name], is_ranged=each.range is not None)
         if clipped[:, at].all():
-            raise RecordingError(f"{path}: column {each.column}: no value lies within its range")
+            raise RecordingError(f"{path}: column {each.column}: no value lies within its range: give a wider range")
     rate_hz = _rate_hz(path, described, columns, found)
-    rig = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), **dataclasses.asdict(described)}
+    rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
     rig["blank_lines"] = found.blank_lines
     truth = _truth(path, samples, 1.0 / rate_hz, scenario)
-    return unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
+    run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
+    return run if scenario is None else dataclasses.replace(run, conditions=scaled_to_program(run.conditions))
 
 
 def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scenario) -> Run:
@@ -172,7 +187,11 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
         raise RecordingError(f"{path}: has codes that rig {rig.description()['name']} does not have: name its rig")
     if not np.isin(clipped, (0.0, 1.0)).all():
         raise RecordingError(f"{path}: a flag of a clipped sample is neither 0 nor 1")
-    description = {"name": f"{KIND}:{path.name}", "kind": KIND, "file": str(path), "rig": dict(rig.description())}
+    for name in played.program.measured:
+        if clipped[:, names.index(name)].all():
+            raise RecordingError(f"{path}: every sample of {name} is clipped")
+    description: dict[str, Any] = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path)}
+    description["rig"] = dict(rig.description())
     return unanswered(
         codes.astype(np.uint16),
         clipped.astype(np.bool_),
@@ -204,7 +223,10 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
         raise RecordingError(
             f"{where}: {what}: a range must be wider than {_LEAST_WIDTH:g} and within +-{_MOST_MAGNITUDE:g}; scale it"
         )
-    return Channel(low, (high - low) / codes, described.unit, 1.0, 0.0, codes)
+    lsb = (high - low) / codes
+    if not (noise_lsb := described.noise / lsb) < _MOST_MAGNITUDE:
+        raise RecordingError(f"{where}: noise {described.noise:g} is far larger than its values: state it in the unit")
+    return Channel(low, lsb, described.unit, 1.0, noise_lsb, codes)
 
 
 def _converted(
@@ -229,6 +251,8 @@ def _rate_hz(
         if found.rate_hz is None:
             raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN")
         return found.rate_hz
+    if unit_in_name(described.time) not in ("", "s"):
+        raise RecordingError(f"{path}: column {described.time}: must be in seconds: pass --rate HZ")
     instants_s = columns[described.time]
     if len(instants_s) < 2 or not np.isfinite(instants_s).all():
         raise RecordingError(f"{path}: column {described.time}: instants are missing")
@@ -290,7 +314,7 @@ def unanswered(
             segments=segments,
             scenario=scenario.as_table(),
             rig=rig,
-            dut={"name": "none", "kind": KIND, "datasheet": {"alarms": False}},
+            dut={"name": "none", "kind": IMPORTED, "datasheet": {"alarms": False}},
             link="none",
             faults=(UNSEEN,),
             program=scenario.program,

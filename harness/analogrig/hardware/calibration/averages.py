@@ -138,7 +138,7 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
     performance, blocks, standing = _play(rig, scenario, seed)
     channels = {name: performance.channels[name] for name in scenario.program.measured}
     codes = np.concatenate([block.codes[:, _COLUMNS] for block in blocks]).astype(np.float64)
-    if not rig.computes_circuit:  # whose volts are without noise
+    if not rig.computes_circuit:  # the volts of a computed circuit are before the noise of its card
         low_v, lsb_v = (np.array([getattr(channel, name) for channel in channels.values()]) for name in _GRID)
         codes = (np.concatenate([block.volts[:, _COLUMNS] for block in blocks]) - low_v) / lsb_v
     return SquareWaveRecording(

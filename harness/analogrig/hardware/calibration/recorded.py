@@ -17,8 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
+<<<<<<< HEAD
 from analogrig.hardware.calibration.averages import noise_variance
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
+=======
+from analogrig.recordings.capture import check_units
+>>>>>>> mend22
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import (
@@ -186,13 +190,7 @@ class RecordedPlant:
         self.program, self.run = program, run
         self._measured = run.conditions.program.measured
         self.input, self.output = next(iter(equations.inputs)), outputs[0]
-        for name, quantity in zip(self._measured, (self.input, self.output), strict=True):
-            unit, measured = equations.quantities[quantity].unit, run.conditions.channels[name].unit
-            if unit is not None and unit.text != measured:
-                raise ConfigurationError(
-                    f"{quantity} of program {program.name} is in {unit.text}, {name} of the recording in {measured}:"
-                    f" import it in {unit.text}"
-                )
+        check_units(run.conditions, equations, (self.input, self.output))
         stock = computer.components_for(seed)
         components = dataclasses.replace(stock, pots=dataclasses.replace(stock.pots, windings=0))
         if computer.components != "nominal":
