@@ -108,27 +108,15 @@ def _fit(
     ]
     if check and checked:
         lines.append(f"samples {check[1].first} to {check[1].end - 1}, not fitted: {_words(checked, unit)}")
-<<<<<<< HEAD
     caveats = [*_caveats(twin), *_settling_lines(twin.fit, checked, _settling_n(arguments))]
-    lines += [_reconstruction_line(twin, unit), *caveats]
-=======
-    lines += [_reconstruction_line(twin, unit), *_caveats(twin), *_diagram_lines(plant, arguments.out)]
-    lines += _settling_lines(twin.fit, checked, _settling_n(arguments))
->>>>>>> mend22
+    lines += [_reconstruction_line(twin, unit), *caveats, *_diagram_lines(plant, arguments.out)]
     if is_twin:
         with replace_file(arguments.out) as out:
             out.write(_program_toml(file, twin.values, lines, arguments).encode("utf-8"))
     if arguments.json:
         table = {"program": str(file), "unit": unit, "plays": twin.plays}
-<<<<<<< HEAD
         recording, rig = (str(arguments.recording), None) if arguments.recording else (None, arguments.rig)
         table |= {"recording": recording, "rig": rig}
-=======
-        table |= {
-            "recording": arguments.recording and str(arguments.recording),
-            "rig": None if arguments.recording else arguments.rig,
-        }
->>>>>>> mend22
         table |= {"parameters": [vars(each) for each in twin.estimates], "fit": vars(twin.fit)}
         table |= {"reconstruction": twin.reconstruction, "other_rms": twin.other_rms}
         table |= {"other_is_fitted": twin.other_is_fitted, "output_rms": twin.output_rms, "caveats": caveats}

@@ -17,12 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
-<<<<<<< HEAD
 from analogrig.hardware.calibration.averages import noise_variance
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-=======
 from analogrig.recordings.capture import check_units
->>>>>>> mend22
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import (
