@@ -58,7 +58,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fit(recording: Path, program: str, capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, Any]:
-    """What calibrate tells of a recording."""
+    """Fit a program to a recording by the command, and return its JSON."""
     command = ["calibrate", "--recording", str(recording), "--program", program, "--json", *options]
     capsys.readouterr()
     assert main([*command, "--out", str(recording.parent / "fitted.toml")]) == 0

@@ -319,6 +319,15 @@ def test_data_that_show_no_change_of_the_scenario_prove_nothing(
     assert UNDETECTABLE in capsys.readouterr().err
 
 
+def check_refused(path: Path, described: ImportDescription, complaint: str) -> None:
+    """Check that scenario thesis refuses the file, as it is imported and afterwards."""
+    scenario = Scenario.load("thesis")
+    with pytest.raises(ConfigurationError, match=complaint):
+        import_columns(path, described, scenario)
+    with pytest.raises(ConfigurationError, match=complaint):
+        replace_scenario(import_columns(path, described, None), scenario)
+
+
 @pytest.mark.parametrize(
     ("output", "complaint"),
     [
@@ -331,11 +340,8 @@ def test_a_column_in_another_unit_than_the_scenario_is_refused(
     output: ImportedColumn, complaint: str, tmp_path: Path
 ) -> None:
     write_npz(tmp_path / "a.npz", *made_signals())
-    described, scenario = description(input=NEWTON, output=output), Scenario.load("thesis")
-    with pytest.raises(ConfigurationError, match=complaint):
-        import_columns(tmp_path / "a.npz", described, scenario)
-    with pytest.raises(ConfigurationError, match=complaint):
-        replace_scenario(import_columns(tmp_path / "a.npz", described, None), scenario)
+    described = description(input=NEWTON, output=output)
+    check_refused(tmp_path / "a.npz", described, complaint)
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -349,12 +355,9 @@ def test_a_rate_that_no_machine_has_is_refused(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("in_this_process")
 def test_the_clock_of_a_faster_machine_must_be_stated(tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", *made_signals())
-    described, scenario = description(input=NEWTON, output=METRE), Scenario.load("thesis")
+    described = description(input=NEWTON, output=METRE)
     complaint = "program front: the machine runs at 200 times the speed of the plant: import the recording with --clock"
-    with pytest.raises(ConfigurationError, match=complaint):
-        import_columns(tmp_path / "a.npz", described, scenario)
-    with pytest.raises(ConfigurationError, match=complaint):
-        replace_scenario(import_columns(tmp_path / "a.npz", described, None), scenario)
+    check_refused(tmp_path / "a.npz", described, complaint)
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -49,6 +49,29 @@ def add(commands: Any) -> None:
         help="program of the computer, or a program file; its parameters are fitted, but with front and shock on a rig"
         " the components (default: %(default)s)",
     )
+    _add_program_fit(command)
+    command.add_argument(
+        "--op-amp",
+        choices=("tl07x", "741", "opa627", "ideal"),
+        help="type of the amplifiers (default: ideal with --recording, tl07x for a rig)",
+    )
+    command.add_argument(
+        "--components",
+        choices=("nominal", "polyester", "polypropylene"),
+        help="type of the capacitors (default: the type that fits best)",
+    )
+    command.add_argument(
+        "--pots",
+        choices=("coefficient", "dial"),
+        help="quantity that the pots are set by (default: coefficient, unless dial fits better)",
+    )
+    add_seed(command)
+    add_json(command)
+    command.set_defaults(command=_run)
+
+
+def _add_program_fit(command: argparse.ArgumentParser) -> None:
+    """Add the options of a fit of a program's parameters."""
     command.add_argument(
         "--recording", type=Path, metavar=FILE, help="fit the program's parameters to this recording instead of a rig"
     )
@@ -76,24 +99,6 @@ def add(commands: Any) -> None:
         help="largest rms difference of a twin to keep, in the"
         " output's unit (default: half the rms of the fitted output about its mean)",
     )
-    command.add_argument(
-        "--op-amp",
-        choices=("tl07x", "741", "opa627", "ideal"),
-        help="type of the amplifiers (default: ideal with --recording, tl07x for a rig)",
-    )
-    command.add_argument(
-        "--components",
-        choices=("nominal", "polyester", "polypropylene"),
-        help="type of the capacitors (default: the type that fits best)",
-    )
-    command.add_argument(
-        "--pots",
-        choices=("coefficient", "dial"),
-        help="quantity that the pots are set by (default: coefficient, unless dial fits better)",
-    )
-    add_seed(command)
-    add_json(command)
-    command.set_defaults(command=_run)
 
 
 def _run(arguments: argparse.Namespace) -> int:
