@@ -28,7 +28,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
-from analogrig_emulator import CHANNELS
+from analogrig_emulator import CHANNELS, parse_unit
 
 RATE_HZ = 1000.0
 SAMPLES = 600
@@ -328,20 +328,86 @@ def check_refused(path: Path, described: ImportDescription, complaint: str) -> N
         replace_scenario(import_columns(path, described, None), scenario)
 
 
-@pytest.mark.parametrize(
-    ("output", "complaint"),
-    [
-        (ImportedColumn("y"), "displacement of program front is in m, displacement of the recording in V: import it"),
-        (ImportedColumn("y", "mm"), "in mm: import it with --output-unit m, and --output-scale m per number in its"),
-    ],
-)
+@pytest.mark.parametrize("unit", [None, "mm/s", "degC"])
 @pytest.mark.usefixtures("in_this_process")
-def test_a_column_in_another_unit_than_the_scenario_is_refused(
-    output: ImportedColumn, complaint: str, tmp_path: Path
-) -> None:
+def test_a_column_that_measures_something_else_than_the_scenario_is_refused(unit: str | None, tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", *made_signals())
-    described = description(input=NEWTON, output=output)
+    described = description(input=NEWTON, output=ImportedColumn("y", unit), clock="plant")
+    complaint = (
+        f"displacement of program front is in m, displacement of the recording in {unit or 'V'}: import it with"
+        " --output-unit m, and --output-scale m per number in its"
+    )
     check_refused(tmp_path / "a.npz", described, complaint)
+
+
+def write_mf4_with_units(path: Path, u: Values, y: Values) -> None:
+    from asammdf import MDF, Signal
+
+    t = np.arange(len(u)) / RATE_HZ
+    with MDF() as file:
+        file.append([Signal(u / 1e3, t, name="u", unit="kN"), Signal(y * 1e3, t, name="y", unit="mm")])
+        file.save(path)
+
+
+def write_parquet_with_units(path: Path, u: Values, y: Values) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    named = (("u", "kN"), ("y", "mm"))
+    schema = pa.schema([pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in named])
+    parquet.write_table(pa.table([u / 1e3, y * 1e3], schema=schema), path)
+
+
+def write_csv_with_units(path: Path, u: Values, y: Values) -> None:
+    rows = np.stack([u / 1e3, y * 1e6, np.arange(len(u)) * 1e3 / RATE_HZ], axis=1)
+    np.savetxt(path, rows, delimiter=",", header="u [kN],y (µm),t [ms]", comments="", fmt="%.17g", encoding="utf-8")
+
+
+HEADERS: dict[str, tuple[Callable[[Path, Values, Values], None], list[str]]] = {
+    "a.mf4": (write_mf4_with_units, ["u", "y", "--rate", "1000"]),
+    "a.parquet": (write_parquet_with_units, ["u", "y", "--rate", "1000"]),
+    "a.csv": (write_csv_with_units, ["u [kN]", "y (µm)", "--time", "t [ms]"]),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+@pytest.mark.usefixtures("in_this_process")
+def test_units_of_a_header_are_converted_to_those_of_the_program(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    u, y = made_signals()
+    write, (input_column, output_column, *rate) = HEADERS[name]
+    write(tmp_path / name, u, y)
+    command = ["import", str(tmp_path / name), "--input", input_column, "--output", output_column, *rate]
+    blind, judged = str(tmp_path / "blind.npz"), str(tmp_path / "judged.npz")
+    assert main([*command, "--clock", "plant", "--scenario", "thesis", "--out", judged]) == 0
+    told = capsys.readouterr().out
+    small = "um" if name == "a.csv" else "mm"
+    assert " N, converted from kN\n" in told and f" m, converted from {small}\n" in told and "imported in" not in told
+    assert main([*command, "--clock", "plant", "--out", blind]) == 0
+    assert f" {small}\n" in capsys.readouterr().out
+    for run in (Run.load(Path(judged)), replace_scenario(Run.load(Path(blind)), Scenario.load("thesis"))):
+        assert run.conditions.sample_period_problem_s == pytest.approx(1.0 / RATE_HZ)
+        for channel, unit, values in (("force", "N", u), ("displacement", "m", y)):
+            assert run.conditions.channels[channel].unit == unit
+            assert np.abs(run.channel(channel) - values).max() <= run.conditions.channels[channel].lsb
+    options = ["--output-unit", "m", "--clock", "plant", "--scenario", "thesis", "--out", judged]
+    assert main([*command, *options]) == 0  # the command line overrides the header
+    header = "µm" if name == "a.csv" else "mm"
+    caveat = f"caveat: column {output_column}, in {header}, is imported in m: pass --output-unit, and --output-scale"
+    assert caveat in capsys.readouterr().out
+    factor = 1e6 if name == "a.csv" else 1e3
+    assert np.ptp(Run.load(Path(judged)).channel("displacement")) == pytest.approx(factor * np.ptp(y), rel=1e-3)
+    assert main([*command, "--input-unit", "m", *options]) == 2
+    assert "force of program front is in N, force of the recording in m: import it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("unit", "other", "factor"),
+    [("mV", "V", 1e-3), ("rpm", "rad/s", np.pi / 30), ("mm", "V", None), ("Hz", "rad/s", None), ("%", "rad", None)],
+)
+def test_units_of_one_dimension_have_a_factor(unit: str, other: str, factor: float | None) -> None:
+    assert parse_unit(unit).factor_to(parse_unit(other)) == (factor and pytest.approx(factor))
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -547,14 +613,15 @@ def test_doubtful_data_are_imported_with_a_caveat(
 @pytest.mark.usefixtures("in_this_process")
 def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [unit_in_name(each) for each in ("x", "x[2]", "x [m/s^2]", "x(mm) ")] == ["", "", "m/s^2", "mm"]
-    (tmp_path / "a.csv").write_text("t [ms];F (N)\n0;1\n1;2\n2;4\n")
-    named = ["import", str(tmp_path / "a.csv"), "--input", "F (N)", "--output", "F (N)", "--input-unit", "N"]
-    named += ["--out", str(tmp_path / "out.npz")]
-    assert main([*named, "--time", "t [ms]"]) == 2
-    assert "column t [ms]: must be in seconds: pass --rate HZ" in capsys.readouterr().err
+    (tmp_path / "a.csv").write_text("t [m];F (Nm)\n0;1\n1;2\n2;4\n")
+    named = ["import", str(tmp_path / "a.csv"), "--input", "F (Nm)", "--output", "F (Nm)"]
+    named += ["--input-unit", "N m", "--out", str(tmp_path / "out.npz")]
+    assert main([*named, "--time", "t [m]"]) == 2
+    assert "column t [m]: must be a time, not in m: pass --rate HZ" in capsys.readouterr().err
     assert main([*named, "--rate", "1000"]) == 0
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")] == [
-        "caveat: column F (N) is imported in V: pass --output-unit, and --output-scale to convert",
+        "caveat: column F (Nm), in Nm, is imported in N m: pass --input-unit, and --input-scale to convert",
+        "caveat: column F (Nm), in Nm, is imported in V: pass --output-unit, and --output-scale to convert",
         "caveat: input and output are the same column",
     ]
 

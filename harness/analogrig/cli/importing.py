@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
     command.add_argument("--map", type=Path, metavar="FILE.toml", help="the settings below as a file")
     for side in _SIDES:
         command.add_argument(f"--{side}", metavar="COLUMN", help=f"column of the plant's {side}")
-        command.add_argument(f"--{side}-unit", metavar="UNIT", help="its unit (default: V)")
+        command.add_argument(f"--{side}-unit", metavar="UNIT", help="its unit (default: that of the header, or V)")
         command.add_argument(f"--{side}-scale", type=float, metavar="X", help="units per number in it (default: 1)")
         command.add_argument(
             f"--{side}-range",
@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
             f"--{side}-noise", type=float, metavar="X", help="its noise, rms in units (default: unknown)"
         )
     command.add_argument("--rate", type=float, metavar="HZ", help="sample rate (default: that of the file)")
-    command.add_argument("--time", metavar="COLUMN", help="column of the instants in seconds, instead of --rate")
+    command.add_argument("--time", metavar="COLUMN", help="column of the instants, instead of --rate")
     command.add_argument(
         "--clock",
         choices=("plant", "machine"),
@@ -154,7 +154,7 @@ def _caveats(run: Run) -> list[str]:
     """Reasons to doubt a recording, one line each."""
     import numpy as np
 
-    from analogrig.recordings.imported import unit_in_name
+    from analogrig.recordings.imported import known_unit
     from analogrig.wording import number_of
 
     names, rig = run.conditions.program.channels, run.conditions.rig
@@ -163,11 +163,13 @@ def _caveats(run: Run) -> list[str]:
         for name in run.conditions.program.measured
         if np.ptp(run.codes[~run.clipped[:, names.index(name)], names.index(name)]) == 0
     ]
-    for side in _SIDES if "rig" not in rig else ():
+    for side, header in zip(_SIDES, rig.get("header_units", ()), strict=False):
         column, unit, scale = (rig[side][key] for key in ("column", "unit", "scale"))
-        if scale == 1.0 and unit_in_name(column) not in ("", unit):
+        known = known_unit(header)
+        if scale == 1.0 and header and (known is None or known.text != unit):
             lines.append(
-                f"caveat: column {column} is imported in {unit}: pass --{side}-unit, and --{side}-scale to convert"
+                f"caveat: column {column}, in {header}, is imported in {unit}: pass --{side}-unit, and --{side}-scale"
+                " to convert"
             )
     if "rig" not in rig and rig["input"]["column"] == rig["output"]["column"]:
         lines.append("caveat: input and output are the same column")
@@ -184,9 +186,13 @@ def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
     if conditions.time_scale != 1.0:
         rate += f" of the machine, {1.0 / conditions.sample_period_problem_s:.6g} Hz of the plant"
     lines = [f"{arguments.out}: {run.samples} samples at {rate}, {int(run.missing.sum())} of them missing"]
+    described = [conditions.rig[side] for side in _SIDES if side in conditions.rig]
+    units = {name: each["unit"] for name, each in zip(conditions.program.measured, described, strict=False)}
     for name, channel in conditions.channels.items():
         high = channel.low_v + channel.codes * channel.lsb_v
         low, high = (volts * channel.unit_per_v for volts in (channel.low_v, high))
-        lines.append(f"{name.replace('_', ' ')}: {channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}")
+        converted = "" if units.get(name, channel.unit) == channel.unit else f", converted from {units[name]}"
+        span = f"{channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}"
+        lines.append(f"{name.replace('_', ' ')}: {span}{converted}")
     known = f"that of scenario {conditions.scenario['name']}" if conditions.segments else "unknown: UNJUDGED"
     return [*lines, *_caveats(run), f"truth: {known}", f"next: analogrig replay {arguments.out} --dut inproc"]

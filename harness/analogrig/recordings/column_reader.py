@@ -3,7 +3,7 @@
 It runs in a process of its own with bounded memory and time, because a damaged or hostile file may exhaust the memory
 or crash the library that reads it. Nothing in a file is executed: no pickles, no formulas, no links to other files.
 REQUEST is a JSON object: ``file``; ``wanted``, the columns to read; ``skip_lines``; ``out``, the .npz to write them to.
-The answer is a JSON object on standard output: ``names``, ``rate_hz`` and ``blank_lines``, or ``error``.
+The answer is a JSON object on standard output: ``names``, ``rate_hz``, ``blank_lines`` and ``units``, or ``error``.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -65,6 +66,8 @@ class Table:
     columns: dict[str, Callable[[], Column]] = field(default_factory=dict)
     rate_hz: float | None = None
     """Sample rate that the file states; None if it states none."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units that the file states beside the names of columns."""
 
     def add_typed(self, name: str, dtype: np.dtype[Any], shape: Sequence[int], load: Callable[[], Any]) -> None:
         """Add an array of NumPy, or each field of a structured one as ``name.field``; texts are left out."""
@@ -379,6 +382,8 @@ def open_mf4(path: Path) -> Table:
             samples = int(measurement.groups[group].channel_group.cycles_nr)
             label = name if len(places) == 1 else f"{name}@{group}"
             table.add(label, (samples,), partial(_mf4_channel, measurement, group, index))
+            channel = measurement.groups[group].channels[index]
+            table.units[label] = (channel.conversion and channel.conversion.unit) or channel.unit or ""
     return table
 
 
@@ -408,6 +413,7 @@ def open_parquet(path: Path) -> Table:
     for kind in file.schema_arrow:
         if types.is_integer(kind.type) or types.is_floating(kind.type) or types.is_boolean(kind.type):
             table.add(kind.name, (file.metadata.num_rows,), partial(_parquet_column, file, kind.name))
+            table.units[kind.name] = (kind.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
         elif types.is_timestamp(kind.type):
             table.add(kind.name, (file.metadata.num_rows,), partial(_parquet_instants, file, kind.name))
     return table
@@ -465,6 +471,8 @@ class Columns(NamedTuple):
     """Sample rate that the file states."""
     blank_lines: int = 0
     """Blank lines between rows of text."""
+    units: Mapping[str, str] = MappingProxyType({})
+    """Units that the file states beside the names of the wanted columns."""
 
 
 def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
@@ -480,7 +488,8 @@ def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
     names = list(table.columns)
     for name in wanted:
         _place(name, names)
-    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz)
+    units = {name: table.units[name][:_MOST_NAME] for name in wanted if table.units.get(name)}
+    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz, units=units)
 
 
 def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -498,7 +507,8 @@ def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
     except Exception as error:  # noqa: BLE001 - the libraries raise anything on damaged files
         cause = re.sub(r"\s+", " ", str(error))[:200] or type(error).__name__
         return {"error": f"damaged, or no {FORMATS[path.suffix.lower()][0]} file: {cause}"}
-    return {"names": found.names, "rate_hz": found.rate_hz, "blank_lines": found.blank_lines}
+    told = {"rate_hz": found.rate_hz, "blank_lines": found.blank_lines, "units": dict(found.units)}
+    return {"names": found.names, **told}
 
 
 def main(request: str) -> None:

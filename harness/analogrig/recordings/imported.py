@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -21,7 +22,7 @@ from analogrig.recordings.columns import ColumnFile, read_columns
 from analogrig.run import IMPORTED, Channel, Conditions, Run
 from analogrig.scenario import DEFAULT_PROGRAM, Scenario
 from analogrig.wording import number_of
-from analogrig_emulator import Excitation
+from analogrig_emulator import Excitation, ProgramError, Unit, parse_unit
 
 if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
@@ -34,6 +35,14 @@ LEAST_BITS, MOST_BITS = 2, 16
 _LEAST_WIDTH, _MOST_MAGNITUDE = 1e-7, 1e8
 """Limits of a converter's range, which a run can hold."""
 
+_MOST_UNIT = 20
+"""Longest unit of a column."""
+
+_ASCII = MappingProxyType(
+    {"\u00b5": "u", "\u03bc": "u", "\u2126": "ohm", "\u03a9": "ohm", "\u00b7": " ", "\u00b2": "^2", "\u00b3": "^3"}
+)
+"""Symbols of headers in the words of a program file."""
+
 _MOST_JITTER = 0.02
 """Largest deviation of a time from the even grid, in sample periods."""
 
@@ -43,7 +52,8 @@ class ImportedColumn:
     """One column of a file: values in ``unit`` are column * scale + offset. ValueError: a number is out of range."""
 
     column: str
-    unit: str = "V"
+    unit: str | None = None
+    """None: the one in the header of an unscaled column; V without one."""
     scale: float = 1.0
     offset: float = 0.0
     range: tuple[float, float] | None = None
@@ -57,8 +67,8 @@ class ImportedColumn:
     def __post_init__(self) -> None:
         if not self.column:
             raise ValueError("column must not be empty")
-        if not self.unit or len(self.unit) > 20 or not self.unit.isprintable():
-            raise ValueError(f"unit must be 1 to 20 printable characters, not {self.unit[:40]!r}")
+        if self.unit is not None and not (0 < len(self.unit) <= _MOST_UNIT and self.unit.isprintable()):
+            raise ValueError(f"unit must be 1 to {_MOST_UNIT} printable characters, not {self.unit[:40]!r}")
         if not 1e-9 < abs(self.scale) < 1e9:
             raise ValueError(f"scale must have a magnitude between 1e-9 and 1e9, not {self.scale:g}")
         if self.range is not None and not self.range[0] < self.range[1]:
@@ -76,7 +86,7 @@ class ImportDescription:
     rate_hz: float | None = None
     """Sample rate; None: that of ``time``, or the one that the file states."""
     time: str = ""
-    """Column of the sample instants in seconds; they must be evenly spaced."""
+    """Column of the sample instants, in seconds or the unit of its header; they must be evenly spaced."""
     clock: Literal["plant", "machine"] | None = None
     """Clock of the rate and the instants: the plant's, or that of a machine that plays a program at its speed.
 
@@ -116,6 +126,28 @@ def unit_in_name(column: str) -> str:
     return found[1].strip() if found else ""
 
 
+def known_unit(text: str) -> Unit | None:
+    """Unit of a text in a file's header; None if no program file could write it."""
+    try:
+        return parse_unit("".join(_ASCII.get(each, each) for each in text)) if 0 < len(text) <= _MOST_UNIT else None
+    except ProgramError:
+        return None
+
+
+def _header_unit(column: str, found: ColumnFile) -> str:
+    """Unit that the file states for a column, as it writes it; empty if it states none."""
+    return found.units.get(column) or unit_in_name(column)
+
+
+def _in_unit(described: ImportedColumn, header: str) -> ImportedColumn:
+    """Column with the unit of its header, unless the description states unit or scale."""
+    unit = described.unit
+    if unit is None:
+        known = known_unit(header) if described.scale == 1.0 else None
+        unit = "V" if known is None else known.text
+    return dataclasses.replace(described, unit=unit)
+
+
 def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
     """True if a file with columns of these names was written by ``analogrig emulate``."""
     if path.suffix == ".npz":
@@ -132,6 +164,10 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
     :raises ConfigurationError: the recording is longer than the scenario, or in other units than its program.
     """
     found = read_columns(path, described.columns, described.skip_lines)
+    headers = [_header_unit(each.column, found) for each in (described.input, described.output)]
+    described = dataclasses.replace(
+        described, input=_in_unit(described.input, headers[0]), output=_in_unit(described.output, headers[1])
+    )
     rows = slice(described.first, None if described.samples is None else described.first + described.samples)
     columns = {name: values[rows] for name, values in found.columns.items()}
     count = {len(values) for values in columns.values()}
@@ -155,7 +191,7 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range: give a wider range")
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
-    rig["blank_lines"] = found.blank_lines
+    rig |= {"blank_lines": found.blank_lines, "header_units": headers}
     truth = _truth(path, samples, 1.0 / rate_hz, scenario)
     run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
     return run if scenario is None else dataclasses.replace(run, conditions=scaled_to_program(run.conditions))
@@ -226,7 +262,7 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
     lsb = (high - low) / codes
     if not (noise_lsb := described.noise / lsb) < _MOST_MAGNITUDE:
         raise RecordingError(f"{where}: noise {described.noise:g} is far larger than its values: state it in the unit")
-    return Channel(low, lsb, described.unit, 1.0, noise_lsb, codes)
+    return Channel(low, lsb, described.unit or "V", 1.0, noise_lsb, codes)
 
 
 def _converted(
@@ -251,9 +287,11 @@ def _rate_hz(
         if found.rate_hz is None:
             raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN")
         return found.rate_hz
-    if unit_in_name(described.time) not in ("", "s"):
-        raise RecordingError(f"{path}: column {described.time}: must be in seconds: pass --rate HZ")
-    instants_s = columns[described.time]
+    unit = _header_unit(described.time, found) or "s"
+    in_s = None if (known := known_unit(unit)) is None else known.factor_to(parse_unit("s"))
+    if in_s is None:
+        raise RecordingError(f"{path}: column {described.time}: must be a time, not in {unit}: pass --rate HZ")
+    instants_s = columns[described.time] * in_s
     if len(instants_s) < 2 or not np.isfinite(instants_s).all():
         raise RecordingError(f"{path}: column {described.time}: instants are missing")
     period_s = float(instants_s[-1] - instants_s[0]) / (len(instants_s) - 1)
