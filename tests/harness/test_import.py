@@ -228,7 +228,9 @@ def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(
     told = capsys.readouterr()
     verdict = json.loads(told.out)
     assert verdict["outcome"] == "unjudged" and not verdict["valid"] and not verdict["false_alarms"]
-    assert told.err.startswith("analogrig: UNJUDGED: nothing is known of the plant")
+    assert told.err.startswith(
+        "analogrig: UNJUDGED: nothing is known of the plant and its changes: import again with --scenario FILE"
+    )
     page = (out / "report.html").read_text()
     assert "Power spectral density" in page and "Frequency response" in page and "Resonance [Hz]" in page
     run = Run.load(out / "run.npz")

@@ -44,7 +44,7 @@ _NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
 Outcome = Literal["passed", "failed", "inconclusive", "unjudged"]
 """``unjudged``: nothing is known of the plant, so that no alarm can be true or false."""
 
-UNKNOWN_PLANT = "nothing is known of the plant and its changes: pass a scenario that holds them with --scenario"
+UNKNOWN_PLANT = "nothing is known of the plant and its changes: import again with --scenario FILE to judge it"
 """Reason of an unjudged run."""
 
 UNDETECTABLE = (
