@@ -244,15 +244,20 @@ def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(
     assert "2 unjudged" in (tmp_path / "session.html").read_text()
 
 
-def test_measured_data_alone_is_inconclusive_and_names_the_next_step(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_measured_data_alone_is_refused_with_the_next_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_npz(tmp_path / "a.npz", *made_signals())
     recording = tmp_path / "recording.npz"
     named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(recording)]
     assert main(["import", str(tmp_path / "a.npz"), *named]) == 0
-    assert main(["judge", str(recording), "--out", str(tmp_path / "judged")]) == 3
-    assert "pass the recording to analogrig replay" in capsys.readouterr().err
+    capsys.readouterr()
+    assert main(["judge", str(recording), "--out", str(tmp_path / "judged")]) == 2
+    told = capsys.readouterr()
+    assert told.err == (
+        f"analogrig: {recording}: no device has answered these samples: judge the run of analogrig replay {recording}"
+        " --dut NAME\n"
+    )
+    verdict = json.loads((tmp_path / "judged" / "verdict.json").read_text())
+    assert verdict["outcome"] == "inconclusive" and not told.out
     assert main(["replay", str(recording), "--out", str(tmp_path / "replayed")]) == 2
     assert "measured data has no device: name one with --dut" in capsys.readouterr().err
 
