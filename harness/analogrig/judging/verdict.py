@@ -93,6 +93,15 @@ FAULT_CURES: Mapping[str, str] = {
 }
 """Measure against each fault of a channel."""
 
+NONLINEAR_CURE = (
+    "the program is not linear, the device's model is: reduce the amplitude of the excitation, or raise the orders na"
+    " and nb"
+)
+"""Measure against a cause or a fault that a plant beyond the device's linear model explains."""
+
+_UNEXPLAINED_CAUSES = frozenset({"slow plant", "excitation"})
+_UNEXPLAINED_FAULTS = frozenset({"stuck"})
+
 
 @dataclass(frozen=True)
 class ChannelFault:
@@ -106,11 +115,15 @@ class ChannelFault:
     """Likeliest sample of its beginning."""
     extent: float | None
     """Gain after over gain before; None unless the fault is a gain, or non-finite."""
+    beyond_model: bool = False
+    """True if the program is not linear and the device's model is: no channel need be at fault."""
 
     @property
     def cure(self) -> str:
         """Measure against the fault."""
         channel, kind = self.name.split()
+        if self.beyond_model and kind not in _UNEXPLAINED_FAULTS:
+            return NONLINEAR_CURE
         return f"{channel}: {FAULT_CURES[kind]}"
 
 
@@ -126,6 +139,8 @@ class MisfitPeriod:
     """Statistic over its limit at ``start``; None if the device does not report it."""
     frequency_hz: float | None
     """Frequency of the disturbance; None unless the cause is ``hum``, or if the device does not report it."""
+    beyond_model: bool = False
+    """True if the program is not linear and the device's model is: nothing need disturb the rig."""
 
     @property
     def text(self) -> str:
@@ -136,7 +151,8 @@ class MisfitPeriod:
     @property
     def cure(self) -> str:
         """Measure against the cause."""
-        return CURES[self.cause]
+        is_explained = self.beyond_model and self.cause not in _UNEXPLAINED_CAUSES
+        return NONLINEAR_CURE if is_explained else CURES[self.cause]
 
 
 @dataclass(frozen=True)
@@ -382,8 +398,14 @@ def _judge(
     )
 
 
+def is_beyond_model(run: Run) -> bool:
+    """True if the device's model is linear and the plant is not."""
+    return bool(run.conditions.segments) and run.datasheet.model is not None and not run.conditions.program.is_linear
+
+
 def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
     """Faults of the channels that the device diagnosed."""
+    beyond_model = is_beyond_model(run) if len(run.diagnosis_index) else False
     reported = zip(run.diagnosis_change, run.diagnosis_index, run.diagnosis_onset, run.diagnosis_extent, strict=True)
     return tuple(
         ChannelFault(
@@ -391,6 +413,7 @@ def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
             sample=int(sample),
             onset=int(onset),
             extent=float(extent) if Change(change) in GAINS and math.isfinite(extent) else None,
+            beyond_model=beyond_model,
         )
         for change, sample, onset, extent in reported
         if change in CHANNEL_FAULTS
@@ -400,6 +423,7 @@ def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
 def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
     """Periods in which the device reported a misfit. Each ends with the next report, or with its record."""
     changes = [*run.misfit_index.tolist(), run.samples]
+    beyond_model = is_beyond_model(run) if len(run.misfit_index) else False
     out = []
     for i, cause in enumerate(map(Cause, run.misfit_cause.tolist())):
         start = changes[i]
@@ -414,6 +438,7 @@ def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
                     end=min(changes[i + 1], record_end),
                     strength=float(run.misfit_strength[i]) or None,
                     frequency_hz=frequency / run.conditions.sample_period_s if is_known else None,
+                    beyond_model=beyond_model,
                 )
             )
     return tuple(out)
