@@ -7,8 +7,10 @@ import json
 import pickle
 import struct
 import sys
+import tempfile
 import zipfile
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -495,6 +497,15 @@ def _larger_mat() -> bytes:
     return told.replace(struct.pack("<ii", 2, 1), struct.pack("<ii", 10**9, 1))
 
 
+def wav_bytes() -> bytes:
+    """1000 samples of two channels of 16 bits."""
+    from scipy.io import wavfile
+
+    out = io.BytesIO()
+    wavfile.write(out, 8000, np.zeros((1000, 2), np.int16))
+    return out.getvalue()
+
+
 HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
 PICKLED = np.array([{"a": 1}, None], dtype=object)
 OBJECTS = np.array([({"a": 1}, 2.0), (None, 3.0)], dtype=[("u", object), ("y", float)])
@@ -567,6 +578,20 @@ BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     "cut hdf5": ("a.mat", lambda: hdf5_bytes(_huge)[:600], "damaged, or no MATLAB file"),
     "no mf4": ("a.mf4", b"MDF     4.10    " + bytes(300), "damaged, or no MF4 file"),
     "no parquet": ("a.parquet", b"PAR1" + bytes(64) + b"PAR1", "damaged, or no Parquet file"),
+    "text as mf4": ("a.mf4", b"u,y\n1,2\n3,4\n" * 20, "damaged, or no MF4 file"),
+    "text as mat": ("a.mat", b"u,y\n1,2\n3,4\n" * 20, "damaged, or no MATLAB file"),
+    "text as parquet": ("a.parquet", b"u,y\n1,2\n3,4\n" * 20, "damaged, or no Parquet file"),
+    "cut wav": ("a.wav", lambda: wav_bytes()[:2001], "is cut off: 2001 of the 4044 bytes that its header states; copy"),
+    "footer": (
+        "a.csv",
+        b"u,y\n1,2\n3,4\nEnd of file\n",
+        "line 4, column u: 'End of file' is no number; mend or delete",
+    ),
+    "footer of one column": (
+        "a.csv",
+        b"t,u,y\n0,1,2\n1,3,4\nMean,2,3\nMax,3,4\n",
+        "line 4, column t: 'Mean' is no number, perhaps a footer: mend or delete the line",
+    ),
     "no wav": ("a.wav", b"RIFF" + bytes(64), "damaged, or no WAV file"),
 }
 
@@ -689,10 +714,32 @@ def test_the_columns_are_named_to_a_user_who_named_none(tmp_path: Path, capsys: 
 
 
 def test_the_reader_is_bounded_in_memory(tmp_path: Path) -> None:
-    told = b"RIFF" + struct.pack("<I", 0xFFFFFFF0) + b"WAVEfmt " + struct.pack("<IHHIIHH", 16, 3, 1, 8000, 64000, 8, 64)
+    told = b"RIFF" + bytes(4) + b"WAVEfmt " + struct.pack("<IHHIIHH", 16, 3, 1, 8000, 64000, 8, 64)
     (tmp_path / "a.wav").write_bytes(told + b"data" + struct.pack("<I", 0xFFFFFFE0) + bytes(64))
     with pytest.raises(RecordingError, match=r"needs more than 4 GiB|damaged"):
         read_columns(tmp_path / "a.wav", ["0"])
+
+
+def test_the_reader_leaves_no_file_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    write_mf4(tmp_path / "a.mf4", *made_signals())
+    (tmp_path / "cut.mf4").write_bytes((tmp_path / "a.mf4").read_bytes()[:3000])
+    assert read_columns(tmp_path / "a.mf4", ["u"]).columns["u"].shape == (SAMPLES,)
+    with pytest.raises(RecordingError, match="damaged"):
+        read_columns(tmp_path / "cut.mf4", ["u"])
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_decimals_of_parquet_are_numbers(tmp_path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    column = pa.array([Decimal(k) / 8 for k in range(9)], pa.decimal128(12, 4))
+    parquet.write_table(pa.table({"u": column}), tmp_path / "a.parquet")
+    assert (read_columns(tmp_path / "a.parquet", ["u"]).columns["u"] == np.arange(9) / 8).all()
 
 
 def test_a_reader_that_crashes_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

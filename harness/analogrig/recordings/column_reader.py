@@ -15,8 +15,10 @@ import os
 import re
 import resource
 import sys
+import tempfile
 import warnings
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -40,6 +42,9 @@ MOST_COLUMNS = 4096
 
 _LONGEST_LINE = 1 << 16
 _MOST_NAME = 120
+_MOST_FOOTER = 20
+"""Lines at the end of a text whose unwanted columns are looked at, too."""
+
 _CHUNK_BYTES = 1 << 20
 _DELIMITERS = (",", ";", "\t")
 _SPACES = " "
@@ -201,6 +206,8 @@ def _read_rows(
     """
     found = [array.array("d") for _ in places]
     blank_lines = blank_here = 0
+    first: list[str] = []
+    last: deque[tuple[int, list[str]]] = deque(maxlen=_MOST_FOOTER)
     for number, line in lines:
         if not line.strip():
             blank_here += bool(found[0])
@@ -209,6 +216,8 @@ def _read_rows(
         if len(found[0]) == MAX_SAMPLES:
             raise ColumnError(_too_many(MAX_SAMPLES))
         row = _cells(line, delimiter)
+        first = first or row
+        last.append((number, row))
         if len(row) > len(names) and any(cell.strip() for cell in row[len(names) :]):
             raise ColumnError(
                 f"line {number} has {len(row)} cells, the first line {len(names)}: cells with decimal commas need"
@@ -226,7 +235,26 @@ def _read_rows(
                 where = f"line {number}, column {names[place][:_MOST_NAME]}"
                 why = f"{row[place][:40]!r} is no number" if place < len(row) else "the line has no such cell"
                 raise ColumnError(f"{where}: {why}; mend or delete the line") from None
+    _check_footer(first, last, names, delimiter)
     return found, blank_lines
+
+
+def _check_footer(
+    first: Sequence[str], last: Iterable[tuple[int, Sequence[str]]], names: Sequence[str], delimiter: str
+) -> None:
+    """Refuse a summary below the samples, which may have numbers in the wanted columns.
+
+    :param last: last rows with the numbers of their lines.
+    :raises ColumnError: a column that begins with a number has text in them.
+    """
+    numeric = [place for place, cell in enumerate(first) if _are_numbers([cell], delimiter)]
+    for number, row in last:
+        for place in numeric:
+            if place < len(row) and row[place].strip() and not _are_numbers([row[place]], delimiter):
+                raise ColumnError(
+                    f"line {number}, column {names[place][:_MOST_NAME]}: {row[place][:40]!r} is no number, perhaps a"
+                    " footer: mend or delete the line"
+                )
 
 
 def _check_text(path: Path, skip_lines: int) -> None:
@@ -411,7 +439,7 @@ def open_parquet(path: Path) -> Table:
     file = parquet.ParquetFile(path)
     table = Table()
     for kind in file.schema_arrow:
-        if types.is_integer(kind.type) or types.is_floating(kind.type) or types.is_boolean(kind.type):
+        if any(each(kind.type) for each in (types.is_integer, types.is_floating, types.is_boolean, types.is_decimal)):
             table.add(kind.name, (file.metadata.num_rows,), partial(_parquet_column, file, kind.name))
             table.units[kind.name] = (kind.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
         elif types.is_timestamp(kind.type):
@@ -434,6 +462,11 @@ def open_wav(path: Path) -> Table:
     """Table of the channels 0, 1, ...; whole numbers are scaled to -1..1."""
     from scipy.io import wavfile
 
+    with path.open("rb") as file:
+        start = file.read(8)
+    stated, size = int.from_bytes(start[4:], "little"), path.stat().st_size
+    if start.startswith(b"RIFF") and stated > size:
+        raise ColumnError(f"is cut off: {size} of the {stated + 8} bytes that its header states; copy it once more")
     rate_hz, values = wavfile.read(path)
     scaled = np.asarray(values)
     if scaled.dtype.kind == "u":
@@ -513,11 +546,13 @@ def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
 
 def main(request: str) -> None:
     """Answer one request."""
+    asked = json.loads(request)
+    tempfile.tempdir = str(Path(asked["out"]).parent)  # asammdf leaves a file there
     resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_PROCESSOR_S, MOST_PROCESSOR_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     warnings.simplefilter("ignore")  # of libraries, about damaged files
-    sys.stdout.write(json.dumps(answer(json.loads(request))))
+    sys.stdout.write(json.dumps(answer(asked)))
     sys.stdout.flush()
     os._exit(0)  # destructors of half-open files would write to standard error
 
