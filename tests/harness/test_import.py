@@ -786,12 +786,42 @@ def test_signals_without_a_sample_of_a_channel_are_refused(tmp_path: Path, capsy
     assert capsys.readouterr().err == f"analogrig: {tmp_path}/a.csv: every sample of displacement is clipped\n"
 
 
-def test_signals_of_another_program_need_its_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    signals, recording = str(tmp_path / "motor.csv"), str(tmp_path / "motor.npz")
-    assert main(["emulate", "--scenario", "dc-motor", "--seed", "5", "--out", signals]) == 0
+@pytest.mark.parametrize("name", ["dc-motor", "pendulum", "two-tanks", "rc-battery"])
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+@pytest.mark.usefixtures("in_this_process")
+def test_signals_of_another_program_come_back_with_its_scenario_or_its_name(
+    name: str, suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    signals, recording = str(tmp_path / f"signals.{suffix}"), str(tmp_path / "recording.npz")
+    scenario = Scenario.load(name)
+    assert main(["emulate", "--scenario", name, "--seed", "5", "--out", signals]) == 0
     assert main(["import", signals, "--out", recording]) == 2
-    assert "motor.csv: lacks channels of program front, force, displacement" in capsys.readouterr().err
-    assert main(["import", signals, "--scenario", "dc-motor", "--out", recording]) == 0
-    with open_rig("emulator") as rig:
-        played = np.concatenate([block.codes for block in rig.perform(Scenario.load("dc-motor"), 5).blocks])
-    assert np.array_equal(Run.load(Path(recording)).codes, played)
+    told = f"has the channels {', '.join(scenario.program.channels)}, program front force, displacement, velocity"
+    assert told in capsys.readouterr().err
+    rig_name = scenario.rig or "emulator"
+    with open_rig(rig_name) as rig:
+        performance = rig.perform(scenario, 5)
+        codes = np.concatenate([block.codes for block in performance.blocks])
+    for options in (["--scenario", name], ["--program", name, "--rig", rig_name]):
+        assert main(["import", signals, *options, "--out", recording]) == 0
+        run = Run.load(Path(recording))
+        assert np.array_equal(run.codes, codes)
+        assert run.conditions.channels == performance.channels
+        assert run.conditions.sample_period_s == performance.sample_period_s
+        assert bool(run.conditions.segments) == (options[0] == "--scenario")
+    assert main(["replay", recording, "--dut", "inproc", "--out", str(tmp_path / "blind")]) == 3
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_columns_of_a_program_are_in_its_units_without_a_scenario(tmp_path: Path) -> None:
+    u, y = made_signals()
+    np.savez(tmp_path / "a.npz", u=u, y=y)
+    out, named = str(tmp_path / "out.npz"), ["--rate", "100", "--clock", "plant", "--program", "duffing"]
+    columns_named = ["--input", "u", "--input-unit", "mN", "--output", "y", "--output-unit", "mm"]
+    assert main(["import", str(tmp_path / "a.npz"), *columns_named, *named, "--out", out]) == 0
+    run = Run.load(Path(out))
+    assert run.conditions.program.name == "duffing" and not run.conditions.segments
+    assert run.conditions.time_scale == 10.0
+    assert np.abs(run.channel("x") - 1e-3 * y).max() < 1e-6
+    judged = replace_scenario(run, Scenario.load("duffing"))
+    assert judged.conditions.channels == run.conditions.channels

@@ -6,10 +6,21 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import FILE, RIG_NAMES, SCENARIO, add_command, add_json, add_rig, files_read, trust_of
+from analogrig.cli.options import (
+    FILE,
+    PROGRAM,
+    RIG_NAMES,
+    SCENARIO,
+    add_command,
+    add_json,
+    add_rig,
+    files_read,
+    trust_of,
+)
 from analogrig.cli.terminal import PASSED, show, show_result, show_work
 
 if TYPE_CHECKING:
+    from analogrig.program import Program
     from analogrig.recordings.imported import ImportDescription
     from analogrig.run import Run
     from analogrig.scenario import Scenario
@@ -25,6 +36,7 @@ def add(commands: Any) -> None:
         "import SNLS80mV.csv --input V1 --output V2 --rate 610.3515625 --out build/silverbox.npz",
         "import bench.mat --map bench.toml --scenario mine.toml --out build/bench.npz",
         "import build/signals.csv --scenario thesis --out build/again.npz",
+        "import build/pendulum.csv --program pendulum --out build/pendulum.npz",
     )
     command.add_argument(
         "file", type=Path, metavar=FILE, help=".csv, .tsv, .txt, .npy, .npz, .mat, .mf4, .parquet or .wav"
@@ -60,7 +72,17 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--scenario", metavar=SCENARIO, help="scenario with the truth: shipped name or .toml file (default: unknown)"
     )
-    add_rig(command, f"rig of a file of analogrig emulate: {RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)")
+    command.add_argument(
+        "--program",
+        metavar=PROGRAM,
+        help="program whose input and output the columns are: shipped name or .toml file (default: the scenario's, or"
+        " front)",
+    )
+    add_rig(
+        command,
+        f"rig of a file of analogrig emulate: {RIG_NAMES} (default: $ANALOGRIG_RIG, that of the scenario, or emulator)",
+        None,
+    )
     add_json(command)
     command.set_defaults(command=_run)
 
@@ -69,14 +91,18 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError
     from analogrig.identity import Identity
     from analogrig.output import move_aside
+    from analogrig.program import Program
     from analogrig.scenario import Scenario
 
     if arguments.out.suffix != ".npz":
         raise ConfigurationError(f"--out {arguments.out}: the file's name must end with .npz")
     move_aside(arguments.out, (*files_read(arguments), *([arguments.map] if arguments.map else [])))
     scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    program = None if arguments.program is None else Program.load(arguments.program)
+    if scenario is not None and program is not None:
+        scenario = scenario.on_program(program)
     with show_work("reading"):
-        run = _import(arguments, scenario)
+        run = _import(arguments, scenario, program)
         run = run.with_identity(Identity.here(arguments.command_line, arguments.started))
         run.save(arguments.out)
     table = _as_json(run, arguments)
@@ -87,12 +113,12 @@ def _run(arguments: argparse.Namespace) -> int:
     return PASSED
 
 
-def _import(arguments: argparse.Namespace, scenario: Scenario | None) -> Run:
+def _import(arguments: argparse.Namespace, scenario: Scenario | None, program: Program | None) -> Run:
     from analogrig.cli.options import DEFAULT_SCENARIO
     from analogrig.errors import RecordingError
     from analogrig.recordings.columns import read_columns
     from analogrig.recordings.imported import import_columns, import_signals, is_emulated
-    from analogrig.rigs.description import open_rig
+    from analogrig.rigs.description import DEFAULT_RIG, open_rig
     from analogrig.scenario import Scenario
 
     table = _table(arguments)
@@ -101,9 +127,11 @@ def _import(arguments: argparse.Namespace, scenario: Scenario | None) -> Run:
         if not is_emulated(arguments.file, names):
             shown = ", ".join(name[:40] for name in names[:20]) + (", ..." if len(names) > 20 else "") or "none"
             raise RecordingError(f"{arguments.file}: name the columns with --input and --output: there are {shown}")
-        with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
-            return import_signals(arguments.file, rig, scenario, scenario or Scenario.load(DEFAULT_SCENARIO))
-    return import_columns(arguments.file, _described(table, arguments), scenario)
+        usual = Scenario.load(DEFAULT_SCENARIO) if program is None else Scenario.of_program(program)
+        rig_name = arguments.rig or (scenario.rig if scenario else "") or DEFAULT_RIG
+        with open_rig(rig_name, allow=trust_of(arguments)) as rig:
+            return import_signals(arguments.file, rig, scenario, scenario or usual)
+    return import_columns(arguments.file, _described(table, arguments), scenario, program)
 
 
 def _table(arguments: argparse.Namespace) -> dict[str, Any]:

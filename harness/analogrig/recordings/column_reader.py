@@ -3,7 +3,8 @@
 It runs in a process of its own with bounded memory and time, because a damaged or hostile file may exhaust the memory
 or crash the library that reads it. Nothing in a file is executed: no pickles, no formulas, no links to other files.
 REQUEST is a JSON object: ``file``; ``wanted``, the columns to read; ``skip_lines``; ``out``, the .npz to write them to.
-The answer is a JSON object on standard output: ``names``, ``rate_hz``, ``blank_lines`` and ``units``, or ``error``.
+The answer is a JSON object on standard output: ``names``, ``rate_hz``, ``blank_lines``, ``units`` and
+``channels``, or ``error``.
 """
 
 from __future__ import annotations
@@ -42,6 +43,9 @@ MOST_COLUMNS = 4096
 
 _LONGEST_LINE = 1 << 16
 _MOST_NAME = 120
+_MOST_TEXT_BYTES = 4096
+"""Largest array of texts that is read."""
+
 _MOST_FOOTER = 20
 """Lines at the end of a text whose unwanted columns are looked at, too."""
 
@@ -73,6 +77,8 @@ class Table:
     """Sample rate that the file states; None if it states none."""
     units: dict[str, str] = field(default_factory=dict)
     """Units that the file states beside the names of columns."""
+    channels: list[str] = field(default_factory=list)
+    """Names in the array ``channels`` of an archive, as analogrig writes it."""
 
     def add_typed(self, name: str, dtype: np.dtype[Any], shape: Sequence[int], load: Callable[[], Any]) -> None:
         """Add an array of NumPy, or each field of a structured one as ``name.field``; texts are left out."""
@@ -335,6 +341,9 @@ def open_npz(path: Path) -> Table:
         if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > info.file_size:
             raise ColumnError(f"{name[:_MOST_NAME]} declares the shape {shape}, larger than its member of the archive")
         table.add_typed(name, dtype, shape, partial(_npz_member, archive, info))
+        if name == "channels" and dtype.kind == "U" and info.file_size < _MOST_TEXT_BYTES:
+            channels = _npz_member(archive, info).reshape(-1).tolist()
+            table.channels = channels if all(each.isprintable() for each in channels) else []
     return table
 
 
@@ -506,6 +515,8 @@ class Columns(NamedTuple):
     """Blank lines between rows of text."""
     units: Mapping[str, str] = MappingProxyType({})
     """Units that the file states beside the names of the wanted columns."""
+    channels: Sequence[str] = ()
+    """Names in the array ``channels`` of an archive."""
 
 
 def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
@@ -522,7 +533,7 @@ def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
     for name in wanted:
         _place(name, names)
     units = {name: table.units[name][:_MOST_NAME] for name in wanted if table.units.get(name)}
-    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz, units=units)
+    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz, 0, units, table.channels)
 
 
 def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -540,8 +551,9 @@ def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
     except Exception as error:  # noqa: BLE001 - the libraries raise anything on damaged files
         cause = re.sub(r"\s+", " ", str(error))[:200] or type(error).__name__
         return {"error": f"damaged, or no {FORMATS[path.suffix.lower()][0]} file: {cause}"}
-    told = {"rate_hz": found.rate_hz, "blank_lines": found.blank_lines, "units": dict(found.units)}
-    return {"names": found.names, **told}
+    told = found._asdict() | {"units": dict(found.units)}
+    del told["columns"]
+    return told
 
 
 def main(request: str) -> None:

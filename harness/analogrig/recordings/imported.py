@@ -156,10 +156,13 @@ def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
     return len(channels) > 1 and {f"{name}_clipped" for name in channels} <= set(names)
 
 
-def import_columns(path: Path, described: ImportDescription, scenario: Scenario | None) -> Run:
+def import_columns(
+    path: Path, described: ImportDescription, scenario: Scenario | None, program: Program | None = None
+) -> Run:
     """Recording of two columns of a file, which no device has seen.
 
     :param scenario: the truth about plant and changes; None: unknown.
+    :param program: whose input and output the columns are, without a scenario; None: unknown.
     :raises RecordingError: the file cannot be read, or its columns give no samples.
     :raises ConfigurationError: the recording is longer than the scenario, or in other units than its program.
     """
@@ -180,7 +183,8 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         raise RecordingError(f"{path}: has a single row: a recording needs two")
     if described.samples is not None and samples < described.samples:
         raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
-    program = Program.load(DEFAULT_PROGRAM) if scenario is None else scenario.program
+    is_known = scenario is not None or program is not None
+    program = scenario.program if scenario else program or Program.load(DEFAULT_PROGRAM)
     shape, channels = (samples, len(program.channels)), {}
     codes, clipped = np.zeros(shape, np.uint16), np.ones(shape, np.bool_)
     for at, (name, each) in enumerate(zip(program.measured, (described.input, described.output), strict=True)):
@@ -192,9 +196,9 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
     rig |= {"blank_lines": found.blank_lines, "header_units": headers}
-    truth = _truth(path, samples, 1.0 / rate_hz, scenario)
+    truth = _truth(path, samples, 1.0 / rate_hz, scenario, program)
     run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
-    return run if scenario is None else dataclasses.replace(run, conditions=scaled_to_program(run.conditions))
+    return dataclasses.replace(run, conditions=scaled_to_program(run.conditions)) if is_known else run
 
 
 def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scenario) -> Run:
@@ -202,16 +206,17 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
 
     :param played: scenario whose units the rig states.
     """
-    names = played.program.channels
+    names, there = played.program.channels, read_columns(path)
     if path.suffix == ".npz":
         wanted = [f"{kind}[{i}]" for kind in ("codes", "clipped") for i in range(len(names))]
     else:
         wanted = [f"{name}_{kind}" for kind in ("code", "clipped") for name in names]
-        if not set(wanted) <= set(read_columns(path).names):
-            raise RecordingError(
-                f"{path}: lacks channels of program {played.program.name}, {', '.join(names)}: pass the scenario that"
-                " was played with --scenario"
-            )
+    channels = there.channels or tuple(name.removesuffix("_code") for name in there.names if name.endswith("_code"))
+    if channels != names:
+        raise RecordingError(
+            f"{path}: has the channels {', '.join(channels)[:200]}, program {played.program.name} {', '.join(names)}:"
+            " pass the scenario that was played with --scenario, or its program with --program"
+        )
     found = read_columns(path, wanted)
     values = np.stack([found.columns[name] for name in wanted], axis=1)
     performance = rig.perform(played, 0)
@@ -235,7 +240,7 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
         performance.sample_period_s,
         performance.time_scale,
         description,
-        *_truth(path, len(codes), performance.sample_period_s, scenario),
+        *_truth(path, len(codes), performance.sample_period_s, scenario, played.program),
     )
 
 
@@ -310,14 +315,14 @@ def _rate_hz(
 
 
 def _truth(
-    path: Path, samples: int, period_s: float, scenario: Scenario | None
+    path: Path, samples: int, period_s: float, scenario: Scenario | None, program: Program
 ) -> tuple[Scenario, tuple[Segment, ...]]:
     """Scenario and plant of a recording; without a scenario they are unknown.
 
     :raises ConfigurationError: the recording is longer than the scenario.
     """
     if scenario is None:
-        return _unknown(path, samples, period_s), ()
+        return _unknown(path, samples, period_s, program), ()
     if samples > scenario.samples:
         raise ConfigurationError(
             f"{path}: has {number_of(samples, 'sample')}, scenario {scenario.name} {scenario.samples}:"
@@ -369,7 +374,8 @@ def unanswered(
     )
 
 
-def _unknown(path: Path, samples: int, period_s: float) -> Scenario:
+def _unknown(path: Path, samples: int, period_s: float, program: Program) -> Scenario:
     """Scenario of samples of which nothing is known: a generator that never switches, and no change."""
     still = Excitation(low_v=0.0, high_v=0.0, frequency_hz=min(max(0.1 / period_s, 1e-6), 1e12))
-    return Scenario(samples=samples, excitation=still, name=path.stem, description="measured data, plant unknown")
+    text = "measured data, plant unknown"
+    return Scenario(samples=samples, program=program, excitation=still, name=path.stem, description=text)
