@@ -615,23 +615,20 @@ def _attribute_alarms(
     run: Run, model: Model | None, expect: Expectations, level: float
 ) -> tuple[tuple[ChangeVerdict, ...], tuple[int, ...]]:
     """Verdict on each change, and the samples of the false alarms."""
-    alarms = run.alarm_index.tolist()
     by_start = {segment.start: segment for segment in run.conditions.segments}
-    detected: set[int] = set()
     tweaks = []
     diagnosed, is_bounded = run.conditions.program.diagnosed, information.is_bounded(run)
     isolates = len(run.diagnosis_index) and diagnosed
     model = model or information.model_of(run)
     isolation_bounds = information.isolation_bounds(run, model) if isolates else [None] * len(run.segments)
-    for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
-        run.segments, run.segments[1:], information.change_information(run, model), isolation_bounds, strict=False
+    informations = information.change_information(run, model)
+    alarms = _alarms_by_change(run, informations)
+    for (_, _, before), (start, end, after), gathered, in_segment, isolation_bound_n in zip(
+        run.segments, run.segments[1:], informations, alarms, isolation_bounds, strict=False
     ):
         if start in run.conditions.records:
             continue  # a device that restarts has no earlier plant to compare with
-        # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
-        in_segment = [index for index in alarms if start < index <= end] if _may_alarm(gathered) else []
         detection = in_segment[0] if in_segment else None
-        detected |= alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
         late = first_at_level(gathered, expect.late_information_ratio * level)
         bound_n = first_at_level(gathered, level)
@@ -652,7 +649,35 @@ def _attribute_alarms(
                 else _judge_diagnosis(run, by_start[start], (detection, end), changed, isolation_bound_n),
             )
         )
-    return tuple(tweaks), tuple(sorted(set(alarms) - detected))
+    return tuple(tweaks), _unexplained(run, alarms)
+
+
+def unexplained_alarms(run: Run) -> tuple[int, ...]:
+    """Sample indices of the alarms that no change explains, at the likeliest instants of the changes.
+
+    :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
+    """
+    return _unexplained(run, _alarms_by_change(run, information.change_information(run)))
+
+
+def _alarms_by_change(run: Run, informations: Iterable[NDArray[np.float64]]) -> list[list[int]]:
+    """Alarms in the segment of each change; none where it gives too little information."""
+    # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
+    return [
+        [index for index in run.alarm_index.tolist() if start < index <= end] if _may_alarm(gathered) else []
+        for (start, end, _), gathered in zip(run.segments[1:], informations, strict=True)
+    ]
+
+
+def _unexplained(run: Run, alarms: Iterable[list[int]]) -> tuple[int, ...]:
+    """Alarms other than those of the changes, to which ``alarms`` attributes them; a record begins without a change."""
+    ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
+    explained = [
+        _alarms_of_change(in_segment, start + ramps_n[start])
+        for (start, _, _), in_segment in zip(run.segments[1:], alarms, strict=True)
+        if start not in run.conditions.records
+    ]
+    return tuple(sorted(set(run.alarm_index.tolist()).difference(*explained)))
 
 
 def _may_alarm(gathered: NDArray[np.float64]) -> bool:
@@ -688,7 +713,7 @@ def _judge_diagnosis(
     )
 
 
-def alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
+def _alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
     """Alarms attributed to a change: all until the end of its ramp, and the first one after it.
 
     An alarm on a ramp restarts the device on a plant that keeps changing. It must detect that change again.
