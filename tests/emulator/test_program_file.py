@@ -45,6 +45,9 @@ states.y.full = 10.0
 parameters.T.value = 3000.0
 """
 
+I0 = 'i0 = { value = 4e3, unit = "mA" }'
+"""Row of a parameter in another size of unit than the state i."""
+
 Change = Callable[[str], str]
 
 
@@ -225,6 +228,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "wrong size of a unit": (
         swapped('unit = "H"', 'unit = "mH"'),
         "line 1: i' is in A s\\^-1, the right side in 1000 A",
+    ),
+    "terms of one unit in two sizes": (
+        equation("omega' = (torque - d*omega*(1 + (i/i0)**2)) / J", with_row("parameters", I0)),
+        r"line 3: 1 is in 1 and \(i / i0\) \*\* 2 in 1e\+06; the dimension is the same, the size is not: write",
     ),
     "unknown unit": (swapped('unit = "H"', 'unit = "henry"'), "parameters.L: unit 'henry': unknown symbol 'henry'"),
     "unit ends early": (swapped('unit = "H"', 'unit = "V s/"'), "parameters.L: unit 'V s/' ends before a symbol"),

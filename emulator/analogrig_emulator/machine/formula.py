@@ -249,7 +249,10 @@ def _same_unit(left: Formula, one: Unit | None, right: Formula, other: Unit | No
     if one is None or other is None:
         return one or other
     if not one.matches(other):
-        raise ProgramError(f"{left} is in {one.text} and {right} in {other.text}; make both units the same")
+        cure = "make both units the same"
+        if one.exponents == other.exponents:
+            cure = "the dimension is the same, the size is not: write one unit for all, such as m and no mm"
+        raise ProgramError(f"{left} is in {one.text} and {right} in {other.text}; {cure}")
     return one
 
 
