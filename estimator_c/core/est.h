@@ -29,9 +29,9 @@
 ///         use(est_theta(&estimator, 0), ...);
 ///     }
 ///
-/// The false-alarm rate holds from some 2,000 samples after est_init() on, whatever the noise: white noise of 0.3 to 4
-/// codes, 10 to 18 bits, poles from 0.3 to 0.999. If the model does not fit the plant, the trigger becomes less
-/// sensitive: est_scale() grows. est_fit.h names the cause.
+/// The false-alarm rate holds from the end of the warm-up on, by default 550 innovations after est_init(). It holds for
+/// white noise of 0.3 to 4 codes, 10 to 18 bits, and poles from 0.3 to 0.999. If the model does not fit the plant, the
+/// trigger becomes less sensitive: est_scale() grows. est_fit.h names the cause.
 ///
 /// Units: signals are in codes of the converter, so that quantisation is 1. The defaults assume noise of about one
 /// code. If signals have another unit, say volts, either divide them by the volts per code, which needs no other
