@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analogrig.estimator_config import EstimatorConfig
 from estimator_c.evidence.cost import SLICES_N as DEVICE_SLICES_N
 
 CORE = Path(__file__).parents[2] / "estimator_c" / "core"
@@ -38,6 +39,11 @@ COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "sat
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM, CUSTOM = range(5)
 UPDATED, MISSING, REFUSED, GATHERING = range(4)
 LOCKED, MAY_SLIP, ANYWHERE = range(3)
+
+WARM_UP_N = EstimatorConfig().warm_up_n
+"""Warm-up of the default configuration."""
+SHORT_WARM_UP_N = 150
+"""Warm-up for short records."""
 
 
 class Config(ctypes.Structure):
@@ -157,10 +163,10 @@ class Estimator:
         return fields | {"c1": c1, "c2": c2}
 
     def init(self, **changes: float | tuple[float, float]) -> bool:
-        """est_init() with the default configuration and these changes; armed soon, because most records are short."""
+        """est_init() with the default configuration, a short warm-up, and these changes."""
         config = Config()
         self._c.driver_default(ctypes.byref(config))
-        config.warm_up_n = 150.0
+        config.warm_up_n = SHORT_WARM_UP_N
         for name, value in changes.items():
             setattr(config, name, (ctypes.c_double * 2)(*value) if isinstance(value, tuple) else value)
         return bool(self._c.driver_init(ctypes.byref(config)))
