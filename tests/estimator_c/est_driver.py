@@ -181,7 +181,7 @@ class Estimator:
         alarm, status, idle = (np.zeros(n, np.uint8) for _ in range(3))
         arrays = (u_, y_, valid_, theta, innovation, statistic, alarm, status, idle)
         held = self._c.driver_run(ctypes.c_size_t(n), *(ctypes.c_void_p(a.ctypes.data) for a in arrays))
-        assert held, "est_invariants_hold() was false"
+        assert held, "est_invariants_hold() was false, or est_copy_theta() is another than est_theta()"
         counters = (ctypes.c_uint * len(COUNTERS))()
         self._c.driver_counters(counters)
         variance = np.array([self._c.driver_variance(i) for i in range(theta.shape[1])])
