@@ -142,6 +142,14 @@ def test_mean_after_an_alarm_begins_with_its_first_term(estimator: Estimator) ->
     assert result.statistic[first] == np.abs(result.innovation[first])
 
 
+def test_mean_of_more_innovations_than_are_counted_does_not_begin_anew(estimator: Estimator) -> None:
+    """The count ends at 65,535. From then on the mean has that memory."""
+    rng, samples = np.random.default_rng(3), 66_000
+    u, y = rng.normal(0.0, 100.0, samples), rng.normal(0.0, 10.0, samples)
+    assert estimator.init(**PLAIN, kind=MEAN_BETWEEN_FAULTS, ceiling=450.0, warm_up_n=0)
+    assert estimator.run(u, y).statistic[65_000:].max() < 0.5
+
+
 def test_absolute_mean_averages_magnitudes(estimator: Estimator) -> None:
     rng = np.random.default_rng(3)
     u, y = rng.normal(0.0, 100.0, 300), rng.normal(0.0, 10.0, 300)
