@@ -221,6 +221,8 @@ int driver_invariants_hold_if_damaged(int way) {
 
 float driver_noise_variance(void) { return est_noise_variance(&self); }
 
+float driver_scale(void) { return est_scale(&self); }
+
 void driver_counters(unsigned out[9]) {
     const est_counters_t c      = est_counters(&self);
     const unsigned       all[9] = { c.updated, c.missing,   c.refused, c.alarms,   c.restarts,

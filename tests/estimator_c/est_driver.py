@@ -152,6 +152,7 @@ class Estimator:
         self._c = ctypes.CDLL(str(library))
         self._c.driver_variance.restype = ctypes.c_float
         self._c.driver_noise_variance.restype = ctypes.c_float
+        self._c.driver_scale.restype = ctypes.c_float
 
     def default(self) -> Mapping[str, float]:
         """est_config_default(), by the names that the harness has for its fields."""
@@ -194,6 +195,10 @@ class Estimator:
     def age_counters(self) -> None:
         """Sets all counters to one below their limits."""
         self._c.driver_age_counters()
+
+    def scale(self) -> float:
+        """est_scale(), in codes^2."""
+        return float(self._c.driver_scale())
 
     def inflate(self, inflation: float) -> None:
         """Sets the inflation of the scale, as after alarms that were not justified."""

@@ -227,6 +227,17 @@ def test_blocks_raise_no_alarm_where_nothing_can_be_hidden(estimator: Estimator,
     assert alarms_behind_an_inflated_scale(estimator, 1200, 0, **settings) == []
 
 
+def test_scale_inflated_by_edges_at_any_instant_is_that_of_the_noise_once_they_are_known(estimator: Estimator) -> None:
+    """The alarms that inflated it came from edges that no longer count."""
+    rng = np.random.default_rng(3)
+    edges = np.arange(10.0, 3000.0, 50.0) + rng.uniform(0.0, 1.0, 60)
+    u, y = suspension([(0, FRONT)], edges, 3000, 1.0, 3)
+    assert estimator.init()
+    estimator.inflate(INFLATION)
+    result = estimator.run(u, y)
+    assert estimator.scale() < 2.0 * result.noise_variance
+
+
 def test_noise_behind_an_inflated_scale_raises_no_alarm(estimator: Estimator) -> None:
     for seed in range(10):
         assert alarms_behind_an_inflated_scale(estimator, 2500, seed) == []
