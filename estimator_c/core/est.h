@@ -29,9 +29,10 @@
 ///         use(est_theta(&estimator, 0), ...);
 ///     }
 ///
-/// The false-alarm rate holds from some 2,000 samples after est_init() on, whatever the noise: white noise of 0.3 to 4
-/// codes, 10 to 18 bits, poles from 0.3 to 0.999. If the model does not fit the plant, the trigger becomes less
-/// sensitive: est_scale() grows. est_fit.h names the cause.
+/// The false-alarm rate holds from the end of the warm-up on, by default 550 innovations after est_init(). It holds for
+/// white noise of 0.3 to 4 codes, 10 to 18 bits, and poles from 0.3 to 0.999. If the edges of u drift by 20 ppm, it
+/// holds on average over such plants, and slow ones have up to 2.5 times as many false alarms. If the model does not fit
+/// the plant, the trigger becomes less sensitive: est_scale() grows. est_fit.h names the cause.
 ///
 /// Units: signals are in codes of the converter, so that quantisation is 1. The defaults assume noise of about one
 /// code. If signals have another unit, say volts, either divide them by the volts per code, which needs no other
@@ -482,7 +483,7 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// has its equation. After any other gap the equations begin anew, as after est_init().
 /// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.45 times a
 /// typical one if edges may slip, 1.3 times otherwise.
-/// RAM: the state, and stack: on a Cortex-M 300 to 440 bytes, at -O0 4,500; on an AVR 340, at -O0 2,800 (make
+/// RAM: the state, and stack: on a Cortex-M 240 to 440 bytes, at -O0 4,500; on an AVR 360, at -O0 2,800 (make
 /// cost). May be called from an interrupt.
 est_step_t est_step(est_t* self, est_sample_t sample);
 

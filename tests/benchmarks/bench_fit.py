@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.estimator_c import misfits
-from tests.estimator_c.est_driver import Estimator, compile_driver
+from tests.estimator_c.est_driver import WARM_UP_N, Estimator, compile_driver
 from tests.estimator_c.plants import FRONT, Mechanics, random_plants, simulate
 
 from .figure import Figure
@@ -22,7 +22,6 @@ LATER_N = 4000
 HEALTHY_N = 20_000
 CHANGED_AT = 1500
 SEED = 41
-WARM_UP_N = 550
 
 
 def figures(trials: int = 100) -> Iterator[Figure]:

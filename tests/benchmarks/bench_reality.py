@@ -28,7 +28,7 @@ from .conditions import CONDITIONS, Condition
 from .false_alarms import CLUSTER_N, FalseAlarms, count_false_alarms
 from .figure import Figure
 from .played import PARAMETERS, Change
-from .shipped import ONSET_N, ONSET_SPAN_N, Misfit, answers_to, reported_misfits, settling_n, shipped
+from .shipped import ONSET_N, ONSET_SPAN_N, Misfit, answers_to, exposure_n, reported_misfits, shipped
 from .simulated import Simulated
 
 MISFIT_N, MISFIT_RUNS = 2000, 100
@@ -55,7 +55,7 @@ them. Rows marked *simulated* integrate the equation of the plant instead. Seeds
 
 | column | meaning |
 |---|---|
-| false alarms per 1e5 | alarms after the settling time; those up to {CLUSTER_N} samples apart are one cluster |
+| false alarms per 1e5 | alarms per armed sample; those up to {CLUSTER_N} samples apart are one cluster |
 | 99 % bound | one-sided upper bound of that rate, with the dispersion of clusters and runs |
 | MISFIT | of the first {MISFIT_RUNS} runs, those with a misfit within {MISFIT_N:,} samples, by its kind |
 | missed | changes without an alarm within 300 samples; 900 to 3,000 where the excitation is slower |
@@ -135,14 +135,13 @@ class Healthy:
 def play_healthy(condition: Condition, effort: Effort) -> Healthy:
     """Play the runs without a change."""
     device = shipped()
-    settled = settling_n(device)
     alarms, exposures_n = [], []
     misfits: list[Sequence[Misfit]] | None = []
     seeds = range(HEALTHY_SEED, HEALTHY_SEED + effort.runs)
     for played in condition.play(seeds, effort.run_n, [None] * effort.runs):
-        found = answers_to(device, played).alarms
-        alarms.append([alarm.index for alarm in found if alarm.index >= settled])
-        exposures_n.append(int(played.valid[settled:].sum()))
+        answers = answers_to(device, played)
+        alarms.append([alarm.index for alarm in answers.alarms])
+        exposures_n.append(exposure_n(device, played, answers))
         try:
             if misfits is not None and len(misfits) < MISFIT_RUNS:
                 misfits = [*misfits, reported_misfits(played.until(MISFIT_N))]

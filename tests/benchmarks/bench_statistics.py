@@ -3,9 +3,9 @@
 Plants of tests.estimator_c.plants; at least 400 trials a cell, random phase and onset, fixed seeds, ARL0 = 1e5.
 
 python -m tests.benchmarks.bench_statistics [delay] [free-running] [false-alarms] [false-alarms-free-running] [accuracy]
-    [shipped] [random-plants] [random-plants-free-running]
+    [shipped] [start] [random-plants] [random-plants-free-running]
 
-The last three parts play the shipped device with its default settings. Random plants take 1e8 samples and some 100 s on
+The last four parts play the shipped device with its default settings. Random plants take 1e8 samples and some 100 s on
 two cores for each clock, and run only if they are named.
 """
 
@@ -58,7 +58,7 @@ from tests.estimator_c.plants import (
 from .false_alarms import FalseAlarms, count_false_alarms
 from .figure import Figure
 from .played import Played
-from .shipped import ONSET_N, ONSET_SPAN_N, answers_to, settling_n, shipped
+from .shipped import ONSET_N, ONSET_SPAN_N, answers_to, exposure_n, shipped
 
 
 def changes(excitation: Excitation) -> Iterator[tuple[str, float]]:
@@ -148,6 +148,9 @@ ARL0_SAMPLES = 10_000_000
 RUN_N, LANES = 20_000, 100
 """Samples of a run, and runs that are simulated together."""
 
+START_N = 2_000
+"""Samples of a run that shows the rate of false alarms once the trigger is armed."""
+
 WORST = 5
 """Number of random plants with a row of their own."""
 
@@ -218,21 +221,20 @@ def play_shipped(cells: Cells, change: tuple[str, float], trials: int, seed: int
 
 
 def healthy_alarms(
-    plant: Mechanics, excitation: Excitation, samples: int, seed: int, missing: float = 0.0
+    plant: Mechanics, excitation: Excitation, samples: int, seed: int, missing: float = 0.0, run_n: int = RUN_N
 ) -> FalseAlarms:
-    """False alarms of the shipped device in runs of RUN_N samples, after the settling time of each."""
+    """False alarms of the shipped device in runs of ``run_n`` samples."""
     device = shipped()
-    settled = settling_n(device)
     alarms, exposures_n = [], []
-    for part in range(max(1, samples // (RUN_N * LANES))):
-        never = np.full(min(LANES, samples // RUN_N), RUN_N)
-        played = simulate((plant, plant), never, excitation, RUN_N, seed + 1000 * part)
+    for part in range(max(1, samples // (run_n * LANES))):
+        never = np.full(min(LANES, samples // run_n), run_n)
+        played = simulate((plant, plant), never, excitation, run_n, seed + 1000 * part)
         rng = np.random.default_rng([seed, part])
         for u, y in zip(played.u, played.y, strict=True):
-            valid = rng.uniform(size=RUN_N) >= missing
-            found = answers_to(device, Played(u, y, valid, np.zeros(RUN_N))).alarms
-            alarms.append([alarm.index for alarm in found if alarm.index >= settled])
-            exposures_n.append(int(valid[settled:].sum()))
+            run = Played(u, y, rng.uniform(size=run_n) >= missing, np.zeros(run_n))
+            answers = answers_to(device, run)
+            alarms.append([alarm.index for alarm in answers.alarms])
+            exposures_n.append(exposure_n(device, run, answers))
     return count_false_alarms(alarms, exposures_n)
 
 
@@ -255,13 +257,20 @@ def plants_of_any_speed_alarms(
         pole = max(abs(np.exp(pole * PERIOD_S)) for pole in plant.poles())
         remark = f"pole {pole:.4f}, half period {half_n:g}; "
         yield _bursts(f"{name}, random plant of any speed, worst but {rank - 1}", each, remark)
-    every = FalseAlarms(
-        sum(each.exposure_n for each in found),
-        tuple(count for each in found for count in each.by_run),
-        tuple(size for each in found for size in each.clusters),
-    )
+    every = FalseAlarms.joined(found)
     yield _bursts(f"{name}, {count} random plants of any speed", every)
     yield Figure(f"{name}, random plants of any speed, throughput", every.exposure_n / took_s, "samples/s")
+
+
+def alarms_from_the_start(excitation: Excitation, count: int = 50, samples: int = 800_000) -> Figure:
+    """False alarms of random plants with poles from 0.3 to 0.999, all in the first START_N samples of a run."""
+    found = FalseAlarms.joined(
+        healthy_alarms(plant, dataclasses.replace(excitation, half_period_n=half_n), samples, 90_000 + i, run_n=START_N)
+        for i, (plant, half_n) in enumerate(plants_of_any_speed(count, seed=3))
+    )
+    return _bursts(
+        f"shipped, {_name(excitation)}: false alarms in samples up to {START_N}, {count} random plants", found
+    )
 
 
 def _bursts(name: str, found: FalseAlarms, remark: str = "") -> Figure:
@@ -276,6 +285,7 @@ PARTS: Mapping[str, Callable[[Estimator], Iterator[Figure]]] = {
     "false-alarms-free-running": lambda estimator: quietness(estimator, OWN_CLOCK, FULL_FREE, 2_000_000),
     "accuracy": lambda estimator: accuracies(estimator, SHARED_CLOCK, 1000),
     "shipped": lambda _: shipped_delays(),
+    "start": lambda _: map(alarms_from_the_start, (FULL, FULL_FREE)),
     "random-plants": lambda _: plants_of_any_speed_alarms(FULL),
     "random-plants-free-running": lambda _: plants_of_any_speed_alarms(FULL_FREE),
 }

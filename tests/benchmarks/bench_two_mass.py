@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -12,15 +12,14 @@ from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import DEFAULT_ARL0, EstimatorConfig
 from analogrig.judging.bursts import BURST, upper_count
 from analogrig.judging.courses import first_at_level
-from analogrig.judging.exposure import ObservedRecord, record_exposure
 from analogrig.program import Program
 from analogrig_emulator import Excitation
 
 from .bench_reality import Delays, delays_of
 from .emulated import Emulated
 from .figure import Figure
-from .played import CARD, FORCE, HIGH_V, LOW_V, Change, Played
-from .shipped import ONSET_N, ONSET_SPAN_N, answers_to, direct
+from .played import HIGH_V, LOW_V, Change
+from .shipped import ONSET_N, ONSET_SPAN_N, answers_to, direct, exposure_n
 
 PROGRAM = Program.load("two-mass")
 
@@ -80,19 +79,10 @@ def false_alarms(device: DirectDevice, runs: int, samples: int = HEALTHY_N) -> t
     seeds = range(HEALTHY_SEED, HEALTHY_SEED + runs)
     found = exposed = 0
     for played in CONDITION.play(seeds, samples, [None] * runs):
-        alarms = [alarm.index for alarm in answers_to(device, played).alarms]
-        found += len(alarms)
-        exposed += _armed(device, played, alarms)
+        answers = answers_to(device, played)
+        found += len(answers.alarms)
+        exposed += exposure_n(device, played, answers)
     return found, exposed
-
-
-def _armed(device: DirectDevice, played: Played, alarms: Sequence[int]) -> int:
-    """Armed samples of a run."""
-    flags = np.zeros(len(played.u), np.uint8)
-    record = ObservedRecord(
-        played.u.astype(np.uint16), flags, np.ones(len(flags), np.bool_), np.array(alarms, np.int64)
-    )
-    return record_exposure(record, device.datasheet, CARD.noise_lsb[FORCE]).armed
 
 
 def figures(trials: int = 100, runs: int = 100) -> Iterator[Figure]:

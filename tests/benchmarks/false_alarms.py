@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,16 @@ class FalseAlarms:
     """Alarms of each run."""
     clusters: tuple[int, ...]
     """Alarms of each cluster."""
+
+    @classmethod
+    def joined(cls, parts: Iterable[FalseAlarms]) -> FalseAlarms:
+        """False alarms of all the runs together."""
+        every = list(parts)
+        return cls(
+            sum(part.exposure_n for part in every),
+            tuple(count for part in every for count in part.by_run),
+            tuple(size for part in every for size in part.clusters),
+        )
 
     @property
     def alarms(self) -> int:

@@ -13,13 +13,14 @@ from analogrig.catalogue import Cause
 from analogrig.devices.device import Device
 from analogrig.devices.direct import DirectDevice
 from analogrig.devices.inproc import InprocDevice
+from analogrig.judging.exposure import ObservedRecord, record_exposure
 from analogrig.run import Channel
 
 from .played import CARD, FORCE, Played
 
 ONSET_N, ONSET_SPAN_N = 2500, 400
-"""Earliest sample of a change, and span of the instants. The device has settled, even if a fifth of the samples is
-missing: its warm-up counts equations."""
+"""Earliest sample of a change, and span of the instants. The trigger is armed by then, even if a fifth of the samples
+is missing: the warm-up counts equations."""
 
 MOST_CODE = 65535
 """Largest code of a message."""
@@ -49,11 +50,6 @@ def direct(description: InprocDevice) -> DirectDevice:
 def _prepare(device: Device) -> None:
     low_v, lsb_v = CARD.ranges_v[FORCE][0], float(CARD.lsb_v[FORCE])
     device.prepare({"u": Channel(low_v, lsb_v, "N", 294.0, 1.0)}, 1.0 / CARD.rate_hz)
-
-
-def settling_n(device: DirectDevice) -> int:
-    """Samples from the start after which the promise on false alarms holds: the header states them."""
-    return int(device.description()["estimator"]["warm_up_n"])
 
 
 def reported_misfits(played: Played) -> Sequence[Misfit]:
@@ -88,3 +84,11 @@ def answers_to(device: DirectDevice, played: Played) -> Answers:
     samples = Samples(0, played.u, played.y, played.valid)  # type: ignore[arg-type]  # up to 18 bits
     (answers,) = device.play([samples])
     return answers
+
+
+def exposure_n(device: DirectDevice, played: Played, answers: Answers) -> int:
+    """Samples of a run in which the trigger was armed."""
+    are_finite = np.ones(len(played.u), np.bool_)
+    alarms = np.array([alarm.index for alarm in answers.alarms], np.int64)
+    record = ObservedRecord(played.u, answers.flags, are_finite, alarms)  # type: ignore[arg-type]  # up to 18 bits
+    return record_exposure(record, device.datasheet, CARD.noise_lsb[FORCE]).armed

@@ -21,7 +21,7 @@ from tests import tools
 
 from .figure import Figure
 from .played import Array, Played
-from .shipped import answers_to, reported_misfits, settling_n, shipped
+from .shipped import answers_to, reported_misfits, shipped
 
 FOLDER_SETTING, FILE = tools.SILVERBOX_SETTING, tools.SILVERBOX_NAME
 
@@ -152,7 +152,7 @@ def figures() -> Iterator[Figure]:
 def _alarms(record: Record) -> Iterator[Figure]:
     device = shipped()
     answers = answers_to(device, record.played())
-    alarms = np.array([alarm.index for alarm in answers.alarms if alarm.index >= settling_n(device)], dtype=int)
+    alarms = np.array([alarm.index for alarm in answers.alarms], dtype=int)
     for start, end, most in (*PARTS, (GROWTH_END, len(record.input_v), 1)):
         found = int(np.count_nonzero((alarms >= start) & (alarms < end)))
         row = f"{ROW}, samples {start:,} to {end:,}"

@@ -7,6 +7,7 @@
 #include "est_isolation.h"
 
 #include <stddef.h>
+#include <string.h>
 
 typedef struct {
     double na, nb, nk, nc, offset, noise_estimated, refresh_n, stuck_n, idle_n, edge_instants;
@@ -110,6 +111,13 @@ void driver_default(driver_config_t* out) {
                                               0 };
 }
 
+/* est_copy_theta() and est_theta() give the same bits. */
+static int copies_theta(const float* theta) {
+    float copy[EST_THETA_MAX];
+    est_copy_theta(&self, copy);
+    return memcmp(copy, theta, est_theta_count(&self) * sizeof(float)) == 0;
+}
+
 /* theta: (n, est_theta_count()); returns whether the invariants held after every sample. */
 int driver_run(size_t               n,
                const double*        u,
@@ -134,7 +142,7 @@ int driver_run(size_t               n,
         alarm[k]      = step.alarm;
         status[k]     = (unsigned char)step.status;
         idle[k]       = step.idle;
-        held          = held && est_invariants_hold(&self);
+        held          = held && est_invariants_hold(&self) && copies_theta(&theta[k * count]);
     }
     return held;
 }
@@ -212,6 +220,8 @@ int driver_invariants_hold_if_damaged(int way) {
 }
 
 float driver_noise_variance(void) { return est_noise_variance(&self); }
+
+float driver_scale(void) { return est_scale(&self); }
 
 void driver_counters(unsigned out[9]) {
     const est_counters_t c      = est_counters(&self);

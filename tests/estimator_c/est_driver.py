@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analogrig.estimator_config import EstimatorConfig
 from estimator_c.evidence.cost import SLICES_N as DEVICE_SLICES_N
 
 CORE = Path(__file__).parents[2] / "estimator_c" / "core"
@@ -38,6 +39,11 @@ COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "sat
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM, CUSTOM = range(5)
 UPDATED, MISSING, REFUSED, GATHERING = range(4)
 LOCKED, MAY_SLIP, ANYWHERE = range(3)
+
+WARM_UP_N = EstimatorConfig().warm_up_n
+"""Warm-up of the default configuration."""
+SHORT_WARM_UP_N = 150
+"""Warm-up for short records."""
 
 
 class Config(ctypes.Structure):
@@ -146,6 +152,7 @@ class Estimator:
         self._c = ctypes.CDLL(str(library))
         self._c.driver_variance.restype = ctypes.c_float
         self._c.driver_noise_variance.restype = ctypes.c_float
+        self._c.driver_scale.restype = ctypes.c_float
 
     def default(self) -> Mapping[str, float]:
         """est_config_default(), by the names that the harness has for its fields."""
@@ -157,10 +164,10 @@ class Estimator:
         return fields | {"c1": c1, "c2": c2}
 
     def init(self, **changes: float | tuple[float, float]) -> bool:
-        """est_init() with the default configuration and these changes; armed soon, because most records are short."""
+        """est_init() with the default configuration, a short warm-up, and these changes."""
         config = Config()
         self._c.driver_default(ctypes.byref(config))
-        config.warm_up_n = 150.0
+        config.warm_up_n = SHORT_WARM_UP_N
         for name, value in changes.items():
             setattr(config, name, (ctypes.c_double * 2)(*value) if isinstance(value, tuple) else value)
         return bool(self._c.driver_init(ctypes.byref(config)))
@@ -175,7 +182,7 @@ class Estimator:
         alarm, status, idle = (np.zeros(n, np.uint8) for _ in range(3))
         arrays = (u_, y_, valid_, theta, innovation, statistic, alarm, status, idle)
         held = self._c.driver_run(ctypes.c_size_t(n), *(ctypes.c_void_p(a.ctypes.data) for a in arrays))
-        assert held, "est_invariants_hold() was false"
+        assert held, "est_invariants_hold() was false, or est_copy_theta() is another than est_theta()"
         counters = (ctypes.c_uint * len(COUNTERS))()
         self._c.driver_counters(counters)
         variance = np.array([self._c.driver_variance(i) for i in range(theta.shape[1])])
@@ -188,6 +195,10 @@ class Estimator:
     def age_counters(self) -> None:
         """Sets all counters to one below their limits."""
         self._c.driver_age_counters()
+
+    def scale(self) -> float:
+        """est_scale(), in codes^2."""
+        return float(self._c.driver_scale())
 
     def inflate(self, inflation: float) -> None:
         """Sets the inflation of the scale, as after alarms that were not justified."""

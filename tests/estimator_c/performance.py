@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from analogrig.datasheet import ModelOrders
 from analogrig.judging.bursts import upper_count
 from analogrig.plant import estimated_parameters
-from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, Estimator
+from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, SHORT_WARM_UP_N, Estimator
 from tests.estimator_c.plants import (
     CODES,
     DISPLACEMENT_RANGE_M,
@@ -33,7 +33,7 @@ ONSET_SPAN_N = 100
 HORIZON_N = 300
 """A change not noticed after so many samples is missed, and counts with that delay."""
 
-ADAPTED: Settings = {"refresh_n": 40, "warm_up_n": 150}
+ADAPTED: Settings = {"refresh_n": 40, "warm_up_n": SHORT_WARM_UP_N}
 """C follows the estimate of A; until it has, the innovations are coloured, and the trigger waits."""
 
 SHARED_CLOCK: Settings = {

@@ -54,7 +54,7 @@ from analogrig.devices.library import LIBRARY, MemoryWire
 from analogrig.links import frame
 from analogrig.links.link import FramedLink
 from tests.estimator_c import isolation, misfits
-from tests.estimator_c.est_driver import Estimator
+from tests.estimator_c.est_driver import WARM_UP_N, Estimator
 from tests.estimator_c.performance import FULL
 from tests.estimator_c.plants import FRONT, simulate
 
@@ -111,10 +111,6 @@ class Device:
         assert [of(Status, [answer])[0].counter for answer in answers] == list(Counter)
         assert {answer.answers for answer in of(Status, answers)} == {(self.seq - 1) % 256}
         return {Counter(answer.counter): answer.value for answer in of(Status, answers)}
-
-
-WARM_UP_N = 550.0
-"""By default."""
 
 
 def of(kind: type[M], messages: Iterable[Message]) -> list[M]:

@@ -95,7 +95,7 @@ def test_variance_is_that_of_least_squares(estimator: Estimator, forgetting: flo
     assert variance == pytest.approx(np.diag(covariance), rel=1e-2)
 
 
-def test_offset_and_its_variance_are_those_at_codes_of_zero(estimator: Estimator) -> None:
+def test_variances_and_offset_are_those_at_codes_of_zero(estimator: Estimator) -> None:
     """With c(k) relative to the first codes: offset = relative offset + y(0) (1 + a1 + a2) - u(0) (b0 + b1)."""
     data = record(noise=3.0)
     u_0, y_0 = 500.0, 300.0
@@ -106,9 +106,19 @@ def test_offset_and_its_variance_are_those_at_codes_of_zero(estimator: Estimator
     phi = np.column_stack([-delayed(y, 1), -delayed(y, 2), u, delayed(u, 1), np.ones(len(u))])[2:]
     covariance = np.linalg.inv(phi.T @ phi + np.diag([0.1, 0.1, 0.1, 0.1, 1e-4]))
     by_offset = np.array([y_0, y_0, -u_0, -u_0, 1.0])
-    assert result.variance[4] == pytest.approx(by_offset @ covariance @ by_offset, rel=1e-2)
+    expected = [*np.diag(covariance)[:4], by_offset @ covariance @ by_offset]
+    assert result.variance == pytest.approx(expected, rel=1e-2)
     offset = by_offset @ covariance @ phi.T @ y[2:] + y_0
     assert result.theta[-1, 4] == pytest.approx(offset, rel=2e-3)
+
+
+def test_offset_beside_a_coloured_residual_is_that_at_codes_of_zero(estimator: Estimator) -> None:
+    """The means of the samples satisfy the model."""
+    data = record(noise=3.0)
+    u, y = data.u + 500.0, data.y + 300.0
+    assert estimator.init(nb=2, nc=1, refresh_n=0, c=(0.0, 0.0), forgetting=1.0, ceiling=1e9, edge_instants=LOCKED)
+    a1, a2, b0, b1, _, offset = estimator.run(u, y).theta[-1].tolist()
+    assert offset == pytest.approx((1.0 + a1 + a2) * y.mean() - (b0 + b1) * u.mean(), abs=10.0)
 
 
 def test_noise_free_estimate_is_the_plant(estimator: Estimator) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from tests.estimator_c import misfits
-from tests.estimator_c.est_driver import GATHERING, MISSING, UPDATED, Estimator, Watched
+from tests.estimator_c.est_driver import GATHERING, MISSING, UPDATED, WARM_UP_N, Estimator, Watched
 from tests.estimator_c.plants import FRONT, Excitation, simulate
 
 Array = NDArray[np.float64]
@@ -20,8 +20,6 @@ A, B = (-1.75, 0.768), (0.002, 0.008, 0.002)
 SLOW_A, SLOW_B = (-1.99, 0.9901), (2e-5, 4e-5, 2e-5)
 N = 2000
 """Samples within which a misfit is stated."""
-WARM_UP_N = 550
-"""Default of the library."""
 SETTLING_N, BLOCK_N, PERIOD_N = 14 * 24, 768, 768 + 24
 """Samples before the first block, samples of a block, and samples from one block to the next."""
 

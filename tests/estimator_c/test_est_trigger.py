@@ -142,6 +142,14 @@ def test_mean_after_an_alarm_begins_with_its_first_term(estimator: Estimator) ->
     assert result.statistic[first] == np.abs(result.innovation[first])
 
 
+def test_mean_of_more_innovations_than_are_counted_does_not_begin_anew(estimator: Estimator) -> None:
+    """The count ends at 65,535. From then on the mean has that memory."""
+    rng, samples = np.random.default_rng(3), 66_000
+    u, y = rng.normal(0.0, 100.0, samples), rng.normal(0.0, 10.0, samples)
+    assert estimator.init(**PLAIN, kind=MEAN_BETWEEN_FAULTS, ceiling=450.0, warm_up_n=0)
+    assert estimator.run(u, y).statistic[65_000:].max() < 0.5
+
+
 def test_absolute_mean_averages_magnitudes(estimator: Estimator) -> None:
     rng = np.random.default_rng(3)
     u, y = rng.normal(0.0, 100.0, 300), rng.normal(0.0, 10.0, 300)
@@ -217,6 +225,17 @@ def test_change_behind_an_inflated_scale_is_found_by_its_blocks(
 )
 def test_blocks_raise_no_alarm_where_nothing_can_be_hidden(estimator: Estimator, settings: dict[str, float]) -> None:
     assert alarms_behind_an_inflated_scale(estimator, 1200, 0, **settings) == []
+
+
+def test_scale_inflated_by_edges_at_any_instant_is_that_of_the_noise_once_they_are_known(estimator: Estimator) -> None:
+    """The alarms that inflated it came from edges that no longer count."""
+    rng = np.random.default_rng(3)
+    edges = np.arange(10.0, 3000.0, 50.0) + rng.uniform(0.0, 1.0, 60)
+    u, y = suspension([(0, FRONT)], edges, 3000, 1.0, 3)
+    assert estimator.init()
+    estimator.inflate(INFLATION)
+    result = estimator.run(u, y)
+    assert estimator.scale() < 2.0 * result.noise_variance
 
 
 def test_noise_behind_an_inflated_scale_raises_no_alarm(estimator: Estimator) -> None:

@@ -162,6 +162,15 @@ def test_own_trigger_is_told_the_variance_that_the_innovation_should_have(estima
     assert estimator.run(u, y).statistic[800:].mean() == pytest.approx(1.0, rel=0.1)
 
 
+def test_own_trigger_is_told_the_variance_of_theta_too(estimator: Estimator) -> None:
+    """Before anything is known of the plant, the innovation is thousands of codes, and its variance as large."""
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 400.0, 50.0), 400, 2.0, 5)
+    assert estimator.init(kind=CUSTOM, custom=2, ceiling=1e6, warm_up_n=0, edge_instants=LOCKED)
+    result = estimator.run(u, y)
+    assert np.abs(result.innovation).max() > 100.0
+    assert 0.0 < result.statistic.max() < 100.0
+
+
 def test_variance_of_the_noise_is_followed(estimator: Estimator) -> None:
     """2 LSB of Gaussian noise and rounding: 4 + 1/12; what clipping at three sigma costs is made up for."""
     u, y = suspension([(0, FRONT)], np.arange(10.0, 20_000.0, 50.0), 20_000, 2.0, 5)

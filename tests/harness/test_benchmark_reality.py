@@ -12,7 +12,9 @@ from scipy import signal, stats
 from scipy.linalg import toeplitz
 
 from analogrig.bench import direct_bench
+from analogrig.catalogue import SteppedFlag
 from analogrig.devices.inproc import InprocDevice
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2, change_information
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
@@ -22,9 +24,9 @@ from tests.benchmarks import __main__ as benchmarks
 from tests.benchmarks import bench_reality, bench_statistics, silverbox
 from tests.benchmarks.bench_reality import Effort, Healthy, delays_of
 from tests.benchmarks.conditions import CONDITIONS
-from tests.benchmarks.false_alarms import CLUSTER_N, count_false_alarms
+from tests.benchmarks.false_alarms import CLUSTER_N, FalseAlarms, count_false_alarms
 from tests.benchmarks.played import Change, accumulate
-from tests.benchmarks.shipped import Misfit, answers_to, shipped
+from tests.benchmarks.shipped import Misfit, answers_to, exposure_n, shipped
 from tests.estimator_c.performance import FULL
 from tests.estimator_c.plants import FRONT, PERIOD_S, plants_of_any_speed
 
@@ -157,6 +159,31 @@ def test_delays_of_the_shipped_device_are_close_to_the_bound() -> None:
     assert 0.7 < figure.value < 2.0
     alarms = bench_statistics.healthy_alarms(FRONT, FULL, bench_statistics.RUN_N, seed=1)
     assert alarms.exposure_n > 0.9 * bench_statistics.RUN_N
+
+
+@pytest.mark.parametrize("name", ["nominal", "missing-20", "blocks"])
+def test_the_exposure_is_the_samples_with_an_equation_beyond_the_warm_up(name: str) -> None:
+    """The warm-up counts equations: it ends the later, the more samples are missing."""
+    device, (played,) = shipped(), CONDITIONS[name].play([5], 4000, [None])
+    answers = answers_to(device, played)
+    equations = (answers.flags & (SteppedFlag.MISSING | SteppedFlag.GATHERING)) == 0
+    assert not (equations & ~played.valid).any()
+    assert exposure_n(device, played, answers) == equations.sum() - EstimatorConfig().warm_up_n
+
+
+def test_the_promise_on_false_alarms_holds_as_soon_as_the_trigger_is_armed() -> None:
+    """Ten random plants of any speed, 580,000 samples; with the rate of 1.1e-6 more than 3 alarms come in 1 of 100."""
+    plants, run_n = plants_of_any_speed(10, seed=4), bench_statistics.START_N
+    found = FalseAlarms.joined(
+        bench_statistics.healthy_alarms(
+            plant, dataclasses.replace(FULL, half_period_n=half_n), 40 * run_n, i, run_n=run_n
+        )
+        for i, (plant, half_n) in enumerate(plants)
+    )
+    warm_up_n = EstimatorConfig().warm_up_n
+    assert len(found.by_run) == 400
+    assert 0.95 < found.exposure_n / (400 * (run_n - warm_up_n)) <= 1.0
+    assert found.alarms <= 3
 
 
 # ------------------------------------------------------------------------------------------------------------ Silverbox

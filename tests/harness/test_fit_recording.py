@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.config import fixtures
-from analogrig.hardware.calibration.recorded import _determined
+from analogrig.hardware.calibration.recorded import SETTLING_N, _determined
 from analogrig_emulator import Excitation, RecordedExcitation, SuspensionComputer, load_program
 
 RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0}
@@ -260,3 +260,9 @@ def test_a_missing_input_cannot_be_played(tmp_path: Path, capsys: pytest.Capture
     assert main([*command, "--out", str(tmp_path / "r.npz")]) == 0
     assert main(["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "silverbox"]) == 2
     assert "sample 300: the input is missing or clipped" in capsys.readouterr().err
+
+
+def test_the_help_states_the_settling_time(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["calibrate", "--help"])
+    assert f"not compared (default: {SETTLING_N})" in " ".join(capsys.readouterr().out.split())

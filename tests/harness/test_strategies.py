@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from analogrig import config
 from analogrig.bench import Bench, direct_bench
 from analogrig.devices.inproc import InprocDevice
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import judge
 from analogrig.program import Program
@@ -22,10 +23,10 @@ from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.scenario import PotChange, Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.strategies import (
+    BETWEEN_CHANGES_N,
     DAMPING_RATIO,
+    FIRST_CHANGE_N,
     REACH,
-    SETTLING_N,
-    WARM_UP_N,
     link_faults,
     random_suspensions,
     rigs,
@@ -94,6 +95,10 @@ def test_drawn_faults_are_such_that_a_line_has() -> None:
     check()
 
 
+def test_changes_come_after_the_warm_up_of_the_default_device() -> None:
+    assert EstimatorConfig().warm_up_n < FIRST_CHANGE_N
+
+
 def test_random_plants_are_those_that_the_device_is_held_to() -> None:
     for plant in random_suspensions(200, seed=3):
         ratio = plant.parameters()["B"] / (2.0 * (plant.parameters()["K"] * plant.parameters()["M"]) ** 0.5)
@@ -105,7 +110,7 @@ def test_random_plants_are_those_that_the_device_is_held_to() -> None:
 @pytest.mark.parametrize(
     ("fails", "expected"),
     [
-        (lambda _: True, {"samples": WARM_UP_N + SETTLING_N, "tweaks": 1}),
+        (lambda _: True, {"samples": FIRST_CHANGE_N + BETWEEN_CHANGES_N, "tweaks": 1}),
         (lambda scenario: len(scenario.tweaks) == 2, {"tweaks": 2}),
         (lambda scenario: any("M" in tweak.set for tweak in scenario.tweaks), {"tweaks": 1}),
     ],

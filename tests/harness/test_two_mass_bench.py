@@ -19,7 +19,7 @@ def test_changes_of_the_suspension_are_detected_within_the_bound_of_the_benchmar
         assert found.ratio()[0] < 1.6
     alarms, armed = false_alarms(made, 2, 20_000)
     assert alarms == 0
-    assert armed == 2 * (20_000 - 550)
+    assert 0.99 < armed / (2 * (20_000 - EstimatorConfig().warm_up_n)) <= 1.0
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -35,6 +35,9 @@ from estimator_c.evidence.mutate import Mutant, Outcome, Session, explained, mut
 from tests.properties.planted import FOUND_ONLY, GENERATED, ROOT, SOURCES
 
 PARTS = ("core", "isolation", "device")
+"""Folders whose sources are altered."""
+BESIDE = ("fit", "ports/library")
+"""Folders of other sources of the library."""
 LEAST = 0.95
 """Least part of the mutants with other code that the shipped properties fail."""
 
@@ -73,7 +76,7 @@ class Build:
         self.folder = folder
         self._exports = folder / "exports"
         self._exports.write_text(f"{{ global: {'; '.join(EXPORTED)}; local: *; }};\n")
-        for part in (*PARTS, "ports/library"):
+        for part in (*PARTS, *BESIDE):
             for path in sorted((SOURCES / part).glob("*.[ch]")):
                 shutil.copy(path, folder)
         for path in GENERATED.glob("*.[ch]"):

@@ -27,8 +27,8 @@ from analogrig_emulator import Excitation, ProgramParameter
 
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}
 DAMPING_RATIO = (0.4, 1.2)
-"""The plants that the default device is held to, all of which the pots can show. It raises false alarms on slower ones
-(harness/docs/background/properties.md)."""
+"""The plants that the default device is held to, all of which the pots can show. Slower ones:
+harness/docs/background/properties.md."""
 
 WIDE_RANGES_V = {
     "force": (-1.0, 11.0),
@@ -38,8 +38,8 @@ WIDE_RANGES_V = {
 }
 """Ranges of the card of the rig ``emulator``: they hold every signal."""
 
-WARM_UP_N, SETTLING_N = 700, 300
-"""Samples before the first change, and between two: enough edges for the device to have learned the plant."""
+FIRST_CHANGE_N, BETWEEN_CHANGES_N = 700, 300
+"""Samples before the first change, and between two: the default device is armed and has learned the plant."""
 
 QUIET_N = 1300
 """Samples of a scenario in which nothing changes."""
@@ -181,7 +181,7 @@ def changes(
         changed = draw(st.sampled_from(able))
     values = changed.parameters()
     turned = {name: _round(values[name]) for name in names}
-    sample = WARM_UP_N if at is None else draw(at)
+    sample = FIRST_CHANGE_N if at is None else draw(at)
     return PotChange(sample, turned, draw(st.integers(0, longest_ramp_n)))
 
 
@@ -324,14 +324,14 @@ def scenarios(
     plant = draw(suspensions() if program is None else plants(program))
     excitation = draw(excitations(free=free)) if program is None else Scenario.of_program(program).excitation
     tweaks: list[PotChange] = []
-    sample, now, passed = WARM_UP_N, plant, [plant]
+    sample, now, passed = FIRST_CHANGE_N, plant, [plant]
     for _ in range(draw(st.integers(min(1, most_changes), most_changes))):
         sample += draw(st.integers(0, 60))
         tweak = draw(changes(now, sizes=sizes, at=st.just(sample), together=together, longest_ramp_n=longest_ramp_n))
         tweaks.append(tweak)
         now = now.changed(tweak.set)
         passed.append(now)
-        sample += tweak.ramp_n + SETTLING_N
+        sample += tweak.ramp_n + BETWEEN_CHANGES_N
     return Scenario(
         samples=sample if tweaks else QUIET_N,
         excitation=_within_range(excitation, passed) if program is None else excitation,

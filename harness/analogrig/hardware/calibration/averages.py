@@ -28,8 +28,8 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 ProgramName = Literal["front", "shock"]
 
 SAMPLES = 1400
-SETTLING_N = 400
-"""Samples left out at the start of each recording: the state before it is unknown."""
+_LEFT_OUT_N = 400
+"""Samples left out at the start of each recording of a rig, whose state before it is unknown."""
 
 RATE_HZ = 20e3
 """Sample rate of the card. The periods below are whole numbers of its samples."""
@@ -119,7 +119,7 @@ class SquareWaveRecording:
     def split_periods(self, values: NDArray[_Scalar]) -> NDArray[_Scalar]:
         """(periods, samples of a period): the settled part of ``values`` (n,)."""
         period_n = self.period_n
-        first = -(-SETTLING_N // period_n) * period_n
+        first = -(-_LEFT_OUT_N // period_n) * period_n
         last = first + (len(values) - first) // period_n * period_n
         return values[first:last].reshape(-1, period_n)
 

@@ -23,7 +23,7 @@ from analogrig.testing.properties.experiments import (
     single_changes_are_rightly_named,
 )
 from analogrig.testing.statement import Play, with_some_seed
-from analogrig.testing.strategies import WARM_UP_N, profile, scenarios, seeds
+from analogrig.testing.strategies import FIRST_CHANGE_N, profile, scenarios, seeds
 from analogrig_emulator import Excitation
 
 ARL0 = 1e5
@@ -55,10 +55,10 @@ _SETTINGS: list[dict[str, Any]] = [
 ]
 _EACH_N = 250
 SINGLY = Scenario(
-    samples=WARM_UP_N + _EACH_N * len(_SETTINGS),
+    samples=FIRST_CHANGE_N + _EACH_N * len(_SETTINGS),
     excitation=Excitation(low_v=0.1, high_v=9.0),
     random_phase=True,
-    tweaks=tuple(PotChange(WARM_UP_N + _EACH_N * i, setting) for i, setting in enumerate(_SETTINGS)),
+    tweaks=tuple(PotChange(FIRST_CHANGE_N + _EACH_N * i, setting) for i, setting in enumerate(_SETTINGS)),
     name="singly",
     description="front suspension: one parameter at a time, by 20 % and back; K does not rise, for want of pot",
 )
