@@ -168,8 +168,7 @@ _NODES = (0.0, 0.5 - 0.5 * math.sqrt(3.0 / 7.0), 0.5, 0.5 + 0.5 * math.sqrt(3.0 
 """Lobatto nodes of a step."""
 
 
-@dataclass(frozen=True)
-class Kink:
+class Kink(NamedTuple):
     """A continuous function of three linear pieces, with slopes below lower, between, and above upper.
 
     Between, phi(w) = slopes[1] w.
@@ -213,8 +212,7 @@ class Kink:
         return 2 if math.isfinite(self.upper) else 1
 
 
-@dataclass(frozen=True)
-class Product:
+class Product(NamedTuple):
     """Product of two polynomials, each of one element of w: coefficients x and y in order of powers."""
 
     x: tuple[float, ...]
@@ -253,9 +251,8 @@ class Layout(NamedTuple):
         rows = system.rows(outputs)
         arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
         tables = (_kink_table(system.kinks), _product_table(system.products))
-        parts = [array.ravel() for array in (*arrays, *tables)]
-        block = np.concatenate(parts)
-        starts = tuple(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
+        block = np.concatenate((*arrays, *tables), axis=None)
+        starts = tuple(itertools.accumulate([part.nbytes for part in (*arrays, *tables[:-1])], initial=0))
         return cls._placed(block, starts)
 
     def with_drives(self, abc: Matrix, cde: Matrix) -> Layout:
