@@ -38,7 +38,7 @@ from analogrig_emulator.circuit.circuit import (
     VoltageSource,
     element_error,
 )
-from analogrig_emulator.circuit.nonlinear import Function, Multiplier
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
@@ -128,15 +128,16 @@ class Nodal:
         branches += [function.name for function in self._functions]
 
         self._nodes = circuit.nodes
-        self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
+        self._row = {node: i for i, node in enumerate(self._nodes)}
+        self._branch = {name: i for i, name in enumerate(branches, len(self._nodes))}
+        self._unknowns = len(self._nodes) + len(branches)
         # Ground has the last row and column, which are left out of the solution.
-        self._row = {node: i for i, node in enumerate(self._nodes)} | {GROUND: len(self._unknowns)}
-        self._branch = {name: len(self._nodes) + i for i, name in enumerate(branches)}
+        self._row[GROUND] = self._unknowns
         holders: list[Capacitor | OpAmp | Multiplier] = [*self._capacitors, *self._poles, *followers]
         self._state = {element.name: i for i, element in enumerate(holders)}
         self._columns = len(self._state) + len(self._inputs) + len(self._multipliers) + 1
         limited: tuple[OpAmp | Multiplier, ...] = (*self._poles, *followers)
-        limits = [_limits(part) for part in limited]
+        limits = [_limits(part.name, part.model) for part in limited]
         kinks = [kink for pairs in limits for _, kink in pairs]
         first_source = len(kinks)
         kinks += [Kink.deadzone(-math.inf, limiter.threshold_v, limiter.name) for limiter in self._limiters]
@@ -149,7 +150,7 @@ class Nodal:
         self._kinks = tuple(kinks)
         self._check_size()
 
-        size = len(self._unknowns) + 1
+        size = self._unknowns + 1
         self._left = np.zeros((size, size))
         self._right = np.zeros((size, self._columns + self._sources.stop - first_source))
         legs = _Stamps(size)
@@ -223,7 +224,7 @@ class Nodal:
 
     def _trim(self, solution: Matrix) -> Trim:
         laws = self._laws
-        slew_kinks = dict(zip(laws.slewing.tolist(), laws.slews.tolist(), strict=True))
+        slew_kinks = dict(zip(laws.slewing.tolist(), laws.slews, strict=True))
         return Trim(
             amps=tuple(amp.name for amp in self._poles),
             apart_v=laws.apart(solution)[laws.poles, self._columns - 1],
@@ -237,7 +238,7 @@ class Nodal:
         Key node: 1 A into it; key op-amp: 1 V in series with its + input; key multiplier with a bandwidth: 1 V added to
         its product; ground: zeros. Raises like at().
         """
-        size = len(self._unknowns)
+        size = self._unknowns
         slopes = self._laws.slopes(self._solve(self._set(dials, {}), np.eye(size + 1)))
         columns = {node: slopes[:, row] if node != GROUND else np.zeros(len(slopes)) for node, row in self._row.items()}
         amps = {amp.name: amp for amp in self._poles}
@@ -255,7 +256,7 @@ class Nodal:
             ("multipliers", len(self._multipliers), library.MAX_PRODUCTS),
             ("inputs and multipliers", len(self._inputs) + len(self._multipliers), library.MAX_INPUTS),
             ("limits, diode limiters, bends and inputs of multipliers", len(self._kinks), library.MAX_KINKS),
-            ("nodes and branches", len(self._unknowns), library.MAX_UNKNOWNS),
+            ("nodes and branches", self._unknowns, library.MAX_UNKNOWNS),
         )
         for what, count, limit in sizes:
             if count > limit:
@@ -263,7 +264,7 @@ class Nodal:
 
     def _enter(self, circuit: Circuit) -> None:
         row, states = self._row, len(self._state)
-        left, right = _Stamps(len(self._unknowns) + 1), self._right
+        left, right = _Stamps(self._unknowns + 1), self._right
         for resistor in circuit.of(Resistor):
             left.join(row[resistor.a], row[resistor.b], 1.0 / resistor.ohm)
         for i, capacitor in enumerate(self._capacitors):
@@ -306,16 +307,15 @@ class Nodal:
     def _set(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Matrix:
         """The left-hand side with pots and switches entered."""
         left = self._left.copy()
-        siemens = np.multiply.outer(self._leg_siemens(dials, closed), _STAMP)
-        np.add.at(left.reshape(-1), self._leg_places, siemens.ravel())
-        return left
-
-    def _leg_siemens(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> list[float]:
-        """Conductances of the switches, then of both legs of every pot."""
         ohms = [switch.ohm(closed=closed.get(switch.name, switch.closed)) for switch in self._switches]
         for pot in self._pots:
             ohms += legs_ohm(check_dial(dials.get(pot.name, pot.dial), pot.name), pot.track_ohm)
-        return [1.0 / ohm for ohm in ohms]
+        values: list[float] = []
+        for ohm in ohms:
+            siemens = 1.0 / ohm
+            values += (siemens, siemens, -siemens, -siemens)
+        np.add.at(left.reshape(-1), self._leg_places, values)
+        return left
 
     def _enter_branch(self, left: _Stamps, name: str, plus: str, minus: str) -> int:
         """Enters a branch whose current flows from node plus through it to node minus.
@@ -371,7 +371,7 @@ class Nodal:
 
     def _solve(self, left: Matrix, right: Matrix) -> Matrix:
         """Solution for the columns of `right`: a row per unknown, and a last row of zeros for ground."""
-        size = len(self._unknowns)
+        size = self._unknowns
         solution = np.zeros((size + 1, right.shape[1]))
         solution[:size] = right[:size]
         failed = solve_in_place(left[:size, :size], solution)
@@ -381,17 +381,17 @@ class Nodal:
 
     def _singular(self, unknown: int) -> CircuitError:
         """CircuitError that names the undetermined node, with the first element at it, or the current."""
-        what, name = self._unknowns[unknown]
-        element = next(
-            part for part in self._circuit.elements if name in (part.nodes if what == "node" else (part.name,))
-        )
+        is_node = unknown < len(self._nodes)
+        what = "node" if is_node else "current of"
+        name = (*self._nodes, *self._branch)[unknown]
+        element = next(part for part in self._circuit.elements if name in (part.nodes if is_node else (part.name,)))
         return element_error(element, f"the circuit is singular: nothing determines the {what} {name}")
 
     def _flow(self, solution: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
         """[A B c], G, [C D e] and P."""
         laws, states = self._laws, len(self._state)
         drives = laws.drives(solution, self._columns - 1)
-        w = drives[laws.drive_of_kink]
+        w = drives.take(laws.drive_of_kink, 0)
         w[laws.of_state] = 0.0
         w[laws.of_state, laws.state] = 1.0
         if laws.currents:
@@ -433,10 +433,6 @@ class Trim:
             else:
                 cde[kink, -1] = rate
         return system.with_drives(abc, cde)
-
-
-_STAMP = np.array((1.0, 1.0, -1.0, -1.0))
-"""Signs of a conductance at its four places: both diagonal ones, then both off-diagonal ones."""
 
 
 class _Stamps:
@@ -484,11 +480,11 @@ class _Laws(NamedTuple):
 
     A drive is solution[plus] - solution[minus] + offset; that of a capacitor is divided by its farads, that of an
     op-amp or multiplier is multiplied by its rate and lessened by its leak. The drives of multipliers hold their
-    products besides: fed gives their rows, products the columns. drive_of_kink: drive of each kink, in the order of the
-    kinks; slews: indices of the kinks of that kind, and slewing: their drives. of_state: kinks whose argument is a
-    state, and state: it. currents: those from which the voltage of the node in loaded is taken. saturations: (kink,
-    column of the solution) at which the output of a recovering op-amp lacks its excess. common: for each op-amp,
-    1 / (2 CMRR), if there is one. g: G without limiters and bends. poles: rows of the op-amps.
+    products besides, in the rows and columns of fed. drive_of_kink: drive of each kink, in the order of the kinks;
+    slews: indices of the kinks of that kind, and slewing: their drives. of_state: kinks whose argument is a state, and
+    state: it. currents: those from which the voltage of the node in loaded is taken. saturations: (kink, column of the
+    solution) at which the output of a recovering op-amp lacks its excess. common: for each op-amp, 1 / (2 CMRR), if
+    there is one. g: G without limiters and bends. poles: rows of the op-amps.
     """
 
     plus: NDArray[np.intp]
@@ -497,11 +493,10 @@ class _Laws(NamedTuple):
     farads: Matrix
     rates: Matrix
     poles: slice
-    fed: list[int]
-    products: list[int]
+    fed: list[tuple[int, int]]
     leak: Matrix
     drive_of_kink: NDArray[np.intp]
-    slews: NDArray[np.intp]
+    slews: list[int]
     slewing: NDArray[np.intp]
     of_state: NDArray[np.intp]
     state: NDArray[np.intp]
@@ -528,7 +523,6 @@ class _Laws(NamedTuple):
         ends += [(ground, ground)] * len(recovering)
         last_source = len(ends)
         ends += [(row[node], ground) for part in multipliers for node in (part.x, part.y)]
-        plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
         # The columns of sources follow those of the last product and the constant.
         last_column = first_product + len(multipliers) + 1 + last_source - states
         excess = {amp.name: column for column, (_, amp) in enumerate(recovering, last_column - len(recovering))}
@@ -552,8 +546,10 @@ class _Laws(NamedTuple):
         drive_of_kink += range(states, len(ends))
         slewing = [drive_of_kink[kink] for kink in slews]
         g = np.zeros((states, len(drive_of_kink)))
-        g[slewing, slews] = 1.0
-        g[state, of_state] = -CLAMP_RATE
+        for i, kink in zip(slewing, slews, strict=True):
+            g[i, kink] = 1.0
+        for i, kink in zip(state, of_state, strict=True):
+            g[i, kink] = -CLAMP_RATE
         of_state += range(limits_count + last_source - states - len(recovering), limits_count + last_source - states)
         state += [i for i, _ in recovering]
         offset = [0.0] * first + [amp.model.vos_v for amp in poles] + [part.model.z_offset_v for part in followers]
@@ -561,17 +557,16 @@ class _Laws(NamedTuple):
         offset += [volts for part in multipliers for volts in (part.model.x_offset_v, part.model.y_offset_v)]
         common = [0.5 / amp.model.cmrr for amp in poles]
         return cls(
-            plus=plus,
-            minus=minus,
+            plus=np.array([plus for plus, _ in ends], np.intp),
+            minus=np.array([minus for _, minus in ends], np.intp),
             offset=np.array(offset),
             farads=np.array([capacitor.farad for capacitor in capacitors]).reshape(-1, 1),
             rates=np.array([part.model.gain_rate for part in limited]).reshape(-1, 1),
             poles=slice(first, first + len(poles)),
-            fed=list(range(first + len(poles), states)),
-            products=[first_product + i for i in fed_products],
+            fed=[(row, first_product + i) for row, i in enumerate(fed_products, first + len(poles))],
             leak=np.array([part.model.leak_rate for part in limited]),
             drive_of_kink=np.array(drive_of_kink, np.intp),
-            slews=np.array(slews, np.intp),
+            slews=slews,
             slewing=np.array(slewing, np.intp),
             of_state=np.array(of_state, np.intp),
             state=np.array(state, np.intp),
@@ -584,7 +579,7 @@ class _Laws(NamedTuple):
 
     def apart(self, solution: Matrix) -> Matrix:
         """Voltage between the ends of each law, with what an op-amp passes of its common mode."""
-        apart: Matrix = solution[self.plus] - solution[self.minus]
+        apart: Matrix = solution.take(self.plus, 0) - solution.take(self.minus, 0)
         if self.common is not None:
             apart[self.poles] += (solution[self.plus[self.poles]] + solution[self.minus[self.poles]]) * self.common
         return apart
@@ -593,8 +588,8 @@ class _Laws(NamedTuple):
         """A row for each capacitor (V/s), op-amp and multiplier with a pole (V/s, before any limit), and w (V)."""
         drives = self.apart(solution)
         drives[:, constant] += self.offset
-        if self.fed:
-            drives[self.fed, self.products] += 1.0
+        for row, product in self.fed:
+            drives[row, product] += 1.0
         slopes = self._scaled(drives)
         diagonal = slopes.reshape(-1)[:: slopes.shape[1] + 1]
         diagonal[len(self.farads) :] -= self.leak
@@ -624,14 +619,14 @@ class _Limit(enum.Enum):
 _Limits: TypeAlias = list[tuple[_Limit, Kink]]
 
 
-def _limits(part: OpAmp | Multiplier) -> _Limits:
+def _limits(name: str, model: OpAmpModel | MultiplierModel) -> _Limits:
     """Limits of an output with a pole, in the order of their kinks."""
-    model, limits = part.model, []
+    limits = []
     if model.slews:
-        limits.append((_Limit.SLEW, Kink.clip(model.slew_v_per_s, part.name)))
+        limits.append((_Limit.SLEW, Kink.clip(model.slew_v_per_s, name)))
     if model.clamps:
-        limits.append((_Limit.SWING, Kink.deadzone(*model.bounds_v, part.name)))
+        limits.append((_Limit.SWING, Kink.deadzone(*model.bounds_v, name)))
     if isinstance(model, OpAmpModel) and model.limits_current:
         drop_v = model.rout_ohm * model.current_limit_a
-        limits.append((_Limit.CURRENT, Kink.deadzone(-drop_v, drop_v, part.name)))
+        limits.append((_Limit.CURRENT, Kink.deadzone(-drop_v, drop_v, name)))
     return limits

@@ -81,17 +81,17 @@ class Edges:
 
     def within(self, start: int, stop: int) -> Edges:
         """Edges at ticks start <= tick < stop."""
-        part = slice(*np.searchsorted(self.ticks, (start, stop)))
+        part = slice(*self.ticks.searchsorted((start, stop)))
         return Edges(self.ticks[part], self.levels_v[part])
 
     def until(self, tick: int) -> Edges:
         """Edges up to and including a tick."""
-        part = slice(None, np.searchsorted(self.ticks, tick, "right"))
+        part = slice(None, self.ticks.searchsorted(tick, "right"))
         return Edges(self.ticks[part], self.levels_v[part])
 
     def after(self, tick: int) -> Edges:
         """Edges later than a tick."""
-        part = slice(np.searchsorted(self.ticks, tick, "right"), None)
+        part = slice(self.ticks.searchsorted(tick, "right"), None)
         return Edges(self.ticks[part], self.levels_v[part])
 
     def shifted(self, ticks: int) -> Edges:
@@ -249,7 +249,7 @@ class Layout(NamedTuple):
     @classmethod
     def of(cls, system: PiecewiseLinear, outputs: tuple[str, ...]) -> Layout:
         rows = system.rows(outputs)
-        arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
+        arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn.take(rows, 0), system.v_phi.take(rows, 0))
         tables = (_kink_table(system.kinks), _product_table(system.products))
         block = np.concatenate((*arrays, *tables), axis=None)
         starts = tuple(itertools.accumulate([part.nbytes for part in (*arrays, *tables[:-1])], initial=0))

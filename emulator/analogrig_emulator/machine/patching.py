@@ -7,8 +7,6 @@ junction, and every cord leads from an output to an input; this module rejects a
 from __future__ import annotations
 
 import functools
-import itertools
-from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -72,19 +70,18 @@ class _Wiring:
 @functools.lru_cache(maxsize=64)
 def _patches(panel: _Wiring) -> dict[str, Patch]:
     circuit = panel.circuit
-    ends = [nodes for _, _, nodes in panel.wires]
+    amps, ends = circuit.of(OpAmp), [nodes for _, _, nodes in panel.wires]
     drivers = _drivers(circuit)
     passive = neighbours(bond for element in circuit.elements if element.output is None for bond in element.bonds)
     _check_ends(circuit, ends, drivers)
     _check_feeds(circuit, ends, drivers, passive)
-    for amp in circuit.of(OpAmp):
-        _check_feedback(circuit, amp, passive, drivers | {GROUND})
-    parts: defaultdict[str, list[Element]] = defaultdict(list)
+    _check_feedback(circuit, passive, drivers | {GROUND})
+    parts: dict[str, list[Element]] = {amp.minus: [] for amp in amps}
     for element, nodes in zip(circuit.elements, ends, strict=True):
-        for node in dict.fromkeys(nodes):
+        for node in parts.keys() & nodes:
             parts[node].append(element)
-    found = {amp.name: _patch(circuit, amp, parts[amp.minus]) for amp in circuit.of(OpAmp)}
-    for amp in circuit.of(OpAmp):
+    found = {amp.name: _patch(circuit, amp, parts[amp.minus]) for amp in amps}
+    for amp in amps:
         if amp.plus == GROUND and not found[amp.name].inputs:
             raise CircuitError(f"{label(amp)}: nothing feeds its input at node {amp.minus}")
     return found
@@ -104,8 +101,11 @@ def _drivers(circuit: Circuit) -> set[str]:
 
 def _check_ends(circuit: Circuit, ends: Sequence[tuple[str, ...]], drivers: set[str]) -> None:
     """Raise CircuitError for a node with one end, unless that is an output."""
-    counts = Counter(itertools.chain.from_iterable(ends))
-    is_open = {node for node, count in counts.items() if count == 1} - drivers - {GROUND}
+    once, again = {GROUND, *drivers}, {GROUND, *drivers}
+    for nodes in ends:
+        for node in nodes:
+            (again if node in once else once).add(node)
+    is_open = once - again
     for element in circuit.elements if is_open else ():
         for node in element.nodes:
             if node in is_open:
@@ -137,12 +137,13 @@ def _check_feeds(circuit: Circuit, ends: Sequence[tuple[str, ...]], drivers: set
                 raise CircuitError(f"{label(element)}: nothing feeds its node {node}")
 
 
-def _check_feedback(circuit: Circuit, amp: OpAmp, passive: Ways, borders: set[str]) -> None:
+def _check_feedback(circuit: Circuit, passive: Ways, borders: set[str]) -> None:
     """Raise CircuitError for an amplifier without feedback of its own."""
     computing: tuple[Multiplier | Function, ...] = (*circuit.of(Multiplier), *circuit.of(Function))
-    fed_back = {amp.out} | {part.out for part in computing if amp.out in part.nodes[:-1]}
-    if amp.minus != amp.out and not leads(amp.minus, passive, fed_back, borders):
-        raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
+    for amp in circuit.of(OpAmp):
+        fed_back = {amp.out, *(part.out for part in computing if amp.out in part.nodes[:-1])}
+        if amp.minus != amp.out and not leads(amp.minus, passive, fed_back, borders):
+            raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
 
 def _patch(circuit: Circuit, amp: OpAmp, parts: Iterable[Element]) -> Patch:

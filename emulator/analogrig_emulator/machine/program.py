@@ -11,6 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +98,7 @@ class ForceLaw(Parameter):
         return (value * self.full_in / self.full_out) * self.gain
 
 
-@dataclass(frozen=True)
-class PotRow:
+class PotRow(NamedTuple):
     """Load of a pot, the resistor from its wiper to a virtual ground, and the parameters that turn it."""
 
     load: str
