@@ -11,7 +11,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from numbers import Real
 from typing import Any, Never, TypeAlias, TypeVar
@@ -269,10 +269,12 @@ class Circuit:
     """
 
     elements: tuple[Element, ...]
+    nodes: tuple[str, ...] = field(repr=False, compare=False)
+    """Every node but ground, in order of appearance."""
 
     def __init__(self, elements: Iterable[Element]) -> None:
         object.__setattr__(self, "elements", tuple(elements))
-        _check_names(self.elements)
+        object.__setattr__(self, "nodes", _check_names(self.elements))
         for element in self.elements:
             _check_element(element)
         _check_nodes(self)
@@ -282,12 +284,6 @@ class Circuit:
     def __reduce__(self) -> tuple[type[Circuit], tuple[tuple[Element, ...]]]:
         """Pickle and copy the netlist alone, not what was computed from it."""
         return Circuit, (self.elements,)
-
-    @functools.cached_property
-    def nodes(self) -> tuple[str, ...]:
-        """Every node but ground, in order of appearance."""
-        seen = dict.fromkeys(node for element in self.elements for node in element.nodes)
-        return tuple(node for node in seen if node != GROUND)
 
     @functools.cached_property
     def inputs(self) -> tuple[VoltageSource | CurrentSource, ...]:
@@ -428,10 +424,11 @@ def _check_known(kind: str, names: Iterable[str], elements: Iterable[Element]) -
             raise CircuitError(f"no {kind} is called {name!r}; there are {', '.join(known) or 'none'}")
 
 
-def _check_names(elements: tuple[Element, ...]) -> None:
+def _check_names(elements: tuple[Element, ...]) -> tuple[str, ...]:
+    """Return every node but ground, in order of appearance. Raise CircuitError for a duplicate or malformed name."""
     names: set[str] = set()
     nodes: dict[str, str] = {}
-    known: set[str] = set()
+    known = {GROUND}
     for element in elements:
         name = element.name
         if not _NAME.fullmatch(name):
@@ -448,6 +445,7 @@ def _check_names(elements: tuple[Element, ...]) -> None:
                 raise element_error(element, f"node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:
                 raise element_error(element, f"nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
+    return tuple(nodes.values())
 
 
 def _check_element(element: Element) -> None:
@@ -456,16 +454,16 @@ def _check_element(element: Element) -> None:
     for a, b in element.spans:
         if a == b:
             raise element_error(element, f"both ends are on node {a}")
-    for field in element.positive:
-        value = getattr(element, field)
+    for name in element.positive:
+        value = getattr(element, name)
         if not (_is_finite(value) and value > 0):
-            raise element_error(element, f"{field} must be positive and finite, got {value!r}")
+            raise element_error(element, f"{name} must be positive and finite, got {value!r}")
         if value < _LEAST:
-            raise element_error(element, f"{field} must be at least {_LEAST:g}, got {value!r}")
-    for field in element.finite:
-        value = getattr(element, field)
+            raise element_error(element, f"{name} must be at least {_LEAST:g}, got {value!r}")
+    for name in element.finite:
+        value = getattr(element, name)
         if value is not None and not _is_finite(value):
-            raise element_error(element, f"{field} must be finite, got {value!r}")
+            raise element_error(element, f"{name} must be finite, got {value!r}")
     if fault := element.fault:
         raise element_error(element, fault)
 

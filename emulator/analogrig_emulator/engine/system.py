@@ -272,7 +272,13 @@ class Layout(NamedTuple):
 @functools.lru_cache(maxsize=64)
 def _kink_table(kinks: tuple[Kink, ...]) -> Matrix:
     """Rows of engine_kink_t: (kinks, 8)."""
-    return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)
+    return np.array([_kink_row(kink.lower, kink.upper, kink.slopes) for kink in kinks]).reshape(-1, 8)
+
+
+@functools.lru_cache(maxsize=64)
+def _kink_row(lower: float, upper: float, slopes: tuple[float, float, float]) -> tuple[float, ...]:
+    """Row of an engine_kink_t. The amplifiers of a machine have few limits that differ."""
+    return lower, upper, *slopes, *Kink(lower, upper, slopes).intercepts
 
 
 @functools.lru_cache(maxsize=64)
