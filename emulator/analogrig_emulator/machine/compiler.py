@@ -167,7 +167,7 @@ class PatchedProgram(ProgramCircuit):
     def pots(self) -> Mapping[str, PotRow]:
         return {
             pot: PotRow(
-                cord.resistor, tuple(name for name in _names(self.stages, cord.cord.factors) if name in self.values)
+                cord.resistor, tuple([name for name in _names(self.stages, cord.cord.factors) if name in self.values])
             )
             for pot, cord in self._cords.items()
         }
@@ -332,7 +332,7 @@ def _names(stages: Stages, factors: Factors) -> list[str]:
     found: dict[str, None] = {}
     for name, _ in factors:
         inner = stages.composites[name].names() if name in stages.composites else (name,)
-        found |= dict.fromkeys(each for each in inner if each in stages.equations.parameters)
+        found |= dict.fromkeys([each for each in inner if each in stages.equations.parameters])
     return list(found)
 
 

@@ -7,6 +7,7 @@ derivative stay outside: a summer, one pot, the integrator. So a change of J or 
 from __future__ import annotations
 
 import enum
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -118,7 +119,7 @@ class Stages:
                     value = _computed(self.composites[name], values, self.equations.functions)
             else:
                 value = values[name]
-            if not (np.isfinite(value) and value > 0):
+            if not 0 < value < math.inf:
                 raise ProgramError(
                     f"{name} is {value:g} with {_settings(self.composites.get(name), values)}; "
                     "a pot needs it positive: change a value or range, or the sign in the equation"
