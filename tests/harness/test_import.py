@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import pickle
@@ -26,6 +27,7 @@ from analogrig.judging.verdict import UNDETECTABLE, judge
 from analogrig.recordings import column_reader, columns, replace_scenario
 from analogrig.recordings.columns import read_columns
 from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns, unit_in_name
+from analogrig.reporting.measured import mode_of
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -813,8 +815,8 @@ def test_signals_of_another_program_come_back_with_its_scenario_or_its_name(
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_columns_of_a_program_are_in_its_units_without_a_scenario(tmp_path: Path) -> None:
-    u, y = made_signals()
+def test_columns_of_a_program_are_in_its_units_and_its_time_without_a_scenario(tmp_path: Path) -> None:
+    u, y = made_signals(4000)
     np.savez(tmp_path / "a.npz", u=u, y=y)
     out, named = str(tmp_path / "out.npz"), ["--rate", "100", "--clock", "plant", "--program", "duffing"]
     columns_named = ["--input", "u", "--input-unit", "mN", "--output", "y", "--output-unit", "mm"]
@@ -823,5 +825,10 @@ def test_columns_of_a_program_are_in_its_units_without_a_scenario(tmp_path: Path
     assert run.conditions.program.name == "duffing" and not run.conditions.segments
     assert run.conditions.time_scale == 10.0
     assert np.abs(run.channel("x") - 1e-3 * y).max() < 1e-6
-    judged = replace_scenario(run, Scenario.load("duffing"))
+    assert main(["replay", out, "--dut", "inproc", "--out", str(tmp_path / "blind")]) == 3
+    blind = Run.load(tmp_path / "blind" / "run.npz")
+    mode = mode_of(blind, blind.theta[-1])
+    assert mode is not None and mode.resonance_hz == pytest.approx(60.07 * 100.0 / RATE_HZ, rel=0.01)
+    scenario = dataclasses.replace(Scenario.load("duffing"), samples=4000)
+    judged = replace_scenario(run, scenario)
     assert judged.conditions.channels == run.conditions.channels
