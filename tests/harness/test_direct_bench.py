@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import platform
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -201,3 +205,33 @@ def test_device_whose_line_matters_is_not_played_without_it() -> None:
     assert not can_be_direct(rig, dataclasses.replace(device, report_interval_n=10))
     assert not can_be_direct(rig, describe("inproc?link=can"))
     assert not can_be_direct(rig, describe("host"))
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt() is of glibc")
+@pytest.mark.parametrize("variables", [{}, {"MALLOC_TRIM_THRESHOLD_": "65536"}], ids=["by default", "as Dask sets it"])
+def test_plays_take_their_memory_from_the_plays_before(variables: dict[str, str]) -> None:
+    """With the allocator's own thresholds each batch of 100 plays faults in 1,000 to 2,000 pages."""
+    child = [sys.executable, "-c", _PAGES_OF_FIVE_BATCHES]
+    printed = subprocess.run(child, env=os.environ | variables, capture_output=True, text=True, check=True).stdout
+    assert int(printed) < 1000
+
+
+_PAGES_OF_FIVE_BATCHES = """
+import dataclasses, resource
+from analogrig.bench import direct_bench
+from analogrig.devices.registry import describe
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
+
+bench = direct_bench(open_rig("emulator"), describe("inproc"))
+scenario = dataclasses.replace(Scenario.load("healthy"), samples=600)
+
+def pages():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+for batch in range(10):
+    if batch == 5:
+        before = pages()
+    bench.play_all(scenario, range(100 * batch, 100 * (batch + 1)))
+print(pages() - before)
+"""
