@@ -29,13 +29,16 @@
 #define TAIL_V 1e-4
 #define GROWING 0.02
 
-/// Weight of an argument's last Legendre coefficient beside a product's: where a loop divides, its output is one.
+/// Weight of an argument's last Legendre coefficient beside a product's, in a circuit with fast loops: where such a loop divides,
+/// its output is an argument, and by a divisor near zero it changes much more than the product.
 #define WEIGHT 10.0
+#define FAST 20.0
 
 /// Error of a product, in V, at which an iteration has converged. It is estimated as the sum of all changes to come: each is
 /// the same part, the contraction, of the one before.
 #define CONVERGED_V 1e-7
 #define ITERATIONS 14
+#define HELD_ITERATIONS 60
 
 /// Contraction of relaxation, from its last step, from which Newton's iteration begins; relaxation itself leaves at most 4.
 #define HOPELESS 8.0
@@ -44,8 +47,8 @@
 /// hold for all steps to come, since each step then ends after one iteration.
 #define ROUNDING_V 1e-15
 
-/// Rounding of a product by the contraction: products that feed one another by fast loops do not agree better.
-#define ROUNDING 4e-16
+/// Change of an argument, in V, after which Newton's iteration is as good as its square. Rounding in long steps may leave more.
+#define SETTLED_V 1e-5
 
 /// Passes after which products that feed one another without a state between must have settled.
 #define PASSES (2 * ENGINE_MAX_PRODUCTS + 2)
@@ -70,6 +73,7 @@ struct collocation {
     double* map;             // [A B c] of one tick, and once more the columns of the product for each of its g
     double* moments[NODES];  // of the level `top`
     int     base, top;       // base: the level below which moments come from their series
+    bool    is_fast;         // a product moves an argument by FAST times its change within a sample period
     rung_t  rungs[ENGINE_LEVELS];
 };
 
@@ -262,6 +266,24 @@ void products_free(collocation_t* matrices) {
     free(matrices);
 }
 
+/// True if a product moves an argument by FAST times its change within a sample period, through one state.
+static bool is_fast(const engine_t* const self, const double* map) {
+    const int columns = self->columns;
+    for (int row = self->kinks - 2 * self->products; row < self->kinks; row++) {
+        const double* const w = &self->w_panels[(row / PANEL) * columns * PANEL + row % PANEL];
+        for (int product = 0; product < self->products; product++) {
+            double moved = 0.0;
+            for (int i = 0; i < self->states; i++) {
+                moved += w[i * PANEL] * map[i * stride_of(self) + column_of(self, product, 0)];
+            }
+            if (fabs(moved) * (double)ENGINE_TICKS_PER_SAMPLE > FAST) {
+                return true;
+            }
+        }
+    }
+    return false;
+}
+
 engine_status_t products_build(engine_t* const self, const double* a) {
     mode_t* const mode = self->mode;
     const int     n = self->states, stride = stride_of(self), from = PADDED(self->columns);
@@ -286,6 +308,7 @@ engine_status_t products_build(engine_t* const self, const double* a) {
             matrices->map[i * stride + self->columns + j] = matrices->map[i * stride + column_of(self, j / NODES, 0)];
         }
     }
+    matrices->is_fast = is_fast(self, matrices->map);
     matrices->base = matrices->top = mode->base;
     int    halvings                = 0;
     double ticks                   = (double)(INT64_C(1) << mode->base);
@@ -411,9 +434,8 @@ typedef struct {
     double begun[PADDED(ENGINE_MAX_PRODUCTS)];  // values of the products at its beginning, for its polynomials
     double values[MAX_VALUES];                  // of the products at the nodes beyond its beginning
     double contraction;                         // of their changes from one iteration to the next
-    double tail;                    // largest last Legendre coefficient of their arguments, if a loop may be fast
-    double vector[MAX_WIDTH];       // [z g]
-    double z[PADDED(MAX_COLUMNS)];  // at the end
+    double vector[MAX_WIDTH];                   // [z g]
+    double z[PADDED(MAX_COLUMNS)];              // at the end
 } step_t;
 
 /// Extend the polynomials of the step before to the nodes of this one.
@@ -461,7 +483,7 @@ static double last_moment(const engine_t* const self, double first, const double
 
 /// Largest last Legendre coefficient of the products that are not driven, with what they truly are at the beginning.
 static double find_tail(const engine_t* const self, const step_t* step) {
-    double largest = step->tail;
+    double largest = 0.0;
     for (int i = 0; i < self->products; i++) {
         const double first = self->z[column_of(self, i, 0)];
         const double tail  = fabs(last_moment(self, first, &step->values[i * NODES])) / LEADING;
@@ -581,29 +603,41 @@ set_row(const engine_t* const self, const rung_t* rung, int row, double by_p, do
     return sum;
 }
 
-/// Set the equations: the laws are straight about the arguments that the values give, or, if `is_first`, about those of the
-/// beginning of the step. Return the largest change by the laws alone; the contraction is that of relaxation.
-static double linearise(const engine_t* const self,
-                        const rung_t*         rung,
-                        const given_t*        given,
-                        bool                  is_first,
-                        step_t*               step,
-                        equations_t*          equations) {
-    const double* now  = &self->w[self->kinks - 2 * self->products];
-    double        most = 0.0;
-    step->contraction = step->tail = 0.0;
-    for (int row = 0; row < NODES * self->products; row += NODES, now += 2) {
-        const law_t* const law = &self->circuit->law[row / NODES];
-        double             fed[2 * NODES], at[2 * NODES], value[NODES];
+/// Arguments of all products at the nodes, about which the laws are straight, and what they have moved by from those before.
+typedef struct {
+    double at[MAX_ARGUMENTS], moved;
+} place_t;
+
+/// Go to the arguments that the values give.
+static void
+move(const engine_t* const self, const rung_t* rung, const given_t* given, const step_t* step, place_t* place) {
+    place->moved = 0.0;
+    for (int row = 0; row < NODES * self->products; row += NODES) {
+        double fed[2 * NODES];
         read_fed(self, rung, given, step, row, fed);
         for (int i = 0; i < 2 * NODES; i++) {
-            at[i] = is_first ? now[i / NODES] : fed[i];
+            const double change = fabs(fed[i] - place->at[2 * row + i]);
+            place->moved        = change <= place->moved ? place->moved : isfinite(change) ? change : (double)INFINITY;
+            place->at[2 * row + i] = fed[i];
         }
-        for (int i = 0; i < 2; i++) {
-            step->tail = fmax(step->tail, WEIGHT * fabs(last_moment(self, now[i], &fed[i * NODES])) / LEADING);
-        }
+    }
+}
+
+/// Set the equations at a place. The contraction is that of relaxation.
+static void linearise(const engine_t* const self,
+                      const rung_t*         rung,
+                      const given_t*        given,
+                      const place_t*        place,
+                      step_t*               step,
+                      equations_t*          equations) {
+    step->contraction = 0.0;
+    for (int row = 0; row < NODES * self->products; row += NODES) {
+        const law_t* const  law = &self->circuit->law[row / NODES];
+        const double* const at  = &place->at[2 * row];
+        double              fed[2 * NODES], value[NODES];
+        read_fed(self, rung, given, step, row, fed);
         memcpy(value, &step->values[row], sizeof value);
-        most = fmax(most, self->kernels->apply(law, at, &given->driven[row], value));
+        (void)self->kernels->apply(law, at, &given->driven[row], value);
         for (int p = 0, q = NODES; p < NODES; p++, q++) {
             double by_p, by_q;
             find_slopes(law, at[p], at[q], &by_p, &by_q);
@@ -612,7 +646,6 @@ static double linearise(const engine_t* const self,
             step->contraction = fmax(step->contraction, set_row(self, rung, row + p, by_p, by_q, equations));
         }
     }
-    return most;
 }
 
 /// Take the cubic polynomials of the products through the nodes beyond the beginning; drives keep theirs.
@@ -630,25 +663,75 @@ static void extend_back(const engine_t* const self, step_t* step) {
 /// not settled by the first node does not ring on: its value at the beginning is left out.
 static bool approach(const engine_t* const self, const rung_t* rung, const given_t* held, step_t* step) {
     const int   values = NODES * self->products;
-    double      before = 0.0;
     given_t     given  = *held;
+    place_t     place  = { .moved = 0.0 };
     equations_t equations;
+    for (int i = 0; i < 2 * values; i++) {
+        place.at[i] = self->w[self->kinks - 2 * self->products + i / NODES];
+    }
     for (int i = 0; i < ITERATIONS; i++) {
         extend_back(self, step);
         restart(self, rung, held, step, &given);
-        const double moved = linearise(self, rung, &given, i == 0, step, &equations);
-        if (!isfinite(moved) || engine_solve(values, 1, equations.left, equations.right) >= 0) {
+        if (i > 0) {
+            move(self, rung, &given, step, &place);
+            if (place.moved <= SETTLED_V) {
+                return true;
+            }
+        }
+        linearise(self, rung, &given, &place, step, &equations);
+        if (!isfinite(place.moved) || engine_solve(values, 1, equations.left, equations.right) >= 0) {
             return false;
         }
         for (int j = 0; j < values; j++) {
             step->values[j] += equations.right[j];
         }
-        if (i > 0 && (has_converged(moved, i > 1 ? moved / before : 1.0) ||
-                      moved <= fmin(TAIL_V, ROUNDING * step->contraction))) {
-            extend_back(self, step);
+    }
+    return false;
+}
+
+/// Take the products of a shortest step as constant, at their values at its end, by which loops that are faster than that settle.
+/// Newton's iteration begins at 0: from there it finds the positive root of a root's loop.
+static bool hold(const engine_t* const self, const rung_t* rung, const given_t* held, step_t* step) {
+    const int products = self->products, values = NODES * products, last = NODES - 1;
+    double    left[ENGINE_MAX_PRODUCTS * ENGINE_MAX_PRODUCTS], right[ENGINE_MAX_PRODUCTS];
+    given_t   given = *held;
+    place_t   place = { .moved = 0.0 };
+    memset(step->begun, 0, sizeof step->begun);
+    memset(step->values, 0, sizeof step->values);
+    for (int i = 0; i < HELD_ITERATIONS; i++) {
+        restart(self, rung, held, step, &given);
+        move(self, rung, &given, step, &place);
+        if (i > 0 && place.moved <= SETTLED_V) {
             return true;
         }
-        before = moved;
+        for (int row = 0; row < products; row++) {
+            const law_t* const  law       = &self->circuit->law[row];
+            const double* const feedback  = &rung->feedback[2 * row * NODES * values + last];
+            const double* const arguments = &rung->arguments[2 * row * NODES * self->columns + last];
+            const double        p = place.at[2 * row * NODES + last], q = place.at[(2 * row + 1) * NODES + last];
+            double              by_p, by_q;
+            find_slopes(law, p, q, &by_p, &by_q);
+            right[row] = evaluate(law->factors.x, law->x_degree, p) * evaluate(law->factors.y, law->y_degree, q) +
+                         given.driven[row * NODES + last] - step->begun[row];
+            for (int j = 0; j < products; j++) {
+                const int first = column_of(self, j, 0);
+                double    p_fed = arguments[first * PANEL], q_fed = arguments[(self->columns + first) * PANEL];
+                for (int k = j * NODES; k < (j + 1) * NODES; k++) {
+                    p_fed += feedback[k * PANEL];
+                    q_fed += feedback[(values + k) * PANEL];
+                }
+                left[row * products + j] = (row == j ? 1.0 : 0.0) - by_p * p_fed - by_q * q_fed;
+            }
+        }
+        if (!isfinite(place.moved) || engine_solve(products, 1, left, right) >= 0) {
+            return false;
+        }
+        for (int j = 0; j < values; j++) {
+            step->values[j] = step->begun[j / NODES] + right[j / NODES];
+        }
+        for (int j = 0; j < products; j++) {
+            step->begun[j] += right[j];
+        }
     }
     return false;
 }
@@ -662,13 +745,27 @@ static bool iterate(engine_t* const self, const rung_t* rung, int64_t ticks, ste
     step->contraction = self->stride > 0 ? 2.0 * self->ratio * self->contraction : 1.0;
     if (self->stride == 0 || step->contraction < HOPELESS) {
         memcpy(step->begun, &self->z[column_of(self, 0, 0)], (size_t)self->products * sizeof step->begun[0]);
-        step->tail = 0.0;
         if (relax(self, rung, &given, step)) {
             return true;
         }
         predict(self, ticks, step);
     }
-    return approach(self, rung, &given, step);
+    return approach(self, rung, &given, step) || (ticks == 1 && hold(self, rung, &given, step));
+}
+
+/// Largest last Legendre coefficient of the arguments.
+static double find_strain(const engine_t* const self, const rung_t* rung, int64_t ticks, const step_t* step) {
+    const double* const now     = &self->w[self->kinks - 2 * self->products];
+    double              largest = 0.0;
+    given_t             held, given;
+    place_t             place = { .moved = 0.0 };
+    prepare(self, rung, ticks, &held);
+    restart(self, rung, &held, step, &given);
+    move(self, rung, &given, step, &place);
+    for (int i = 0; i < 2 * self->products; i++) {
+        largest = fmax(largest, fabs(last_moment(self, now[i], &place.at[i * NODES])) / LEADING);
+    }
+    return largest;
 }
 
 /// Set z to the state at a node.
@@ -725,6 +822,9 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
     }
     fit(self, step);
     *tail = find_tail(self, step);
+    if (self->mode->collocation->is_fast) {
+        *tail = fmax(*tail, WEIGHT * find_strain(self, rung, ticks, step));
+    }
     if (level > 0 && !(*tail <= TAIL_V)) {
         return TOO_LONG;
     }

@@ -59,10 +59,10 @@ _LOOP_FARAD = 47e-12
 _BARRED_V = 0.05
 """Voltage beyond zero at which a root's diode conducts: at zero itself it would switch without end at rest."""
 
-_IDEAL_LOOP = 1e-4, 1e-4
+_IDEAL_LOOP = 1e-5, 1e-4
 """Parts of that capacitor and of that voltage with an ideal amplifier, which needs neither.
 
-The loop is late by 50 ps times 10 V over the divisor's voltage.
+The loop is late by 5 ps times 10 V over the divisor's voltage.
 """
 
 _OFF_OHM = 1e12
