@@ -31,7 +31,7 @@
 
 /// Weight of an argument's last Legendre coefficient beside a product's, in a circuit with fast loops: where such a loop divides,
 /// its output is an argument, and by a divisor near zero it changes much more than the product.
-#define WEIGHT 10.0
+#define WEIGHT 100.0
 #define FAST 20.0
 
 /// Error of a product, in V, at which an iteration has converged. It is estimated as the sum of all changes to come: each is
