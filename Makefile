@@ -19,7 +19,7 @@ ZIG := $(BUILD)/zig
 PYTHONS ?= $(foreach version,3.11 3.12 3.13,$(if $(shell python$(version) -c '' 2>/dev/null && echo found),python$(version)))
 
 PRODUCTS := harness/analogrig/_catalogue.py emulator/analogrig_emulator/_engine.so harness/analogrig/_device.so harness/analogrig/bin/analogrig-device \
-            harness/analogrig/_device_wide.so harness/analogrig/bin/analogrig-device-wide harness/analogrig/bin/analogrig-tether harness/analogrig/bin/analogrig-library harness/analogrig/_exit_guard.so \
+            harness/analogrig/_device_wide.so harness/analogrig/_device_fixed.so harness/analogrig/bin/analogrig-device-wide harness/analogrig/bin/analogrig-tether harness/analogrig/bin/analogrig-library harness/analogrig/_exit_guard.so \
             harness/analogrig/reporting/uPlot.iife.min.js harness/analogrig/reporting/uPlot.min.css
 NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/engine/*.[ch] harness/analogrig/devices/*.c harness/analogrig/include/*.h \
                   estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \

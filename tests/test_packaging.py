@@ -41,6 +41,7 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
         "analogrig/_catalogue.py",
         "analogrig/_commit.txt",
         "analogrig/_device.so",
+        "analogrig/_device_fixed.so",
         "analogrig/_device_wide.so",
         "analogrig/_exit_guard.so",
         "analogrig/bin/analogrig-device",

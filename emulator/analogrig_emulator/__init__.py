@@ -69,6 +69,7 @@ from analogrig_emulator.machine.program_file import Equations, ProgramParameter,
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
+from analogrig_emulator.machine.units import Unit, parse_unit
 from analogrig_emulator.streams import normals, uniforms
 
 __all__ = [
@@ -151,6 +152,7 @@ __all__ = [
     "SuspensionParts",
     "SuspensionProgram",
     "Switch",
+    "Unit",
     "VoltageSource",
     "WideProgram",
     "Wired",
@@ -162,6 +164,7 @@ __all__ = [
     "is_repeatable",
     "load_program",
     "normals",
+    "parse_unit",
     "piecewise_linear",
     "preset",
     "probes_per_sample",

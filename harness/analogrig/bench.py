@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
 import gc
 import itertools
@@ -30,7 +31,10 @@ Progress = Callable[[int, int], None]
 """Callback after each block, with the number of samples done and of samples asked."""
 
 _RETAINED_BYTES = 30_000_000
-"""Freed memory that the allocator keeps for the next play."""
+"""Size of the largest array whose memory the allocator keeps for the next play."""
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+"""Parameters of mallopt() in malloc.h of glibc."""
 
 _INTERRUPTED_BY = "interrupted by "
 """Start of the fault of an interrupted run; the name of the signal follows."""
@@ -419,6 +423,17 @@ def _overloads(known: Hindsight, samples: int) -> dict[str, int]:
     return {amplifier: sample for amplifier, sample in known.lamps.items() if sample < samples}
 
 
+def _retain_freed_memory() -> None:
+    """Make glibc keep the arrays of a play for the next one; otherwise each play faults their pages in again.
+
+    Its thresholds would grow by themselves, but not in a worker of Dask: they are fixed at 128 kB by the variable
+    MALLOC_TRIM_THRESHOLD_, whatever its value, and Dask sets it.
+    """
+    if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
+        mallopt(_M_MMAP_THRESHOLD, _RETAINED_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, 2 * _RETAINED_BYTES)
+
+
 def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bool = False) -> DirectBench:
     """Bench with the estimator in this process and whole blocks: the fastest way.
 
@@ -428,7 +443,5 @@ def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bo
     :raises ConfigurationError: the estimator refuses its configuration.
     :raises LinkError: the library of the device was not built.
     """
-    # glibc returns freed memory to the system beyond a threshold that grows with the largest block freed. Without this
-    # line every play would fault its pages in again, which takes a tenth of the time.
-    np.empty(_RETAINED_BYTES, np.uint8)
+    _retain_freed_memory()
     return DirectBench(rig.in_blocks(DIRECT_BLOCK_SAMPLES), device.direct(alarms_only=alarms_only))

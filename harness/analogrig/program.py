@@ -172,6 +172,16 @@ class Program:
         at_rest, at_once = (self._rates(point, self.equations.values) for point in (rest, driven))
         return not at_rest.any() and not at_once[-1]
 
+    @functools.cached_property
+    def settling_s(self) -> float | None:
+        """Time in which the slowest mode decays to 1 %, in s of the plant; None unless it is linear and all decay."""
+        if not self.is_linear:
+            return None
+        values = [self.equations.values[name] for name in self.parameters]
+        modes = np.linalg.eigvals(self.generators([values])[0, :-1, :-1])
+        slowest = -float(modes.real.max())
+        return math.log(100.0) / slowest if slowest > _EXACT * float(np.abs(modes).max()) else None
+
     def values_at(self, coefficients: Mapping[str, float]) -> dict[str, float]:
         """Values of the parameters whose pots have these coefficients under load.
 

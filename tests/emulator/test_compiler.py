@@ -14,6 +14,7 @@ from analogrig_emulator import (
     PROGRAMS,
     TICKS_PER_SAMPLE,
     Deck,
+    Engine,
     Excitation,
     OpAmp,
     Pot,
@@ -22,6 +23,7 @@ from analogrig_emulator import (
     Resistor,
     SuspensionComputer,
 )
+from analogrig_emulator.circuit.nodal import piecewise_linear
 from analogrig_emulator.circuit.pot import dial_for
 from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.compiler import INPUT_OHM, MACHINE_V, PatchedProgram, compile_program
@@ -124,6 +126,76 @@ def off_equations_lsb(program: PatchedProgram, changes: Sequence[PotTurn] = ()) 
     computer = SuspensionComputer(program, opamp="ideal")
     volts = np.concatenate(list(computer.play(excitation, SAMPLES, changes)))
     return float(np.abs(volts - by_scipy(program, excitation, changes)).max() / LSB_V)
+
+
+DIVIDING = {
+    "a divisor near zero": """x' = -1.5*x + u
+y' = -y + 0.1*x/(0.02 + x**2)
+z' = -z + 0.1*y/(0.03 + abs(x))""",
+    "a tank that empties": """x' = 0.5*max(0, u) - 0.8*sqrt(max(0, x))
+y' = 0.8*sqrt(max(0, x)) - 0.7*sqrt(max(0, y))
+z' = -z + x""",
+    "roots of both signs": """x' = y
+y' = -4*x - 0.3*y*abs(y) + u
+z' = -z + sqrt(max(0, x)) - sqrt(max(0, -x)) + 0.2*y/(0.05 + abs(x))""",
+    "a root of the input": """w = sqrt(0.004 + (u - x)**2)
+x' = 0.5*(u - x) / (0.05 + w)
+y' = -y + sqrt(abs(x)) + 0.3*sqrt(max(0, u))
+z' = -z + y/(0.05 + x*x)""",
+    "a divisor with a root": """x' = -2*x + u/(0.1 + sqrt(abs(y)))
+y' = -y + x/(0.2 + abs(x))
+z' = -z + 0.05*y*y/(0.03 + sqrt(0.01 + x*x))""",
+}
+
+
+def dividing(name: str) -> PatchedProgram:
+    states = "".join(f"{state} = {{}}\n" for state in "xyz")
+    return compile_program(
+        parse_program(
+            f"name = 'dividing'\nspeed = 500\nperiod_s = 20.0\nequations = '''\n{DIVIDING[name]}\n'''\n"
+            f"[inputs]\nu = {{ full = 1.0, trial = [-1.0, 1.0] }}\n[states]\n{states}",
+            name,
+        )
+    )
+
+
+@pytest.mark.parametrize("name", DIVIDING)
+def test_dividers_and_roots_of_ideal_parts_play_the_equations(name: str) -> None:
+    assert off_equations_lsb(dividing(name)) < 0.05
+
+
+def test_a_divider_follows_a_sine() -> None:
+    program, excitation = dividing("a divisor near zero"), Excitation(low_v=-10.0, shape="sine")
+    computer = SuspensionComputer(program, opamp="ideal")
+    volts = np.concatenate(list(computer.play(excitation, SAMPLES)))
+    drive, slopes = excitation.drive(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ), program.equations.slopes()
+
+    def flow(sample: float, state: Volts) -> Volts:
+        level = float(drive.volts(np.array([sample]))[0]) / MACHINE_V
+        return slopes({"u": level}, state) * program.equations.speed / RATE_HZ
+
+    solution = solve_ivp(flow, (0, SAMPLES - 1), np.zeros(3), "DOP853", np.arange(SAMPLES), rtol=1e-9, atol=1e-11)
+    fulls = [program.fulls[name] / MACHINE_V for name in program.equations.states]
+    assert np.abs(volts[:, 1:] - solution.y.T / fulls).max() < 0.05 * LSB_V
+
+
+@pytest.mark.parametrize("rate_hz", [500.0, 100e3])
+@pytest.mark.parametrize("name", DIVIDING)
+def test_loops_that_are_faster_than_the_shortest_step_settle(name: str, rate_hz: float) -> None:
+    # At 500 Hz a tick is ten times as long as a loop of ideal parts.
+    one, other = (SuspensionComputer(dividing(name), opamp=amp, sample_rate_hz=rate_hz) for amp in ("ideal", "tl07x"))
+    excitation = Excitation(low_v=-10.0, frequency_hz=rate_hz / 100.0)
+    ideal, real = (np.concatenate(list(computer.play(excitation, 150))) for computer in (one, other))
+    assert np.sqrt(np.mean((ideal - real) ** 2)) < 0.5  # offsets make the difference
+
+
+def test_a_loop_costs_steps_where_it_moves_and_not_all_the_time() -> None:
+    program = program_of("two-tanks")
+    engine = Engine(piecewise_linear(SuspensionComputer(program).circuit), program.channel_nodes, RATE_HZ)
+    low_v, high_v = levels_v(program)
+    edges = Excitation(low_v=low_v, high_v=high_v).edges(0, 4000 * TICKS_PER_SAMPLE, RATE_HZ)
+    engine.run(4000, {"F": edges})
+    assert engine.counts.steps < 4 * 4000
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -45,6 +45,9 @@ states.y.full = 10.0
 parameters.T.value = 3000.0
 """
 
+I0 = 'i0 = { value = 4e3, unit = "mA" }'
+"""Row of a parameter in another size of unit than the state i."""
+
 Change = Callable[[str], str]
 
 
@@ -159,7 +162,38 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "fractional power": (equation("omega' = (torque - d*omega**1.5) / J"), "line 3: power 1.5: write an integer"),
     "tower of powers": (equation("omega' = (torque - 9**9**9) / J"), r"line 3: power 9 \*\* 9: write an integer"),
-    "infinite number": (equation("omega' = (torque - 1e999*omega) / J"), "line 3: number .* is not finite"),
+    "number beyond all floats": (
+        equation("omega' = (torque - 1e999*d*omega) / J"),
+        r"equations, line 3: number 1e999 exceeds 1e\+100; scale the quantities",
+    ),
+    "number that underflows": (
+        equation("omega' = (torque - 1e-400*d*omega) / J"),
+        "equations, line 3: number 1e-400 is smaller than 1e-100; write 0, or scale the quantities",
+    ),
+    "coefficient of zero at the end of a range": (
+        equation("omega' = (torque - d*omega/(R - 0.9)) / J", without_units),
+        r"equations, line 3: R - 0.9 is 0 with R = 0.9; a pot needs it positive",
+    ),
+    "estimate divided by zero": (
+        lambda text: text + "[estimates]\nJ = 's0/0'\n",
+        "estimates.J: s0 / 0 divides by zero",
+    ),
+    "estimate divided by a formula of zero": (
+        lambda text: text + "[estimates]\nJ = '1/gain + s0/(2 - 2)'\n",
+        r"estimates.J: s0 / \(2 - 2\) divides by zero",
+    ),
+    "estimate with the root of a negative number": (
+        lambda text: text + "[estimates]\nJ = 'gain*sqrt(-1)'\n",
+        r"estimates.J: sqrt\(-1\) is the root of a negative number",
+    ),
+    "estimate beyond all floats": (
+        lambda text: text + "[estimates]\nJ = '1e999*gain'\n",
+        r"estimates.J: number 1e999 exceeds 1e\+100; scale the quantities",
+    ),
+    "estimate that is a number": (
+        lambda text: text + "[estimates]\nJ = '8e-5'\n",
+        "estimates.J: 8e-05 is the same for every response; write it with gain, s0, s1",
+    ),
     "complex number": (equation("omega' = (torque - 1j*omega) / J"), "line 3: 1j is no number"),
     "second derivative": (equation("omega'' = torque / J"), "line 3: omega'' is no first derivative; write omega' = v"),
     "derivative on the right": (
@@ -194,6 +228,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "wrong size of a unit": (
         swapped('unit = "H"', 'unit = "mH"'),
         "line 1: i' is in A s\\^-1, the right side in 1000 A",
+    ),
+    "terms of one unit in two sizes": (
+        equation("omega' = (torque - d*omega*(1 + (i/i0)**2)) / J", with_row("parameters", I0)),
+        r"line 3: 1 is in 1 and \(i / i0\) \*\* 2 in 1e\+06; the dimension is the same, the size is not: write",
     ),
     "unknown unit": (swapped('unit = "H"', 'unit = "henry"'), "parameters.L: unit 'henry': unknown symbol 'henry'"),
     "unit ends early": (swapped('unit = "H"', 'unit = "V s/"'), "parameters.L: unit 'V s/' ends before a symbol"),

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import platform
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -11,9 +15,12 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Samples
 from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_bench
+from analogrig.devices.estimator import Estimator
 from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import FIXED_LIBRARY, LIBRARY, WIDE_LIBRARY, estimator_library_for
 from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging import information
 from analogrig.judging.verdict import judge, judge_all
 from analogrig.program import Program
@@ -201,3 +208,56 @@ def test_device_whose_line_matters_is_not_played_without_it() -> None:
     assert not can_be_direct(rig, dataclasses.replace(device, report_interval_n=10))
     assert not can_be_direct(rig, describe("inproc?link=can"))
     assert not can_be_direct(rig, describe("host"))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"trigger": "prediction-error", "ceiling": 9.0, "reset": "all", "c": ()}, {"edge_instants": "anywhere"}],
+    ids=["default", "prediction error", "edges anywhere"],
+)
+def test_estimator_of_fixed_orders_is_that_of_any_orders_to_the_bit(settings: dict[str, Any]) -> None:
+    config, rng = EstimatorConfig(**settings), np.random.default_rng(23)
+    run = direct_bench(emulator("emulator"), describe("inproc")).play(Scenario.load("thesis"), 7)
+    u, y = run.codes[:, 0], run.codes[:, 1]
+    valid = rng.random(len(u)) > 0.01
+    ours, others = (Estimator(config, library=library) for library in (estimator_library_for(config), LIBRARY))
+    for name in ("theta", "innovation", "statistic", "status", "alarms"):
+        assert getattr(ours.run(u, y, valid), name).tobytes() == getattr(others.run(u, y, valid), name).tobytes()
+        assert ours.counters == others.counters
+
+
+def test_estimator_of_fixed_orders_is_for_the_default_orders_alone() -> None:
+    assert estimator_library_for(EstimatorConfig()) == FIXED_LIBRARY
+    assert estimator_library_for(EstimatorConfig(offset=False)) == LIBRARY
+    assert estimator_library_for(EstimatorConfig().of_order(4)) == WIDE_LIBRARY
+    assert InprocDevice(name="mine", library="mine.so").estimator_library.name == "mine.so"
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt() is of glibc")
+@pytest.mark.parametrize("variables", [{}, {"MALLOC_TRIM_THRESHOLD_": "65536"}], ids=["by default", "as Dask sets it"])
+def test_plays_take_their_memory_from_the_plays_before(variables: dict[str, str]) -> None:
+    """With the allocator's own thresholds each batch of 100 plays faults in 1,000 to 2,000 pages."""
+    child = [sys.executable, "-c", _PAGES_OF_FIVE_BATCHES]
+    printed = subprocess.run(child, env=os.environ | variables, capture_output=True, text=True, check=True).stdout
+    assert int(printed) < 1000
+
+
+_PAGES_OF_FIVE_BATCHES = """
+import dataclasses, resource
+from analogrig.bench import direct_bench
+from analogrig.devices.registry import describe
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
+
+bench = direct_bench(open_rig("emulator"), describe("inproc"))
+scenario = dataclasses.replace(Scenario.load("healthy"), samples=600)
+
+def pages():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+for batch in range(10):
+    if batch == 5:
+        before = pages()
+    bench.play_all(scenario, range(100 * batch, 100 * (batch + 1)))
+print(pages() - before)
+"""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import pickle
 import struct
 import sys
+import tempfile
 import zipfile
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +27,12 @@ from analogrig.judging.verdict import UNDETECTABLE, judge
 from analogrig.recordings import column_reader, columns, replace_scenario
 from analogrig.recordings.columns import read_columns
 from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns, unit_in_name
+from analogrig.reporting.measured import mode_of
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
-from analogrig_emulator import CHANNELS
+from analogrig_emulator import CHANNELS, parse_unit
 
 RATE_HZ = 1000.0
 SAMPLES = 600
@@ -228,7 +232,9 @@ def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(
     told = capsys.readouterr()
     verdict = json.loads(told.out)
     assert verdict["outcome"] == "unjudged" and not verdict["valid"] and not verdict["false_alarms"]
-    assert told.err.startswith("analogrig: UNJUDGED: nothing is known of the plant")
+    assert told.err.startswith(
+        "analogrig: UNJUDGED: nothing is known of the plant and its changes: import again with --scenario FILE"
+    )
     page = (out / "report.html").read_text()
     assert "Power spectral density" in page and "Frequency response" in page and "Resonance [Hz]" in page
     run = Run.load(out / "run.npz")
@@ -242,15 +248,20 @@ def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(
     assert "2 unjudged" in (tmp_path / "session.html").read_text()
 
 
-def test_measured_data_alone_is_inconclusive_and_names_the_next_step(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_measured_data_alone_is_refused_with_the_next_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_npz(tmp_path / "a.npz", *made_signals())
     recording = tmp_path / "recording.npz"
     named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(recording)]
     assert main(["import", str(tmp_path / "a.npz"), *named]) == 0
-    assert main(["judge", str(recording), "--out", str(tmp_path / "judged")]) == 3
-    assert "pass the recording to analogrig replay" in capsys.readouterr().err
+    capsys.readouterr()
+    assert main(["judge", str(recording), "--out", str(tmp_path / "judged")]) == 2
+    told = capsys.readouterr()
+    assert told.err == (
+        f"analogrig: {recording}: no device has answered these samples: judge the run of analogrig replay {recording}"
+        " --dut NAME\n"
+    )
+    verdict = json.loads((tmp_path / "judged" / "verdict.json").read_text())
+    assert verdict["outcome"] == "inconclusive" and not told.out
     assert main(["replay", str(recording), "--out", str(tmp_path / "replayed")]) == 2
     assert "measured data has no device: name one with --dut" in capsys.readouterr().err
 
@@ -328,20 +339,86 @@ def check_refused(path: Path, described: ImportDescription, complaint: str) -> N
         replace_scenario(import_columns(path, described, None), scenario)
 
 
-@pytest.mark.parametrize(
-    ("output", "complaint"),
-    [
-        (ImportedColumn("y"), "displacement of program front is in m, displacement of the recording in V: import it"),
-        (ImportedColumn("y", "mm"), "in mm: import it with --output-unit m, and --output-scale m per number in its"),
-    ],
-)
+@pytest.mark.parametrize("unit", [None, "mm/s", "degC"])
 @pytest.mark.usefixtures("in_this_process")
-def test_a_column_in_another_unit_than_the_scenario_is_refused(
-    output: ImportedColumn, complaint: str, tmp_path: Path
-) -> None:
+def test_a_column_that_measures_something_else_than_the_scenario_is_refused(unit: str | None, tmp_path: Path) -> None:
     write_npz(tmp_path / "a.npz", *made_signals())
-    described = description(input=NEWTON, output=output)
+    described = description(input=NEWTON, output=ImportedColumn("y", unit), clock="plant")
+    complaint = (
+        f"displacement of program front is in m, displacement of the recording in {unit or 'V'}: import it with"
+        " --output-unit m, and --output-scale m per number in its"
+    )
     check_refused(tmp_path / "a.npz", described, complaint)
+
+
+def write_mf4_with_units(path: Path, u: Values, y: Values) -> None:
+    from asammdf import MDF, Signal
+
+    t = np.arange(len(u)) / RATE_HZ
+    with MDF() as file:
+        file.append([Signal(u / 1e3, t, name="u", unit="kN"), Signal(y * 1e3, t, name="y", unit="mm")])
+        file.save(path)
+
+
+def write_parquet_with_units(path: Path, u: Values, y: Values) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    named = (("u", "kN"), ("y", "mm"))
+    schema = pa.schema([pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in named])
+    parquet.write_table(pa.table([u / 1e3, y * 1e3], schema=schema), path)
+
+
+def write_csv_with_units(path: Path, u: Values, y: Values) -> None:
+    rows = np.stack([u / 1e3, y * 1e6, np.arange(len(u)) * 1e3 / RATE_HZ], axis=1)
+    np.savetxt(path, rows, delimiter=",", header="u [kN],y (µm),t [ms]", comments="", fmt="%.17g", encoding="utf-8")
+
+
+HEADERS: dict[str, tuple[Callable[[Path, Values, Values], None], list[str]]] = {
+    "a.mf4": (write_mf4_with_units, ["u", "y", "--rate", "1000"]),
+    "a.parquet": (write_parquet_with_units, ["u", "y", "--rate", "1000"]),
+    "a.csv": (write_csv_with_units, ["u [kN]", "y (µm)", "--time", "t [ms]"]),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+@pytest.mark.usefixtures("in_this_process")
+def test_units_of_a_header_are_converted_to_those_of_the_program(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    u, y = made_signals()
+    write, (input_column, output_column, *rate) = HEADERS[name]
+    write(tmp_path / name, u, y)
+    command = ["import", str(tmp_path / name), "--input", input_column, "--output", output_column, *rate]
+    blind, judged = str(tmp_path / "blind.npz"), str(tmp_path / "judged.npz")
+    assert main([*command, "--clock", "plant", "--scenario", "thesis", "--out", judged]) == 0
+    told = capsys.readouterr().out
+    small = "um" if name == "a.csv" else "mm"
+    assert " N, converted from kN\n" in told and f" m, converted from {small}\n" in told and "imported in" not in told
+    assert main([*command, "--clock", "plant", "--out", blind]) == 0
+    assert f" {small}\n" in capsys.readouterr().out
+    for run in (Run.load(Path(judged)), replace_scenario(Run.load(Path(blind)), Scenario.load("thesis"))):
+        assert run.conditions.sample_period_problem_s == pytest.approx(1.0 / RATE_HZ)
+        for channel, unit, values in (("force", "N", u), ("displacement", "m", y)):
+            assert run.conditions.channels[channel].unit == unit
+            assert np.abs(run.channel(channel) - values).max() <= run.conditions.channels[channel].lsb
+    options = ["--output-unit", "m", "--clock", "plant", "--scenario", "thesis", "--out", judged]
+    assert main([*command, *options]) == 0  # the command line overrides the header
+    header = "µm" if name == "a.csv" else "mm"
+    caveat = f"caveat: column {output_column}, in {header}, is imported in m: pass --output-unit, and --output-scale"
+    assert caveat in capsys.readouterr().out
+    factor = 1e6 if name == "a.csv" else 1e3
+    assert np.ptp(Run.load(Path(judged)).channel("displacement")) == pytest.approx(factor * np.ptp(y), rel=1e-3)
+    assert main([*command, "--input-unit", "m", *options]) == 2
+    assert "force of program front is in N, force of the recording in m: import it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("unit", "other", "factor"),
+    [("mV", "V", 1e-3), ("rpm", "rad/s", np.pi / 30), ("mm", "V", None), ("Hz", "rad/s", None), ("%", "rad", None)],
+)
+def test_units_of_one_dimension_have_a_factor(unit: str, other: str, factor: float | None) -> None:
+    assert parse_unit(unit).factor_to(parse_unit(other)) == (factor and pytest.approx(factor))
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -422,6 +499,15 @@ def _larger_mat() -> bytes:
     return told.replace(struct.pack("<ii", 2, 1), struct.pack("<ii", 10**9, 1))
 
 
+def wav_bytes() -> bytes:
+    """1000 samples of two channels of 16 bits."""
+    from scipy.io import wavfile
+
+    out = io.BytesIO()
+    wavfile.write(out, 8000, np.zeros((1000, 2), np.int16))
+    return out.getvalue()
+
+
 HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
 PICKLED = np.array([{"a": 1}, None], dtype=object)
 OBJECTS = np.array([({"a": 1}, 2.0), (None, 3.0)], dtype=[("u", object), ("y", float)])
@@ -494,6 +580,20 @@ BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     "cut hdf5": ("a.mat", lambda: hdf5_bytes(_huge)[:600], "damaged, or no MATLAB file"),
     "no mf4": ("a.mf4", b"MDF     4.10    " + bytes(300), "damaged, or no MF4 file"),
     "no parquet": ("a.parquet", b"PAR1" + bytes(64) + b"PAR1", "damaged, or no Parquet file"),
+    "text as mf4": ("a.mf4", b"u,y\n1,2\n3,4\n" * 20, "damaged, or no MF4 file"),
+    "text as mat": ("a.mat", b"u,y\n1,2\n3,4\n" * 20, "damaged, or no MATLAB file"),
+    "text as parquet": ("a.parquet", b"u,y\n1,2\n3,4\n" * 20, "damaged, or no Parquet file"),
+    "cut wav": ("a.wav", lambda: wav_bytes()[:2001], "is cut off: 2001 of the 4044 bytes that its header states; copy"),
+    "footer": (
+        "a.csv",
+        b"u,y\n1,2\n3,4\nEnd of file\n",
+        "line 4, column u: 'End of file' is no number; mend or delete",
+    ),
+    "footer of one column": (
+        "a.csv",
+        b"t,u,y\n0,1,2\n1,3,4\nMean,2,3\nMax,3,4\n",
+        "line 4, column t: 'Mean' is no number, perhaps a footer: mend or delete the line",
+    ),
     "no wav": ("a.wav", b"RIFF" + bytes(64), "damaged, or no WAV file"),
 }
 
@@ -547,14 +647,15 @@ def test_doubtful_data_are_imported_with_a_caveat(
 @pytest.mark.usefixtures("in_this_process")
 def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [unit_in_name(each) for each in ("x", "x[2]", "x [m/s^2]", "x(mm) ")] == ["", "", "m/s^2", "mm"]
-    (tmp_path / "a.csv").write_text("t [ms];F (N)\n0;1\n1;2\n2;4\n")
-    named = ["import", str(tmp_path / "a.csv"), "--input", "F (N)", "--output", "F (N)", "--input-unit", "N"]
-    named += ["--out", str(tmp_path / "out.npz")]
-    assert main([*named, "--time", "t [ms]"]) == 2
-    assert "column t [ms]: must be in seconds: pass --rate HZ" in capsys.readouterr().err
+    (tmp_path / "a.csv").write_text("t [m];F (Nm)\n0;1\n1;2\n2;4\n")
+    named = ["import", str(tmp_path / "a.csv"), "--input", "F (Nm)", "--output", "F (Nm)"]
+    named += ["--input-unit", "N m", "--out", str(tmp_path / "out.npz")]
+    assert main([*named, "--time", "t [m]"]) == 2
+    assert "column t [m]: must be a time, not in m: pass --rate HZ" in capsys.readouterr().err
     assert main([*named, "--rate", "1000"]) == 0
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")] == [
-        "caveat: column F (N) is imported in V: pass --output-unit, and --output-scale to convert",
+        "caveat: column F (Nm), in Nm, is imported in N m: pass --input-unit, and --input-scale to convert",
+        "caveat: column F (Nm), in Nm, is imported in V: pass --output-unit, and --output-scale to convert",
         "caveat: input and output are the same column",
     ]
 
@@ -615,10 +716,32 @@ def test_the_columns_are_named_to_a_user_who_named_none(tmp_path: Path, capsys: 
 
 
 def test_the_reader_is_bounded_in_memory(tmp_path: Path) -> None:
-    told = b"RIFF" + struct.pack("<I", 0xFFFFFFF0) + b"WAVEfmt " + struct.pack("<IHHIIHH", 16, 3, 1, 8000, 64000, 8, 64)
+    told = b"RIFF" + bytes(4) + b"WAVEfmt " + struct.pack("<IHHIIHH", 16, 3, 1, 8000, 64000, 8, 64)
     (tmp_path / "a.wav").write_bytes(told + b"data" + struct.pack("<I", 0xFFFFFFE0) + bytes(64))
     with pytest.raises(RecordingError, match=r"needs more than 4 GiB|damaged"):
         read_columns(tmp_path / "a.wav", ["0"])
+
+
+def test_the_reader_leaves_no_file_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    write_mf4(tmp_path / "a.mf4", *made_signals())
+    (tmp_path / "cut.mf4").write_bytes((tmp_path / "a.mf4").read_bytes()[:3000])
+    assert read_columns(tmp_path / "a.mf4", ["u"]).columns["u"].shape == (SAMPLES,)
+    with pytest.raises(RecordingError, match="damaged"):
+        read_columns(tmp_path / "cut.mf4", ["u"])
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_decimals_of_parquet_are_numbers(tmp_path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    column = pa.array([Decimal(k) / 8 for k in range(9)], pa.decimal128(12, 4))
+    parquet.write_table(pa.table({"u": column}), tmp_path / "a.parquet")
+    assert (read_columns(tmp_path / "a.parquet", ["u"]).columns["u"] == np.arange(9) / 8).all()
 
 
 def test_a_reader_that_crashes_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -665,12 +788,47 @@ def test_signals_without_a_sample_of_a_channel_are_refused(tmp_path: Path, capsy
     assert capsys.readouterr().err == f"analogrig: {tmp_path}/a.csv: every sample of displacement is clipped\n"
 
 
-def test_signals_of_another_program_need_its_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    signals, recording = str(tmp_path / "motor.csv"), str(tmp_path / "motor.npz")
-    assert main(["emulate", "--scenario", "dc-motor", "--seed", "5", "--out", signals]) == 0
+@pytest.mark.parametrize("name", ["dc-motor", "pendulum", "two-tanks", "rc-battery"])
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+@pytest.mark.usefixtures("in_this_process")
+def test_signals_of_another_program_come_back_with_its_scenario_or_its_name(
+    name: str, suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    signals, recording = str(tmp_path / f"signals.{suffix}"), str(tmp_path / "recording.npz")
+    scenario = Scenario.load(name)
+    assert main(["emulate", "--scenario", name, "--seed", "5", "--out", signals]) == 0
     assert main(["import", signals, "--out", recording]) == 2
-    assert "motor.csv: lacks channels of program front, force, displacement" in capsys.readouterr().err
-    assert main(["import", signals, "--scenario", "dc-motor", "--out", recording]) == 0
-    with open_rig("emulator") as rig:
-        played = np.concatenate([block.codes for block in rig.perform(Scenario.load("dc-motor"), 5).blocks])
-    assert np.array_equal(Run.load(Path(recording)).codes, played)
+    told = f"has the channels {', '.join(scenario.program.channels)}, program front force, displacement, velocity"
+    assert told in capsys.readouterr().err
+    rig_name = scenario.rig or "emulator"
+    with open_rig(rig_name) as rig:
+        performance = rig.perform(scenario, 5)
+        codes = np.concatenate([block.codes for block in performance.blocks])
+    for options in (["--scenario", name], ["--program", name, "--rig", rig_name]):
+        assert main(["import", signals, *options, "--out", recording]) == 0
+        run = Run.load(Path(recording))
+        assert np.array_equal(run.codes, codes)
+        assert run.conditions.channels == performance.channels
+        assert run.conditions.sample_period_s == performance.sample_period_s
+        assert bool(run.conditions.segments) == (options[0] == "--scenario")
+    assert main(["replay", recording, "--dut", "inproc", "--out", str(tmp_path / "blind")]) == 3
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_columns_of_a_program_are_in_its_units_and_its_time_without_a_scenario(tmp_path: Path) -> None:
+    u, y = made_signals(4000)
+    np.savez(tmp_path / "a.npz", u=u, y=y)
+    out, named = str(tmp_path / "out.npz"), ["--rate", "100", "--clock", "plant", "--program", "duffing"]
+    columns_named = ["--input", "u", "--input-unit", "mN", "--output", "y", "--output-unit", "mm"]
+    assert main(["import", str(tmp_path / "a.npz"), *columns_named, *named, "--out", out]) == 0
+    run = Run.load(Path(out))
+    assert run.conditions.program.name == "duffing" and not run.conditions.segments
+    assert run.conditions.time_scale == 10.0
+    assert np.abs(run.channel("x") - 1e-3 * y).max() < 1e-6
+    assert main(["replay", out, "--dut", "inproc", "--out", str(tmp_path / "blind")]) == 3
+    blind = Run.load(tmp_path / "blind" / "run.npz")
+    mode = mode_of(blind, blind.theta[-1])
+    assert mode is not None and mode.resonance_hz == pytest.approx(60.07 * 100.0 / RATE_HZ, rel=0.01)
+    scenario = dataclasses.replace(Scenario.load("duffing"), samples=4000)
+    judged = replace_scenario(run, scenario)
+    assert judged.conditions.channels == run.conditions.channels

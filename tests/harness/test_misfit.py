@@ -14,7 +14,7 @@ from analogrig.bench import Bench
 from analogrig.catalogue import Cause
 from analogrig.devices.opening import open_dut
 from analogrig.judging.advice import advice
-from analogrig.judging.verdict import CURES, MisfitPeriod, as_json, judge, misfit_periods
+from analogrig.judging.verdict import CURES, NONLINEAR_CURE, MisfitPeriod, as_json, judge, misfit_periods
 from analogrig.recordings import CanLog, import_run
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
@@ -134,3 +134,31 @@ def test_advice_has_one_sentence_a_cause() -> None:
     said = [(10 * k, Cause.NOISE if k % 2 else Cause.NONE, 0.0, 2.0) for k in range(1, 8)]
     run = made_run(np.zeros(100), [(0, FRONT)], misfits=said, estimator=WATCHING)
     assert sum("(noise)" in sentence for sentence in advice(run, judge(run))) == 1
+
+
+def test_a_nonlinear_plant_is_named_in_place_of_faults_of_the_rig() -> None:
+    scenario = dataclasses.replace(Scenario.load("bump-stop"), samples=4000)
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        run = Bench(rig, dut).play(scenario, 2)
+    verdict = judge(run)
+    assert {period.cause for period in verdict.fit or ()} == {"nonlinear", "noise", "hum"}
+    assert [fault.name for fault in verdict.channel_faults] == ["displacement offset"]
+    said = advice(run, verdict)
+    assert (
+        f"the model does not fit (hum, noise, nonlinear): alarms may be false, and changes missed; {NONLINEAR_CURE}"
+        in said
+    )
+    assert any("(displacement offset)" in sentence and sentence.endswith(NONLINEAR_CURE) for sentence in said)
+    assert not any(cure in sentence for sentence in said for cure in (CURES["hum"], CURES["noise"]))
+    found = dataclasses.replace(verdict.channel_faults[0], name="displacement stuck")
+    assert found.cure == "displacement: check its cable and its input"
+    assert MisfitPeriod("excitation", 1, 2, None, None, beyond_model=True).cure == CURES["excitation"]
+
+
+def test_a_failed_run_of_a_nonlinear_program_names_it() -> None:
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        run = Bench(rig, dut).play(Scenario.load("van-der-pol"), 7)
+    verdict = judge(run)
+    assert verdict.outcome == "failed" and not verdict.fit
+    text = "the program van-der-pol is not linear and has 2 states, the device's model is linear, of order 2: if it"
+    assert any(sentence.startswith(text) for sentence in advice(run, verdict))

@@ -119,7 +119,9 @@ def test_run_states_that_a_nonlinear_program_has_more_states_than_the_model(
     scenario = tmp_path / "chain-run.toml"
     scenario.write_text('program = "chain.toml"\nsamples = 60\n[excitation]\nlow_v = 1.0\nfrequency_hz = 50.0\n')
     main(["run", "--scenario", str(scenario), "--dut", "inproc", "--out", str(tmp_path / "run")])
-    assert "chain is not linear and has 3 states, the device models order 2" in capsys.readouterr().out
+    assert (
+        "chain is not linear and has 3 states, the device's model is linear, of order 2: if" in capsys.readouterr().out
+    )
 
 
 def test_run_states_that_a_model_has_too_few_poles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

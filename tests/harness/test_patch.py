@@ -103,3 +103,18 @@ def test_program_that_no_run_could_play_is_refused(tmp_path: Path, capsys: pytes
     captured = capsys.readouterr()
     assert captured.err == f"analogrig: {path}: the circuit has 68 states; the engine takes at most 64\n"
     assert not captured.out
+
+
+@pytest.mark.parametrize(("speed", "told"), [(10, False), (0.5, True), (95, True)])
+def test_a_speed_at_which_the_plant_hardly_moves_or_settles_at_once_is_noted(
+    speed: float,
+    told: bool,  # noqa: FBT001
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = MOTOR.read_text()
+    assert text.count("speed = 10") == 1
+    (tmp_path / "motor.toml").write_text(text.replace("speed = 10", f"speed = {speed}\nperiod_s = 0.05"))
+    assert main(["patch", str(tmp_path / "motor.toml")]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: the plant settles in")]
+    assert len(notes) == told and all("write speed = 8.8 for 100" in line for line in notes)

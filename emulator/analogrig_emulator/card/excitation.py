@@ -230,12 +230,13 @@ class Excitation:
         index = np.arange(first, last + 1)
         starts = index - phases[:, None]
         if self.shape == "prbs":
-            periods, levels_v = starts, self._bit_levels_v(index)
+            periods = starts
+            levels_v = np.tile(self._bit_levels_v(index), (len(phases), 1))
         else:
-            periods = np.stack((starts, starts + self.duty), axis=-1).reshape(len(phases), -1)
-            levels_v = np.tile((self.high_v, self.low_v), index.size)
+            periods, levels_v = np.empty((2, len(phases), 2 * index.size))
+            periods[:, 0::2], periods[:, 1::2] = starts, starts + self.duty
+            levels_v[:, 0::2], levels_v[:, 1::2] = self.high_v, self.low_v
         periods *= period
-        levels_v = np.tile(levels_v, (len(phases), 1))
         ticks, counts = np.empty(periods.shape, np.int64), np.empty(len(phases), np.int64)
         grid = TICKS_PER_SAMPLE if self.clock == "card" else 1
         addresses = [array.ctypes.data for array in (periods, levels_v, ticks, counts)]

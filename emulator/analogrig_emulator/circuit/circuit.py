@@ -11,12 +11,12 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from numbers import Real
 from typing import Any, Never, TypeAlias, TypeVar
 
-from analogrig_emulator.circuit.nonlinear import Function, Multiplier, breakpoint_fault
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND, CircuitPart
 from analogrig_emulator.circuit.pot import check_dial
@@ -81,6 +81,11 @@ class Pot(CircuitPart):
     def bonds(self) -> tuple[tuple[str, str], ...]:
         return (self.top, self.wiper), (self.wiper, self.bottom)
 
+    @property
+    def fault(self) -> str | None:
+        check_dial(self.dial, self.name)
+        return None
+
 
 @dataclass(frozen=True)
 class OpAmp(CircuitPart):
@@ -99,6 +104,10 @@ class OpAmp(CircuitPart):
     def bonds(self) -> tuple[tuple[str, str], ...]:
         # The inputs draw no current, so they hold no node at a voltage.
         return ((self.out, GROUND),)
+
+    @property
+    def output(self) -> str | None:
+        return self.out
 
     @property
     def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
@@ -137,6 +146,10 @@ class VoltageSource(_Source):
     @property
     def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
         return self.bonds
+
+    @property
+    def output(self) -> str | None:
+        return self.minus if self.plus == GROUND else self.plus
 
     @property
     def constant(self) -> float | None:
@@ -184,6 +197,10 @@ class DiodeLimiter(_TwoEnded):
     off_ohm: float
 
     @property
+    def fault(self) -> str | None:
+        return _fault_of_resistances(self)
+
+    @property
     def excess_siemens(self) -> float:
         """Increase of the conductance at the threshold, in S."""
         return 1.0 / self.on_ohm - 1.0 / self.off_ohm
@@ -199,9 +216,19 @@ class Switch(_TwoEnded):
     off_ohm: float
     closed: bool
 
+    @property
+    def fault(self) -> str | None:
+        return _fault_of_resistances(self)
+
     def ohm(self, *, closed: bool) -> float:
         """Resistance in the given position."""
         return self.on_ohm if closed else self.off_ohm
+
+
+def _fault_of_resistances(element: DiodeLimiter | Switch) -> str | None:
+    if element.on_ohm > element.off_ohm:
+        return f"on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}"
+    return None
 
 
 Element: TypeAlias = (
@@ -242,50 +269,48 @@ class Circuit:
     """
 
     elements: tuple[Element, ...]
+    nodes: tuple[str, ...] = field(repr=False, compare=False)
+    """Every node but ground, in order of appearance."""
 
     def __init__(self, elements: Iterable[Element]) -> None:
         object.__setattr__(self, "elements", tuple(elements))
-        _check_names(self.elements)
+        object.__setattr__(self, "nodes", _check_names(self.elements))
         for element in self.elements:
             _check_element(element)
         _check_nodes(self)
         _check_loops(self.elements)
-        _check_feedback(self.elements)
+        _check_feedback(self)
 
     def __reduce__(self) -> tuple[type[Circuit], tuple[tuple[Element, ...]]]:
         """Pickle and copy the netlist alone, not what was computed from it."""
         return Circuit, (self.elements,)
 
     @functools.cached_property
-    def nodes(self) -> tuple[str, ...]:
-        """Every node but ground, in order of appearance."""
-        seen = dict.fromkeys(node for element in self.elements for node in element.nodes)
-        return tuple(node for node in seen if node != GROUND)
-
-    @functools.cached_property
     def inputs(self) -> tuple[VoltageSource | CurrentSource, ...]:
         """Sources without a constant level: inputs in V or A, in netlist order."""
-        sources = (element for element in self.elements if isinstance(element, VoltageSource | CurrentSource))
-        return tuple(source for source in sources if source.constant is None)
+        return tuple(element for element in self.elements if isinstance(element, _Source) and element.constant is None)
 
     def of(self, kind: type[_E]) -> tuple[_E, ...]:
         """The elements of one kind, in netlist order."""
-        if self.untrimmed is not self and kind is not OpAmp:
-            return self.untrimmed.of(kind)
-        found: Sequence[_E] = self._of_kind.get(kind, ())
-        return tuple(found)
+        found: tuple[_E, ...] = self._of_kind.get(kind, ())
+        return found
 
     @functools.cached_property
-    def _of_kind(self) -> Mapping[type, Sequence[Any]]:
+    def _of_kind(self) -> Mapping[type, tuple[Any, ...]]:
         found: defaultdict[type, list[Element]] = defaultdict(list)
         for element in self.elements:
             found[type(element)].append(element)
-        return found
+        return {kind: tuple(elements) for kind, elements in found.items()}
+
+    @functools.cached_property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        """Bonds of all elements, in netlist order."""
+        return tuple([bond for element in self.elements for bond in element.bonds])
 
     @functools.cached_property
     def ways(self) -> Ways:
         """Nodes that bonds of elements join to each node."""
-        return neighbours(bond for element in self.elements for bond in element.bonds)
+        return neighbours(self.bonds)
 
     def derive(self, make: Callable[[Circuit], _T]) -> _T:
         """make(self), computed once for each function `make`."""
@@ -359,7 +384,8 @@ class Circuit:
                 for element in self.elements
             ),
         )
-        trimmed.__dict__.update(_untrimmed=self.untrimmed, nodes=self.nodes, inputs=self.inputs)
+        of_kind = {**self._of_kind, OpAmp: tuple(each for each in trimmed.elements if isinstance(each, OpAmp))}
+        trimmed.__dict__.update(_untrimmed=self.untrimmed, _of_kind=of_kind, nodes=self.nodes, inputs=self.inputs)
         return trimmed
 
     def _variant(self, settings: object, make: Callable[[], Circuit]) -> Circuit:
@@ -398,16 +424,19 @@ def _check_known(kind: str, names: Iterable[str], elements: Iterable[Element]) -
             raise CircuitError(f"no {kind} is called {name!r}; there are {', '.join(known) or 'none'}")
 
 
-def _check_names(elements: tuple[Element, ...]) -> None:
+def _check_names(elements: tuple[Element, ...]) -> tuple[str, ...]:
+    """Return every node but ground, in order of appearance. Raise CircuitError for a duplicate or malformed name."""
     names: set[str] = set()
     nodes: dict[str, str] = {}
-    known: set[str] = set()
+    known = {GROUND}
     for element in elements:
-        if not _NAME.fullmatch(element.name):
-            raise element_error(element, f"element name {element.name!r}: only letters, digits and _ are allowed")
-        if element.name.lower() in names:
+        name = element.name
+        if not _NAME.fullmatch(name):
+            raise element_error(element, f"element name {name!r}: only letters, digits and _ are allowed")
+        name = name.lower()
+        if name in names:
             raise element_error(element, f"two elements are called {element.name!r}")
-        names.add(element.name.lower())
+        names.add(name)
         for node in element.nodes:
             if node in known:
                 continue
@@ -416,6 +445,7 @@ def _check_names(elements: tuple[Element, ...]) -> None:
                 raise element_error(element, f"node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:
                 raise element_error(element, f"nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
+    return tuple(nodes.values())
 
 
 def _check_element(element: Element) -> None:
@@ -424,34 +454,30 @@ def _check_element(element: Element) -> None:
     for a, b in element.spans:
         if a == b:
             raise element_error(element, f"both ends are on node {a}")
-    for field in (*element.positive, *element.finite):
-        _check_value(element, field)
-    if isinstance(element, Pot):
-        check_dial(element.dial, element.name)
-    if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
-        raise element_error(element, f"on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
-    if isinstance(element, Multiplier) and element.scale_v == 0:
-        raise element_error(element, "scale_v must not be 0")
-    if isinstance(element, Function) and (fault := breakpoint_fault(element.breakpoints)):
+    for name in element.positive:
+        value = getattr(element, name)
+        if not (_is_finite(value) and value > 0):
+            raise element_error(element, f"{name} must be positive and finite, got {value!r}")
+        if value < _LEAST:
+            raise element_error(element, f"{name} must be at least {_LEAST:g}, got {value!r}")
+    for name in element.finite:
+        value = getattr(element, name)
+        if value is not None and not _is_finite(value):
+            raise element_error(element, f"{name} must be finite, got {value!r}")
+    if fault := element.fault:
         raise element_error(element, fault)
 
 
-def _check_value(element: Element, field: str) -> None:
-    value = getattr(element, field)
-    if value is None and field in element.finite:
-        return
-    number = isinstance(value, Real) and math.isfinite(value)
-    if field in element.finite and not number:
-        raise element_error(element, f"{field} must be finite, got {value!r}")
-    if field in element.positive and not (number and value > 0):
-        raise element_error(element, f"{field} must be positive and finite, got {value!r}")
-    if field in element.positive and value < _LEAST:
-        raise element_error(element, f"{field} must be at least {_LEAST:g}, got {value!r}")
+def _is_finite(value: object) -> bool:
+    # Nearly all values are floats, and Real is slow to ask.
+    return isinstance(value, (float, Real)) and math.isfinite(value)
 
 
 def _check_nodes(circuit: Circuit) -> None:
     """Raise CircuitError for a node without a path to ground that determines its voltage."""
     grounded = reachable(GROUND, circuit.ways)
+    if grounded.issuperset(circuit.nodes):
+        return
     for element in circuit.elements:
         for node in element.nodes:
             if node not in grounded:
@@ -499,20 +525,18 @@ def _path_names(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
     return [names[frozenset(pair)] for pair in pairwise(reversed(path))]
 
 
-def _check_feedback(elements: tuple[Element, ...]) -> None:
+def _check_feedback(circuit: Circuit) -> None:
     """Raise CircuitError for an op-amp whose output acts on neither of its inputs."""
-    acts = neighbours(
-        bond for element in elements if not isinstance(element, OpAmp) for bond in element.bonds if GROUND not in bond
-    )
-    for amp in elements:
-        if isinstance(amp, OpAmp):
-            for node in {amp.plus, amp.minus} - {GROUND}:
-                acts[node].append(amp.out)
-        elif isinstance(amp, Multiplier | Function):
-            for node in amp.nodes[:-1]:
-                acts[node].append(amp.out)
-    for amp in elements:
-        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & reachable(amp.out, acts):
+    acts = neighbours(bond for bond in circuit.bonds if GROUND not in bond)
+    for amp in circuit.of(OpAmp):
+        for node in {amp.plus, amp.minus} - {GROUND}:
+            acts[node].append(amp.out)
+    computing: tuple[Multiplier | Function, ...] = (*circuit.of(Multiplier), *circuit.of(Function))
+    for part in computing:
+        for node in part.nodes[:-1]:
+            acts[node].append(part.out)
+    for amp in circuit.of(OpAmp):
+        if not leads(amp.out, acts, {amp.plus, amp.minus}):
             raise element_error(
                 amp,
                 f"no feedback: its output, node {amp.out}, acts on neither of its inputs, nodes"
@@ -529,13 +553,28 @@ def neighbours(bonds: Iterable[tuple[str, str]]) -> defaultdict[str, list[str]]:
     return ways
 
 
-def reachable(start: str, ways: Ways, borders: Container[str] = ()) -> set[str]:
-    """Nodes to which ways lead from start, up to and including borders."""
+def reachable(start: str, ways: Ways) -> set[str]:
+    """Nodes to which ways lead from start."""
     reached, front = {start}, [start]
     while front:
         for node in ways.get(front.pop(), ()):
             if node not in reached:
                 reached.add(node)
-                if node not in borders:
-                    front.append(node)
+                front.append(node)
     return reached
+
+
+def leads(start: str, ways: Ways, goals: Container[str], borders: Container[str] = ()) -> bool:
+    """True if ways lead from start to one of the goals, through no border but start."""
+    if start in goals:
+        return True
+    reached, front = {start}, [start]
+    for node in front:
+        for near in ways.get(node, ()):
+            if near in goals:
+                return True
+            if near not in reached:
+                reached.add(near)
+                if near not in borders:
+                    front.append(near)
+    return False

@@ -20,7 +20,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -38,7 +38,7 @@ from analogrig_emulator.circuit.circuit import (
     VoltageSource,
     element_error,
 )
-from analogrig_emulator.circuit.nonlinear import Function, Multiplier
+from analogrig_emulator.circuit.nonlinear import Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
@@ -102,7 +102,7 @@ class Nodal:
             self._poles = circuit.of(OpAmp)
             offset = self._laws.offset.copy()
             offset[self._laws.poles] = [amp.model.vos_v for amp in self._poles]
-            self._laws = replace(self._laws, offset=offset)
+            self._laws = self._laws._replace(offset=offset)
         self._circuit = circuit
         self._untrimmed = untrimmed
         self._kept: dict[_Place, PiecewiseLinear] = {}
@@ -128,31 +128,37 @@ class Nodal:
         branches += [function.name for function in self._functions]
 
         self._nodes = circuit.nodes
-        self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
+        self._row = {node: i for i, node in enumerate(self._nodes)}
+        self._branch = {name: i for i, name in enumerate(branches, len(self._nodes))}
+        self._unknowns = len(self._nodes) + len(branches)
         # Ground has the last row and column, which are left out of the solution.
-        self._row = {node: i for i, node in enumerate(self._nodes)} | {GROUND: len(self._unknowns)}
-        self._branch = {name: len(self._nodes) + i for i, name in enumerate(branches)}
+        self._row[GROUND] = self._unknowns
         holders: list[Capacitor | OpAmp | Multiplier] = [*self._capacitors, *self._poles, *followers]
         self._state = {element.name: i for i, element in enumerate(holders)}
         self._columns = len(self._state) + len(self._inputs) + len(self._multipliers) + 1
         limited: tuple[OpAmp | Multiplier, ...] = (*self._poles, *followers)
-        limits = [_limits(part) for part in limited]
-        self._kinks = tuple(kink for kinks in limits for kink in kinks.values())
-        first_source = len(self._kinks)
-        self._kinks += tuple(Kink.deadzone(-math.inf, limiter.threshold_v, limiter.name) for limiter in self._limiters)
-        self._kinks += tuple(kink for function in self._functions for kink in function.kinks)
-        self._recovering = tuple(amp for amp in self._poles if amp.model.recovers)
-        self._kinks += tuple(Kink.deadzone(*amp.model.swing_v, amp.name) for amp in self._recovering)
-        self._sources = slice(first_source, len(self._kinks))
-        self._kinks += tuple(Kink.none(part.name) for part in self._multipliers for _ in "xy")
+        limits = [_limits(part.name, part.model) for part in limited]
+        kinks = [kink for pairs in limits for _, kink in pairs]
+        first_source = len(kinks)
+        kinks += [Kink.deadzone(-math.inf, limiter.threshold_v, limiter.name) for limiter in self._limiters]
+        bends = [function.kinks for function in self._functions]
+        kinks += [kink for bent in bends for kink in bent]
+        self._recovering = tuple([amp for amp in self._poles if amp.model.recovers])
+        kinks += [Kink.deadzone(*amp.model.swing_v, amp.name) for amp in self._recovering]
+        self._sources = slice(first_source, len(kinks))
+        kinks += [Kink.none(part.name) for part in self._multipliers for _ in "xy"]
+        self._kinks = tuple(kinks)
         self._check_size()
 
-        size = len(self._unknowns) + 1
+        size = self._unknowns + 1
         self._left = np.zeros((size, size))
         self._right = np.zeros((size, self._columns + self._sources.stop - first_source))
-        ends = [(switch.a, switch.b) for switch in self._switches]
-        self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
-        parts = _Parts(self._capacitors, self._poles, self._multipliers, self._limiters, self._functions, limits)
+        legs = _Stamps(size)
+        for part in (*self._switches, *self._pots):
+            for a, b in part.bonds:
+                legs.join(self._row[a], self._row[b], 1.0)
+        self._leg_places = np.array(legs.places, np.intp)
+        parts = _Parts(self._capacitors, self._poles, self._multipliers, self._limiters, self._functions, limits, bends)
         self._laws = _Laws.of(self._row, self._branch, parts, len(self._state) + len(self._inputs))
         self._enter(circuit)
 
@@ -218,13 +224,12 @@ class Nodal:
 
     def _trim(self, solution: Matrix) -> Trim:
         laws = self._laws
-        apart_v = laws.apart(solution)[laws.poles, self._columns - 1]
-        slew_kinks = dict(zip(laws.drive_of_kink[laws.slews].tolist(), laws.slews.tolist(), strict=True))
+        slew_kinks = dict(zip(laws.slewing.tolist(), laws.slews, strict=True))
         return Trim(
             amps=tuple(amp.name for amp in self._poles),
-            apart_v=apart_v,
-            gain_rate=laws.gain[laws.poles, 0],
-            rows=tuple((pole, slew_kinks.get(pole)) for pole in laws.poles.tolist()),
+            apart_v=laws.apart(solution)[laws.poles, self._columns - 1],
+            gain_rate=laws.rates[: len(self._poles), 0],
+            rows=tuple((pole, slew_kinks.get(pole)) for pole in range(laws.poles.start, laws.poles.stop)),
         )
 
     def disturbances(self, dials: Mapping[str, float]) -> dict[str, Matrix]:
@@ -233,8 +238,8 @@ class Nodal:
         Key node: 1 A into it; key op-amp: 1 V in series with its + input; key multiplier with a bandwidth: 1 V added to
         its product; ground: zeros. Raises like at().
         """
-        size = len(self._unknowns)
-        slopes = self._laws.slopes(self._solve(self._set(dials, {}), np.eye(size + 1)))[: len(self._state)]
+        size = self._unknowns
+        slopes = self._laws.slopes(self._solve(self._set(dials, {}), np.eye(size + 1)))
         columns = {node: slopes[:, row] if node != GROUND else np.zeros(len(slopes)) for node, row in self._row.items()}
         amps = {amp.name: amp for amp in self._poles}
         own = np.eye(len(self._state))
@@ -251,46 +256,46 @@ class Nodal:
             ("multipliers", len(self._multipliers), library.MAX_PRODUCTS),
             ("inputs and multipliers", len(self._inputs) + len(self._multipliers), library.MAX_INPUTS),
             ("limits, diode limiters, bends and inputs of multipliers", len(self._kinks), library.MAX_KINKS),
-            ("nodes and branches", len(self._unknowns), library.MAX_UNKNOWNS),
+            ("nodes and branches", self._unknowns, library.MAX_UNKNOWNS),
         )
         for what, count, limit in sizes:
             if count > limit:
                 raise CircuitError(f"the circuit has {count} {what}; the engine takes at most {limit}")
 
     def _enter(self, circuit: Circuit) -> None:
-        places = self._places([(resistor.a, resistor.b) for resistor in circuit.of(Resistor)])
-        siemens = [1.0 / resistor.ohm for resistor in circuit.of(Resistor)]
-        np.add.at(self._left.reshape(-1), places, np.outer(siemens, _STAMP).ravel())
-        for capacitor in self._capacitors:
-            row = self._voltage_branch(capacitor.name, capacitor.a, capacitor.b)
-            self._right[row, self._state[capacitor.name]] = 1.0
+        row, states = self._row, len(self._state)
+        left, right = _Stamps(self._unknowns + 1), self._right
+        for resistor in circuit.of(Resistor):
+            left.join(row[resistor.a], row[resistor.b], 1.0 / resistor.ohm)
+        for i, capacitor in enumerate(self._capacitors):
+            right[self._enter_branch(left, capacitor.name, capacitor.a, capacitor.b), i] = 1.0
         for source in circuit.of(VoltageSource):
-            row = self._voltage_branch(source.name, source.plus, source.minus)
             column, volts = self._drive(source)
-            self._right[row, column] = volts
+            right[self._enter_branch(left, source.name, source.plus, source.minus), column] = volts
         for drive in circuit.of(CurrentSource):
             column, amperes = self._drive(drive)
-            self._right[self._row[drive.plus], column] -= amperes
-            self._right[self._row[drive.minus], column] += amperes
+            right[row[drive.plus], column] -= amperes
+            right[row[drive.minus], column] += amperes
         for amp in circuit.of(OpAmp):
-            self._enter_opamp(amp)
-        for i, limiter in enumerate(self._limiters):
-            self._conductance(self._left, limiter.a, limiter.b, 1.0 / limiter.off_ohm)
-            self._right[self._row[limiter.a], self._columns + i] -= limiter.excess_siemens
-            self._right[self._row[limiter.b], self._columns + i] += limiter.excess_siemens
-        for i, part in enumerate(self._multipliers):
-            self._enter_multiplier(part, len(self._state) + len(self._inputs) + i)
+            self._enter_opamp(left, amp)
+        for i, limiter in enumerate(self._limiters, self._columns):
+            left.join(row[limiter.a], row[limiter.b], 1.0 / limiter.off_ohm)
+            right[row[limiter.a], i] -= limiter.excess_siemens
+            right[row[limiter.b], i] += limiter.excess_siemens
+        for i, part in enumerate(self._multipliers, states + len(self._inputs)):
+            self._enter_multiplier(left, part, i)
         bend = self._columns + len(self._limiters)
         for function in self._functions:
             slope, volts = function.line
-            row = self._voltage_branch(function.name, function.out, GROUND)
-            self._left[row, self._row[function.x]] -= slope
-            self._right[row, self._columns - 1] = volts
-            self._right[row, bend : bend + len(function.kinks)] = 1.0
+            branch = self._enter_branch(left, function.name, function.out, GROUND)
+            left.add(branch, row[function.x], -slope)
+            right[branch, self._columns - 1] = volts
+            right[branch, bend : bend + len(function.kinks)] = 1.0
             bend += len(function.kinks)
         for amp in self._recovering:
-            self._right[:, bend] = -self._right[:, self._state[amp.name]]
+            right[:, bend] = -right[:, self._state[amp.name]]
             bend += 1
+        np.add.at(self._left.reshape(-1), np.array(left.places, np.intp), left.values)
 
     def _drive(self, source: VoltageSource | CurrentSource) -> tuple[int, float]:
         """Column of the right-hand side that drives a source, and its factor."""
@@ -299,79 +304,65 @@ class Nodal:
             return len(self._state) + self._inputs.index(source), 1.0
         return self._columns - 1, level
 
-    def _conductance(self, left: Matrix, a: str, b: str, siemens: float) -> None:
-        i, j = self._row[a], self._row[b]
-        left[i, i] += siemens
-        left[j, j] += siemens
-        left[i, j] -= siemens
-        left[j, i] -= siemens
-
     def _set(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Matrix:
         """The left-hand side with pots and switches entered."""
         left = self._left.copy()
-        np.add.at(left.reshape(-1), self._leg_places, np.outer(self._leg_siemens(dials, closed), _STAMP).ravel())
-        return left
-
-    def _leg_siemens(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> list[float]:
-        """Conductances of the switches, then of both legs of every pot."""
         ohms = [switch.ohm(closed=closed.get(switch.name, switch.closed)) for switch in self._switches]
         for pot in self._pots:
             ohms += legs_ohm(check_dial(dials.get(pot.name, pot.dial), pot.name), pot.track_ohm)
-        return [1.0 / ohm for ohm in ohms]
+        values: list[float] = []
+        for ohm in ohms:
+            siemens = 1.0 / ohm
+            values += (siemens, siemens, -siemens, -siemens)
+        np.add.at(left.reshape(-1), self._leg_places, values)
+        return left
 
-    def _places(self, ends: Sequence[tuple[str, str]]) -> NDArray[np.intp]:
-        """Indices at which conductances between these nodes enter the flattened matrix, four each."""
-        size = len(self._unknowns) + 1
-        rows = [(self._row[a], self._row[b]) for a, b in ends]
-        return np.array([(i * size + i, j * size + j, i * size + j, j * size + i) for i, j in rows], np.intp).ravel()
-
-    def _voltage_branch(self, name: str, plus: str, minus: str) -> int:
+    def _enter_branch(self, left: _Stamps, name: str, plus: str, minus: str) -> int:
         """Enters a branch whose current flows from node plus through it to node minus.
 
         Returns the row of its equation, v(plus) - v(minus) = right-hand side.
         """
-        row, i, j = self._branch[name], self._row[plus], self._row[minus]
-        self._left[i, row] += 1.0
-        self._left[j, row] -= 1.0
-        self._left[row, i] += 1.0
-        self._left[row, j] -= 1.0
+        row = self._branch[name]
+        left.branch(row, self._row[plus], self._row[minus])
         return row
 
-    def _enter_opamp(self, amp: OpAmp) -> None:
-        model, out = amp.model, self._row[amp.out]
-        if not model.has_state:
-            # (v(out) - Rout i) / Avol - (v+ - v-) = Vos, with the current i leaving the node; for infinite Avol this is
-            # v+ = v-.
-            row = self._branch[amp.name]
-            self._left[out, row] += 1.0
-            self._left[row, out] += 1.0 / model.avol
-            self._left[row, row] -= model.rout_ohm / model.avol
-            self._left[row, self._row[amp.plus]] -= 1.0
-            self._left[row, self._row[amp.minus]] += 1.0
-            self._right[row, self._columns - 1] = model.vos_v
-            for node in (amp.plus, amp.minus):
-                self._left[row, self._row[node]] -= 0.5 / model.cmrr
-        else:
-            self._enter_output(amp)
+    def _enter_opamp(self, left: _Stamps, amp: OpAmp) -> None:
+        model = amp.model
+        if model.has_state:
+            self._enter_output(left, amp)
+            return
+        # (v(out) - Rout i) / Avol - (v+ - v-) = Vos, with the current i leaving the node; for infinite Avol this is
+        # v+ = v-.
+        out, row = self._row[amp.out], self._branch[amp.name]
+        plus, minus = self._row[amp.plus], self._row[amp.minus]
+        left.add(out, row, 1.0)
+        left.add(row, out, 1.0 / model.avol)
+        left.add(row, row, -model.rout_ohm / model.avol)
+        left.add(row, plus, -1.0)
+        left.add(row, minus, 1.0)
+        self._right[row, self._columns - 1] = model.vos_v
+        for node in (plus, minus):
+            left.add(row, node, -0.5 / model.cmrr)
 
-    def _enter_output(self, part: OpAmp | Multiplier) -> None:
+    def _enter_output(self, left: _Stamps, part: OpAmp | Multiplier) -> None:
         """Enter the state of an element behind its output resistance."""
+        state = self._state[part.name]
         if part.model.rout_ohm > 0:
-            self._conductance(self._left, part.out, GROUND, 1.0 / part.model.rout_ohm)
-            self._right[self._row[part.out], self._state[part.name]] += 1.0 / part.model.rout_ohm
+            siemens, out = 1.0 / part.model.rout_ohm, self._row[part.out]
+            left.join(out, self._row[GROUND], siemens)
+            self._right[out, state] += siemens
         else:
-            row = self._voltage_branch(part.name, part.out, GROUND)
-            self._right[row, self._state[part.name]] = 1.0
+            self._right[self._enter_branch(left, part.name, part.out, GROUND), state] = 1.0
 
-    def _enter_multiplier(self, part: Multiplier, product: int) -> None:
+    def _enter_multiplier(self, left: _Stamps, part: Multiplier, product: int) -> None:
         if part.model.has_state:
-            self._enter_output(part)
-        else:
-            row = self._voltage_branch(part.name, part.out, GROUND)
-            if part.model.rout_ohm > 0:
-                self._left[row, row] -= part.model.rout_ohm
-            self._right[row, product] = 1.0
-            self._right[row, self._columns - 1] = part.model.z_offset_v
+            self._enter_output(left, part)
+            return
+        row = self._enter_branch(left, part.name, part.out, GROUND)
+        if part.model.rout_ohm > 0:
+            left.add(row, row, -part.model.rout_ohm)
+        self._right[row, product] = 1.0
+        self._right[row, self._columns - 1] = part.model.z_offset_v
 
     # ---- reading the solution
 
@@ -380,7 +371,7 @@ class Nodal:
 
     def _solve(self, left: Matrix, right: Matrix) -> Matrix:
         """Solution for the columns of `right`: a row per unknown, and a last row of zeros for ground."""
-        size = len(self._unknowns)
+        size = self._unknowns
         solution = np.zeros((size + 1, right.shape[1]))
         solution[:size] = right[:size]
         failed = solve_in_place(left[:size, :size], solution)
@@ -390,24 +381,25 @@ class Nodal:
 
     def _singular(self, unknown: int) -> CircuitError:
         """CircuitError that names the undetermined node, with the first element at it, or the current."""
-        what, name = self._unknowns[unknown]
-        element = next(
-            part for part in self._circuit.elements if name in (part.nodes if what == "node" else (part.name,))
-        )
+        is_node = unknown < len(self._nodes)
+        what = "node" if is_node else "current of"
+        name = (*self._nodes, *self._branch)[unknown]
+        element = next(part for part in self._circuit.elements if name in (part.nodes if is_node else (part.name,)))
         return element_error(element, f"the circuit is singular: nothing determines the {what} {name}")
 
     def _flow(self, solution: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
         """[A B c], G, [C D e] and P."""
         laws, states = self._laws, len(self._state)
         drives = laws.drives(solution, self._columns - 1)
-        w = drives[laws.drive_of_kink]
+        w = drives.take(laws.drive_of_kink, 0)
         w[laws.of_state] = 0.0
         w[laws.of_state, laws.state] = 1.0
-        w[laws.currents] -= solution[laws.loaded]
+        if laws.currents:
+            w[laws.currents] -= solution[laws.loaded]
         for kink, column in laws.saturations:
             w[kink, column] -= 1.0
         slopes = drives[:states]
-        slopes[laws.drive_of_kink[laws.slews]] = 0.0
+        slopes[laws.slewing] = 0.0
         g = laws.g.copy()
         g[:, self._sources] = slopes[:, self._columns :]
         return slopes[:, : self._columns], g, w[:, : self._columns], self._spread(w)
@@ -443,8 +435,30 @@ class Trim:
         return system.with_drives(abc, cde)
 
 
-_STAMP = np.array((1.0, 1.0, -1.0, -1.0))
-"""Signs of a conductance at its four places: both diagonal ones, then both off-diagonal ones."""
+class _Stamps:
+    """Numbers to be added to the left-hand side, in order, with their indices in the flattened matrix."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self.places: list[int] = []
+        self.values: list[float] = []
+
+    def add(self, row: int, column: int, value: float) -> None:
+        """Add a number in one place."""
+        self.places.append(row * self._size + column)
+        self.values.append(value)
+
+    def join(self, i: int, j: int, siemens: float) -> None:
+        """Add a conductance between two nodes."""
+        size = self._size
+        self.places += (i * size + i, j * size + j, i * size + j, j * size + i)
+        self.values += (siemens, siemens, -siemens, -siemens)
+
+    def branch(self, row: int, i: int, j: int) -> None:
+        """Add a branch with the voltage between two nodes; row: its equation, and the column of its current."""
+        size = self._size
+        self.places += (i * size + row, j * size + row, row * size + i, row * size + j)
+        self.values += (1.0, -1.0, 1.0, -1.0)
 
 
 class _Parts(NamedTuple):
@@ -455,108 +469,118 @@ class _Parts(NamedTuple):
     multipliers: Sequence[Multiplier]
     limiters: Sequence[DiodeLimiter]
     functions: Sequence[Function]
-    limits: Sequence[Mapping[_Limit, Kink]]
+    limits: Sequence[_Limits]
     """Those of each op-amp and multiplier with a pole."""
+    bends: Sequence[Sequence[Kink]]
+    """Those of each function generator."""
 
 
-@dataclass(frozen=True)
-class _Laws:
+class _Laws(NamedTuple):
     """Laws of capacitors (by current), and of op-amps, multipliers, limiters and bends (by voltages), as arrays.
 
-    A drive is (solution[plus] - solution[minus] + offset) gain / capacity, less the leak. The drives of multipliers
-    hold their products besides: fed gives their rows, products the columns. drive_of_kink: drive of each kink, in the
-    order of the kinks; slews: indices of the kinks of that kind. of_state: kinks whose argument is a state, and state:
-    it. currents: those from which the voltage of the node in loaded is taken. saturations: (kink, column of the
-    solution) at which the output of a recovering op-amp lacks its excess. common: for each op-amp, 1 / (2 CMRR). g: G
-    without limiters and bends. holders: rows with a leak; poles: those of the op-amps.
+    A drive is solution[plus] - solution[minus] + offset; that of a capacitor is divided by its farads, that of an
+    op-amp or multiplier is multiplied by its rate and lessened by its leak. The drives of multipliers hold their
+    products besides, in the rows and columns of fed. drive_of_kink: drive of each kink, in the order of the kinks;
+    slews: indices of the kinks of that kind, and slewing: their drives. of_state: kinks whose argument is a state, and
+    state: it. currents: those from which the voltage of the node in loaded is taken. saturations: (kink, column of the
+    solution) at which the output of a recovering op-amp lacks its excess. common: for each op-amp, 1 / (2 CMRR), if
+    there is one. g: G without limiters and bends. poles: rows of the op-amps.
     """
 
     plus: NDArray[np.intp]
     minus: NDArray[np.intp]
     offset: Matrix
-    gain: Matrix
-    capacity: Matrix
-    poles: NDArray[np.intp]
-    holders: NDArray[np.intp]
-    fed: NDArray[np.intp]
-    products: NDArray[np.intp]
+    farads: Matrix
+    rates: Matrix
+    poles: slice
+    fed: list[tuple[int, int]]
     leak: Matrix
     drive_of_kink: NDArray[np.intp]
-    slews: NDArray[np.intp]
+    slews: list[int]
+    slewing: NDArray[np.intp]
     of_state: NDArray[np.intp]
     state: NDArray[np.intp]
-    currents: NDArray[np.intp]
-    loaded: NDArray[np.intp]
-    saturations: tuple[tuple[int, int], ...]
-    common: Matrix
+    currents: list[int]
+    loaded: list[int]
+    saturations: list[tuple[int, int]]
+    common: Matrix | None
     g: Matrix
 
     @classmethod
     def of(cls, row: Mapping[str, int], branch: Mapping[str, int], parts: _Parts, first_product: int) -> _Laws:
         """Laws of a circuit with numbered nodes (row) and branches."""
-        capacitors, poles, multipliers, limiters, functions, limits = parts
-        followers = [part for part in multipliers if part.model.has_state]
-        bent = [function for function in functions for _ in function.kinks]
-        ends = [(branch[capacitor.name], row[GROUND]) for capacitor in capacitors]
-        ends += [(row[amp.plus], row[amp.minus]) for amp in poles]
-        ends += [(row[GROUND], row[GROUND])] * len(followers)
-        ends += [(row[limiter.a], row[limiter.b]) for limiter in limiters]
-        ends += [(row[function.x], row[GROUND]) for function in bent]
-        recovering = [(i, amp) for i, amp in enumerate(poles, len(capacitors)) if amp.model.recovers]
-        ends += [(row[GROUND], row[GROUND])] * len(recovering)
-        ends += [(row[node], row[GROUND]) for part in multipliers for node in (part.x, part.y)]
-        plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
+        capacitors, poles, multipliers, limiters, functions, limits, bends = parts
+        fed_products = [i for i, part in enumerate(multipliers) if part.model.has_state]
+        followers = [multipliers[i] for i in fed_products]
         limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
-        first, states = len(capacitors), len(capacitors) + len(limited)
-        parts_limits = enumerate(zip(limited, limits, strict=True), first)
-        kinds = [(i, part, limit) for i, (part, kinks) in parts_limits for limit in kinks]
-        held = [(kink, i) for kink, (i, _, limit) in enumerate(kinds) if limit is not _Limit.SLEW]
-        fed_back = [(kink, part) for kink, (_, part, limit) in enumerate(kinds) if limit is _Limit.CURRENT]
-        last_source = len(kinds) + len(limiters) + len(bent) + len(recovering)
-        held += [(last_source - len(recovering) + k, i) for k, (i, _) in enumerate(recovering)]
+        first, states, ground = len(capacitors), len(capacitors) + len(limited), row[GROUND]
+        recovering = [(i, amp) for i, amp in enumerate(poles, first) if amp.model.recovers]
+        ends = [(branch[capacitor.name], ground) for capacitor in capacitors]
+        ends += [(row[amp.plus], row[amp.minus]) for amp in poles]
+        ends += [(ground, ground)] * len(followers)
+        ends += [(row[limiter.a], row[limiter.b]) for limiter in limiters]
+        ends += [(row[function.x], ground) for function, bent in zip(functions, bends, strict=True) for _ in bent]
+        ends += [(ground, ground)] * len(recovering)
+        last_source = len(ends)
+        ends += [(row[node], ground) for part in multipliers for node in (part.x, part.y)]
         # The columns of sources follow those of the last product and the constant.
-        excess = {
-            amp.name: first_product + len(multipliers) + 1 + len(limiters) + len(bent) + k
-            for k, (_, amp) in enumerate(recovering)
-        }
-        ones, zeros = np.ones(len(capacitors)), np.zeros(len(capacitors))
-        tail = np.ones(len(ends) - states)
-        offsets_v = np.zeros(tail.size)
-        offsets_v[tail.size - 2 * len(multipliers) :] = [
-            volts for part in multipliers for volts in (part.model.x_offset_v, part.model.y_offset_v)
-        ]
-        rates = [part.model.gain_rate for part in limited]
-        z_offsets_v = [part.model.z_offset_v for part in followers]
-        laws = cls(
-            plus=plus,
-            minus=minus,
-            offset=np.concatenate((zeros, [amp.model.vos_v for amp in poles], z_offsets_v, offsets_v)),
-            gain=np.concatenate((ones, rates, tail)).reshape(-1, 1),
-            capacity=np.concatenate(([c.farad for c in capacitors], np.ones(len(limited)), tail)).reshape(-1, 1),
-            poles=np.arange(first, first + len(poles)),
-            holders=np.arange(first, states),
-            fed=np.arange(first + len(poles), states),
-            products=first_product + np.array([i for i, p in enumerate(multipliers) if p.model.has_state], np.intp),
+        last_column = first_product + len(multipliers) + 1 + last_source - states
+        excess = {amp.name: column for column, (_, amp) in enumerate(recovering, last_column - len(recovering))}
+        drive_of_kink: list[int] = []
+        slews, of_state, state, currents = [], [], [], []
+        loaded, saturations = [], []
+        for i, (part, kinks) in enumerate(zip(limited, limits, strict=True), first):
+            for kink, (limit, _) in enumerate(kinks, len(drive_of_kink)):
+                drive_of_kink.append(i)
+                if limit is _Limit.SLEW:
+                    slews.append(kink)
+                    continue
+                of_state.append(kink)
+                state.append(i)
+                if limit is _Limit.CURRENT:
+                    currents.append(kink)
+                    loaded.append(row[part.out])
+                    if part.name in excess:
+                        saturations.append((kink, excess[part.name]))
+        limits_count = len(drive_of_kink)
+        drive_of_kink += range(states, len(ends))
+        slewing = [drive_of_kink[kink] for kink in slews]
+        g = np.zeros((states, len(drive_of_kink)))
+        for i, kink in zip(slewing, slews, strict=True):
+            g[i, kink] = 1.0
+        for i, kink in zip(state, of_state, strict=True):
+            g[i, kink] = -CLAMP_RATE
+        of_state += range(limits_count + last_source - states - len(recovering), limits_count + last_source - states)
+        state += [i for i, _ in recovering]
+        offset = [0.0] * first + [amp.model.vos_v for amp in poles] + [part.model.z_offset_v for part in followers]
+        offset += [0.0] * (last_source - states)
+        offset += [volts for part in multipliers for volts in (part.model.x_offset_v, part.model.y_offset_v)]
+        common = [0.5 / amp.model.cmrr for amp in poles]
+        return cls(
+            plus=np.array([plus for plus, _ in ends], np.intp),
+            minus=np.array([minus for _, minus in ends], np.intp),
+            offset=np.array(offset),
+            farads=np.array([capacitor.farad for capacitor in capacitors]).reshape(-1, 1),
+            rates=np.array([part.model.gain_rate for part in limited]).reshape(-1, 1),
+            poles=slice(first, first + len(poles)),
+            fed=[(row, first_product + i) for row, i in enumerate(fed_products, first + len(poles))],
             leak=np.array([part.model.leak_rate for part in limited]),
-            drive_of_kink=np.array([*(i for i, _, _ in kinds), *range(states, len(ends))], np.intp),
-            slews=np.array([kink for kink, (_, _, limit) in enumerate(kinds) if limit is _Limit.SLEW], np.intp),
-            of_state=np.array([kink for kink, _ in held], np.intp),
-            state=np.array([i for _, i in held], np.intp),
-            currents=np.array([kink for kink, _ in fed_back], np.intp),
-            loaded=np.array([row[part.out] for _, part in fed_back], np.intp),
-            saturations=tuple((kink, excess[part.name]) for kink, part in fed_back if part.name in excess),
-            common=np.array([0.5 / amp.model.cmrr for amp in poles]).reshape(-1, 1),
-            g=np.zeros((states, len(kinds) + tail.size)),
+            drive_of_kink=np.array(drive_of_kink, np.intp),
+            slews=slews,
+            slewing=np.array(slewing, np.intp),
+            of_state=np.array(of_state, np.intp),
+            state=np.array(state, np.intp),
+            currents=currents,
+            loaded=loaded,
+            saturations=saturations,
+            common=np.array(common).reshape(-1, 1) if any(common) else None,
+            g=g,
         )
-        laws.g[laws.drive_of_kink[laws.slews], laws.slews] = 1.0
-        for kink, i in held[: len(held) - len(recovering)]:
-            laws.g[i, kink] = -CLAMP_RATE
-        return laws
 
     def apart(self, solution: Matrix) -> Matrix:
         """Voltage between the ends of each law, with what an op-amp passes of its common mode."""
-        apart: Matrix = solution[self.plus] - solution[self.minus]
-        if self.common.any():
+        apart: Matrix = solution.take(self.plus, 0) - solution.take(self.minus, 0)
+        if self.common is not None:
             apart[self.poles] += (solution[self.plus[self.poles]] + solution[self.minus[self.poles]]) * self.common
         return apart
 
@@ -564,15 +588,24 @@ class _Laws:
         """A row for each capacitor (V/s), op-amp and multiplier with a pole (V/s, before any limit), and w (V)."""
         drives = self.apart(solution)
         drives[:, constant] += self.offset
-        drives[self.fed, self.products] += 1.0
-        drives *= self.gain
-        drives /= self.capacity
-        drives[self.holders, self.holders] -= self.leak
+        for row, product in self.fed:
+            drives[row, product] += 1.0
+        slopes = self._scaled(drives)
+        diagonal = slopes.reshape(-1)[:: slopes.shape[1] + 1]
+        diagonal[len(self.farads) :] -= self.leak
         return drives
 
     def slopes(self, solution: Matrix) -> Matrix:
-        """Rows of drives() without offsets and leaks."""
-        return np.asarray(self.apart(solution) * self.gain / self.capacity)
+        """Rows of drives() with a state, without offsets and leaks."""
+        return self._scaled(self.apart(solution))
+
+    def _scaled(self, apart: Matrix) -> Matrix:
+        """Rows with a state, scaled in place."""
+        first = len(self.farads)
+        slopes = apart[: first + len(self.rates)]
+        slopes[:first] /= self.farads
+        slopes[first:] *= self.rates
+        return slopes
 
 
 class _Limit(enum.Enum):
@@ -583,14 +616,17 @@ class _Limit(enum.Enum):
     CURRENT = enum.auto()
 
 
-def _limits(part: OpAmp | Multiplier) -> dict[_Limit, Kink]:
+_Limits: TypeAlias = list[tuple[_Limit, Kink]]
+
+
+def _limits(name: str, model: OpAmpModel | MultiplierModel) -> _Limits:
     """Limits of an output with a pole, in the order of their kinks."""
-    model, limits = part.model, {}
+    limits = []
     if model.slews:
-        limits[_Limit.SLEW] = Kink.clip(model.slew_v_per_s, part.name)
+        limits.append((_Limit.SLEW, Kink.clip(model.slew_v_per_s, name)))
     if model.clamps:
-        limits[_Limit.SWING] = Kink.deadzone(*model.bounds_v, part.name)
+        limits.append((_Limit.SWING, Kink.deadzone(*model.bounds_v, name)))
     if isinstance(model, OpAmpModel) and model.limits_current:
         drop_v = model.rout_ohm * model.current_limit_a
-        limits[_Limit.CURRENT] = Kink.deadzone(-drop_v, drop_v, part.name)
+        limits.append((_Limit.CURRENT, Kink.deadzone(-drop_v, drop_v, name)))
     return limits

@@ -131,6 +131,14 @@ class Multiplier(CircuitPart):
         return () if self.model.has_state and self.model.rout_ohm > 0 else self.bonds
 
     @property
+    def output(self) -> str | None:
+        return self.out
+
+    @property
+    def fault(self) -> str | None:
+        return "scale_v must not be 0" if self.scale_v == 0 else None
+
+    @property
     def product(self) -> Product:
         """Product of the inputs."""
         return self.model.product(self.scale_v, self.name)
@@ -171,6 +179,20 @@ class Function(CircuitPart):
         return self.bonds
 
     @property
+    def output(self) -> str | None:
+        return self.out
+
+    @property
+    def fault(self) -> str | None:
+        if len(self.breakpoints) < 2:
+            return f"needs at least two breakpoints, got {len(self.breakpoints)}"
+        if not all(math.isfinite(number) for pair in self.breakpoints for number in pair):
+            return "breakpoints must be finite"
+        if any(later <= earlier for (earlier, _), (later, _) in itertools.pairwise(self.breakpoints)):
+            return "v(x) of the breakpoints must ascend"
+        return None
+
+    @property
     def slopes(self) -> tuple[float, ...]:
         """Slopes of the pieces."""
         return tuple((d - b) / (c - a) for (a, b), (c, d) in itertools.pairwise(self.breakpoints))
@@ -203,14 +225,3 @@ class Function(CircuitPart):
 def _bent(bends: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Bends whose slopes differ."""
     return [bend for bend in bends if bend[1] != 0]
-
-
-def breakpoint_fault(breakpoints: Sequence[tuple[float, float]]) -> str | None:
-    """Return why breakpoints make no function, else None."""
-    if len(breakpoints) < 2:
-        return f"needs at least two breakpoints, got {len(breakpoints)}"
-    if not all(math.isfinite(number) for pair in breakpoints for number in pair):
-        return "breakpoints must be finite"
-    if any(later <= earlier for (earlier, _), (later, _) in itertools.pairwise(breakpoints)):
-        return "v(x) of the breakpoints must ascend"
-    return None

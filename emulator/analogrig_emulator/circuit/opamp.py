@@ -67,7 +67,8 @@ class OutputStage:
     @property
     def clamps(self) -> bool:
         """True if the output swing is finite on either side."""
-        return any(math.isfinite(limit) for limit in self.swing_v)
+        low, high = self.swing_v
+        return math.isfinite(low) or math.isfinite(high)
 
     def require_limits(self, element: str, bandwidth: str) -> None:
         """Raise CircuitError naming the element and the field, unless the limits make sense together."""

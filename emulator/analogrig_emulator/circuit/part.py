@@ -36,3 +36,13 @@ class CircuitPart:
     def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
         """Bonds whose voltage does not depend on the current."""
         return ()
+
+    @property
+    def output(self) -> str | None:
+        """Node driven by an output of the element; None for a passive element or a current source."""
+        return None
+
+    @property
+    def fault(self) -> str | None:
+        """Fault of the values together, for an error message."""
+        return None

@@ -29,14 +29,26 @@
 #define TAIL_V 1e-4
 #define GROWING 0.02
 
+/// Weight of an argument's last Legendre coefficient beside a product's, in a circuit with fast loops: where such a loop divides,
+/// its output is an argument, and by a divisor near zero it changes much more than the product.
+#define WEIGHT 10.0
+#define FAST 20.0
+
 /// Error of a product, in V, at which an iteration has converged. It is estimated as the sum of all changes to come: each is
 /// the same part, the contraction, of the one before.
 #define CONVERGED_V 1e-7
 #define ITERATIONS 14
+#define HELD_ITERATIONS 60
+
+/// Contraction of relaxation, from its last step, from which Newton's iteration begins; relaxation itself leaves at most 4.
+#define HOPELESS 8.0
 
 /// Least change of a product, in V, of which a contraction is computed: smaller ones are rounding. A contraction of 0 would
 /// hold for all steps to come, since each step then ends after one iteration.
 #define ROUNDING_V 1e-15
+
+/// Change of an argument, in V, after which Newton's iteration is as good as its square. Rounding in long steps may leave more.
+#define SETTLED_V 1e-5
 
 /// Passes after which products that feed one another without a state between must have settled.
 #define PASSES (2 * ENGINE_MAX_PRODUCTS + 2)
@@ -61,6 +73,7 @@ struct collocation {
     double* map;             // [A B c] of one tick, and once more the columns of the product for each of its g
     double* moments[NODES];  // of the level `top`
     int     base, top;       // base: the level below which moments come from their series
+    bool    is_fast;         // a product moves an argument by FAST times its change within a sample period
     rung_t  rungs[ENGINE_LEVELS];
 };
 
@@ -253,6 +266,24 @@ void products_free(collocation_t* matrices) {
     free(matrices);
 }
 
+/// True if a product moves an argument by FAST times its change within a sample period, through one state.
+static bool is_fast(const engine_t* const self, const double* map) {
+    const int columns = self->columns;
+    for (int row = self->kinks - 2 * self->products; row < self->kinks; row++) {
+        const double* const w = &self->w_panels[(row / PANEL) * columns * PANEL + row % PANEL];
+        for (int product = 0; product < self->products; product++) {
+            double moved = 0.0;
+            for (int i = 0; i < self->states; i++) {
+                moved += w[i * PANEL] * map[i * stride_of(self) + column_of(self, product, 0)];
+            }
+            if (fabs(moved) * (double)ENGINE_TICKS_PER_SAMPLE > FAST) {
+                return true;
+            }
+        }
+    }
+    return false;
+}
+
 engine_status_t products_build(engine_t* const self, const double* a) {
     mode_t* const mode = self->mode;
     const int     n = self->states, stride = stride_of(self), from = PADDED(self->columns);
@@ -277,6 +308,7 @@ engine_status_t products_build(engine_t* const self, const double* a) {
             matrices->map[i * stride + self->columns + j] = matrices->map[i * stride + column_of(self, j / NODES, 0)];
         }
     }
+    matrices->is_fast = is_fast(self, matrices->map);
     matrices->base = matrices->top = mode->base;
     int    halvings                = 0;
     double ticks                   = (double)(INT64_C(1) << mode->base);
@@ -321,6 +353,15 @@ static double evaluate(const double* coefficients, int degree, double at) {
     double value = coefficients[degree];
     for (int k = degree - 1; k >= 0; k--) {
         value = value * at + coefficients[k];
+    }
+    return value;
+}
+
+/// Slope of a polynomial.
+static double slope_at(const double* coefficients, int degree, double at) {
+    double value = (double)degree * coefficients[degree];
+    for (int k = degree - 1; k > 0; k--) {
+        value = value * at + (double)k * coefficients[k];
     }
     return value;
 }
@@ -390,10 +431,11 @@ engine_status_t products_solve(engine_t* const self) {
 
 /// One step under trial.
 typedef struct {
-    double values[MAX_VALUES];      // of the products at the nodes beyond its beginning
-    double contraction;             // of their changes from one iteration to the next
-    double vector[MAX_WIDTH];       // [z g]
-    double z[PADDED(MAX_COLUMNS)];  // at the end
+    double begun[PADDED(ENGINE_MAX_PRODUCTS)];  // values of the products at its beginning, for its polynomials
+    double values[MAX_VALUES];                  // of the products at the nodes beyond its beginning
+    double contraction;                         // of their changes from one iteration to the next
+    double vector[MAX_WIDTH];                   // [z g]
+    double z[PADDED(MAX_COLUMNS)];              // at the end
 } step_t;
 
 /// Extend the polynomials of the step before to the nodes of this one.
@@ -423,56 +465,307 @@ static void predict(engine_t* const self, int64_t ticks, step_t* step) {
 static void fit(const engine_t* const self, step_t* step) {
     copy_z(self, self->z, step->vector);
     for (int i = 0; i < self->products; i++) {
-        double value[ORDER] = { self->z[column_of(self, i, 0)] };
+        double value[ORDER] = { step->begun[i] };
         memcpy(&value[1], &step->values[i * NODES], NODES * sizeof value[0]);
+        step->vector[column_of(self, i, 0)] = value[0];
         self->kernels->multiply(NODES, ORDER, self->weight, value, &step->vector[column_of(self, i, 1)]);
     }
 }
 
-/// Largest last Legendre coefficient of the products that are not driven.
+/// Last moment of the polynomial through a value at the beginning and those at the other nodes.
+static double last_moment(const engine_t* const self, double first, const double* values) {
+    double last = first * self->weight[NODES - 1];
+    for (int node = 0; node < NODES; node++) {
+        last += self->weight[(node + 1) * PANEL + NODES - 1] * values[node];
+    }
+    return last;
+}
+
+/// Largest last Legendre coefficient of the products that are not driven, with what they truly are at the beginning.
 static double find_tail(const engine_t* const self, const step_t* step) {
     double largest = 0.0;
     for (int i = 0; i < self->products; i++) {
-        const double tail = fabs(step->vector[column_of(self, i, ORDER - 1)]) / LEADING;
-        largest           = self->drives[i].terms == NULL && tail > largest ? tail : largest;
+        const double first = self->z[column_of(self, i, 0)];
+        const double tail  = fabs(last_moment(self, first, &step->values[i * NODES])) / LEADING;
+        largest            = self->drives[i].terms == NULL && tail > largest ? tail : largest;
     }
     return largest;
 }
 
-/// Find the products at the nodes of a step from now. Return false if the iteration does not converge.
-static bool iterate(const engine_t* const self, const rung_t* rung, int64_t ticks, step_t* step) {
+/// Arguments of the products at the nodes of a step as far as the iteration does not change them, and what drives add.
+typedef struct {
+    double fixed[MAX_ARGUMENTS], driven[MAX_VALUES];
+} given_t;
+
+static void prepare(const engine_t* const self, const rung_t* rung, int64_t ticks, given_t* given) {
     const int values = NODES * self->products;
-    double    fixed[MAX_ARGUMENTS], fed[2 * NODES], driven[MAX_VALUES];
-    double    before = 0.0;
-    self->kernels->multiply(2 * values, self->columns, rung->arguments, self->z, fixed);
-    memset(driven, 0, (size_t)values * sizeof driven[0]);
+    self->kernels->multiply(2 * values, self->columns, rung->arguments, self->z, given->fixed);
+    memset(given->driven, 0, (size_t)values * sizeof given->driven[0]);
     for (int i = 0; i < self->products; i++) {
         for (int node = 0; node < NODES && self->drives[i].terms != NULL; node++) {
             follow_drive(&self->drives[i], (double)self->now + nodes[node + 1] * (double)ticks,
-                         &driven[i * NODES + node]);
+                         &given->driven[i * NODES + node]);
         }
     }
-    // Until the second change, that of the step before counts twice, and the more the longer this step is.
-    step->contraction = self->stride > 0 ? 2.0 * self->ratio * self->contraction : 1.0;
+}
+
+/// Arguments of the product whose first value is `first`: p at the nodes, then q.
+static void read_fed(
+    const engine_t* const self, const rung_t* rung, const given_t* given, const step_t* step, int first, double* fed) {
+    const int values = NODES * self->products;
+    self->kernels->multiply(2 * NODES, values, &rung->feedback[2 * first * values], step->values, fed);
+    self->kernels->add(2 * NODES, 1.0, &given->fixed[2 * first], 1.0, fed);
+}
+
+/// True if an iteration has converged. `moved`: the last change of the products.
+static bool has_converged(double moved, double contraction) {
+    return moved <= CONVERGED_V || contraction * moved <= CONVERGED_V * (1.0 - contraction);
+}
+
+/// Find the products at the nodes by taking the new values again and again. Return false if they do not converge.
+static bool relax(const engine_t* const self, const rung_t* rung, const given_t* given, step_t* step) {
+    double before = 0.0;
     for (int i = 0; i < ITERATIONS; i++) {
         double moved = 0.0;
-        for (int j = 0; j < values; j += NODES) {  // each product takes the new values of those before it
-            self->kernels->multiply(2 * NODES, values, &rung->feedback[2 * j * values], step->values, fed);
-            self->kernels->add(2 * NODES, 1.0, &fixed[2 * j], 1.0, fed);
+        for (int j = 0; j < NODES * self->products; j += NODES) {
+            // Each product takes the new values of those before it.
+            double fed[2 * NODES];
+            read_fed(self, rung, given, step, j, fed);
             const double change =
-                self->kernels->apply(&self->circuit->law[j / NODES], fed, &driven[j], &step->values[j]);
+                self->kernels->apply(&self->circuit->law[j / NODES], fed, &given->driven[j], &step->values[j]);
             moved = change > moved ? change : moved;
         }
-        step->contraction = i > 0 ? (moved > ROUNDING_V ? moved : ROUNDING_V) / before : step->contraction;
-        if (moved <= CONVERGED_V || step->contraction * moved <= CONVERGED_V * (1.0 - step->contraction)) {
+        step->contraction = i > 0 ? fmax(moved, ROUNDING_V) / before : step->contraction;
+        if (has_converged(moved, step->contraction)) {
+            step->contraction = fmin(step->contraction, 1.0);
             return true;
         }
-        if (!isfinite(moved)) {
+        if (!isfinite(moved) || (i > 0 && !(moved < before))) {
             return false;
         }
         before = moved;
     }
     return false;
+}
+
+/// Weight of a value in that at the beginning of the cubic polynomial through the values of its product; 0 for one that is driven.
+static double back_weight(const engine_t* const self, int value) {
+    return self->drives[value / NODES].terms != NULL
+               ? 0.0
+               : -self->weight[(value % NODES + 1) * PANEL + NODES - 1] / self->weight[NODES - 1];
+}
+
+/// Set the arguments that come from the products at the beginning to those of step->begun instead of those of z.
+static void
+restart(const engine_t* const self, const rung_t* rung, const given_t* held, const step_t* step, given_t* given) {
+    const int products = self->products, first = column_of(self, 0, 0);
+    double    change[PADDED(ENGINE_MAX_PRODUCTS)], moved[PANEL];
+    for (int i = 0; i < products; i++) {
+        change[i] = step->begun[i] - self->z[first + i];
+    }
+    for (int panel = 0; panel < 2 * products; panel++) {
+        const double* const arguments = &rung->arguments[(panel * self->columns + first) * PANEL];
+        self->kernels->multiply(PANEL, products, arguments, change, moved);
+        for (int i = 0; i < PANEL; i++) {
+            given->fixed[panel * PANEL + i] = held->fixed[panel * PANEL + i] + moved[i];
+        }
+    }
+}
+
+/// Slopes of a product over its arguments p and q.
+static void find_slopes(const law_t* law, double p, double q, double* by_p, double* by_q) {
+    *by_p = slope_at(law->factors.x, law->x_degree, p) * evaluate(law->factors.y, law->y_degree, q);
+    *by_q = slope_at(law->factors.y, law->y_degree, q) * evaluate(law->factors.x, law->x_degree, p);
+}
+
+/// Equations for the changes of all values in the next of Newton's iterations.
+typedef struct {
+    double left[MAX_VALUES * MAX_VALUES], right[MAX_VALUES];
+} equations_t;
+
+/// Set the row of the equations of a product at a node. by_p, by_q: its slopes over its arguments there. Return the sum of what
+/// the values contribute.
+static double
+set_row(const engine_t* const self, const rung_t* rung, int row, double by_p, double by_q, equations_t* equations) {
+    const int           values = NODES * self->products, node = row % NODES, panel = 2 * (row - node);
+    const double* const feedback = &rung->feedback[panel * values + node];
+    const double* const begun    = &rung->arguments[panel * self->columns + column_of(self, 0, 0) * PANEL + node];
+    double              sum      = 0.0;
+    for (int j = 0; j < values; j++) {
+        const int    first = (j / NODES) * PANEL;
+        const double back  = back_weight(self, j);
+        const double p_fed = feedback[j * PANEL] + back * begun[first];
+        const double q_fed = feedback[(values + j) * PANEL] + back * begun[self->columns * PANEL + first];
+        const double gain  = by_p * p_fed + by_q * q_fed;
+        equations->left[row * values + j] = (row == j ? 1.0 : 0.0) - gain;
+        sum += fabs(gain);
+    }
+    return sum;
+}
+
+/// Arguments of all products at the nodes, about which the laws are straight, and what they have moved by from those before.
+typedef struct {
+    double at[MAX_ARGUMENTS], moved;
+} place_t;
+
+/// Go to the arguments that the values give.
+static void
+move(const engine_t* const self, const rung_t* rung, const given_t* given, const step_t* step, place_t* place) {
+    place->moved = 0.0;
+    for (int row = 0; row < NODES * self->products; row += NODES) {
+        double fed[2 * NODES];
+        read_fed(self, rung, given, step, row, fed);
+        for (int i = 0; i < 2 * NODES; i++) {
+            const double change = fabs(fed[i] - place->at[2 * row + i]);
+            place->moved        = change <= place->moved ? place->moved : isfinite(change) ? change : (double)INFINITY;
+            place->at[2 * row + i] = fed[i];
+        }
+    }
+}
+
+/// Set the equations at a place. The contraction is that of relaxation.
+static void linearise(const engine_t* const self,
+                      const rung_t*         rung,
+                      const given_t*        given,
+                      const place_t*        place,
+                      step_t*               step,
+                      equations_t*          equations) {
+    step->contraction = 0.0;
+    for (int row = 0; row < NODES * self->products; row += NODES) {
+        const law_t* const  law = &self->circuit->law[row / NODES];
+        const double* const at  = &place->at[2 * row];
+        double              fed[2 * NODES], value[NODES];
+        read_fed(self, rung, given, step, row, fed);
+        memcpy(value, &step->values[row], sizeof value);
+        (void)self->kernels->apply(law, at, &given->driven[row], value);
+        for (int p = 0, q = NODES; p < NODES; p++, q++) {
+            double by_p, by_q;
+            find_slopes(law, at[p], at[q], &by_p, &by_q);
+            equations->right[row + p] =
+                value[p] - step->values[row + p] + by_p * (fed[p] - at[p]) + by_q * (fed[q] - at[q]);
+            step->contraction = fmax(step->contraction, set_row(self, rung, row + p, by_p, by_q, equations));
+        }
+    }
+}
+
+/// Take the cubic polynomials of the products through the nodes beyond the beginning; drives keep theirs.
+static void extend_back(const engine_t* const self, step_t* step) {
+    for (int i = 0; i < self->products; i++) {
+        double sum = self->drives[i].terms != NULL ? self->z[column_of(self, i, 0)] : 0.0;
+        for (int j = i * NODES; j < (i + 1) * NODES; j++) {
+            sum += back_weight(self, j) * step->values[j];
+        }
+        step->begun[i] = sum;
+    }
+}
+
+/// Find the products at the nodes by Newton's iteration, which serves loops that are faster than the step. What such a loop has
+/// not settled by the first node does not ring on: its value at the beginning is left out.
+static bool approach(const engine_t* const self, const rung_t* rung, const given_t* held, step_t* step) {
+    const int   values = NODES * self->products;
+    given_t     given  = *held;
+    place_t     place  = { .moved = 0.0 };
+    equations_t equations;
+    for (int i = 0; i < 2 * values; i++) {
+        place.at[i] = self->w[self->kinks - 2 * self->products + i / NODES];
+    }
+    for (int i = 0; i < ITERATIONS; i++) {
+        extend_back(self, step);
+        restart(self, rung, held, step, &given);
+        if (i > 0) {
+            move(self, rung, &given, step, &place);
+            if (place.moved <= SETTLED_V) {
+                return true;
+            }
+        }
+        linearise(self, rung, &given, &place, step, &equations);
+        if (!isfinite(place.moved) || engine_solve(values, 1, equations.left, equations.right) >= 0) {
+            return false;
+        }
+        for (int j = 0; j < values; j++) {
+            step->values[j] += equations.right[j];
+        }
+    }
+    return false;
+}
+
+/// Take the products of a shortest step as constant, at their values at its end, by which loops that are faster than that settle.
+/// Newton's iteration begins at 0: from there it finds the positive root of a root's loop.
+static bool hold(const engine_t* const self, const rung_t* rung, const given_t* held, step_t* step) {
+    const int products = self->products, values = NODES * products, last = NODES - 1;
+    double    left[ENGINE_MAX_PRODUCTS * ENGINE_MAX_PRODUCTS], right[ENGINE_MAX_PRODUCTS];
+    given_t   given = *held;
+    place_t   place = { .moved = 0.0 };
+    memset(step->begun, 0, sizeof step->begun);
+    memset(step->values, 0, sizeof step->values);
+    for (int i = 0; i < HELD_ITERATIONS; i++) {
+        restart(self, rung, held, step, &given);
+        move(self, rung, &given, step, &place);
+        if (i > 0 && place.moved <= SETTLED_V) {
+            return true;
+        }
+        for (int row = 0; row < products; row++) {
+            const law_t* const  law       = &self->circuit->law[row];
+            const double* const feedback  = &rung->feedback[2 * row * NODES * values + last];
+            const double* const arguments = &rung->arguments[2 * row * NODES * self->columns + last];
+            const double        p = place.at[2 * row * NODES + last], q = place.at[(2 * row + 1) * NODES + last];
+            double              by_p, by_q;
+            find_slopes(law, p, q, &by_p, &by_q);
+            right[row] = evaluate(law->factors.x, law->x_degree, p) * evaluate(law->factors.y, law->y_degree, q) +
+                         given.driven[row * NODES + last] - step->begun[row];
+            for (int j = 0; j < products; j++) {
+                const int first = column_of(self, j, 0);
+                double    p_fed = arguments[first * PANEL], q_fed = arguments[(self->columns + first) * PANEL];
+                for (int k = j * NODES; k < (j + 1) * NODES; k++) {
+                    p_fed += feedback[k * PANEL];
+                    q_fed += feedback[(values + k) * PANEL];
+                }
+                left[row * products + j] = (row == j ? 1.0 : 0.0) - by_p * p_fed - by_q * q_fed;
+            }
+        }
+        if (!isfinite(place.moved) || engine_solve(products, 1, left, right) >= 0) {
+            return false;
+        }
+        for (int j = 0; j < values; j++) {
+            step->values[j] = step->begun[j / NODES] + right[j / NODES];
+        }
+        for (int j = 0; j < products; j++) {
+            step->begun[j] += right[j];
+        }
+    }
+    return false;
+}
+
+/// Find the products at the nodes of a step from now. Return false if no iteration converges.
+static bool iterate(engine_t* const self, const rung_t* rung, int64_t ticks, step_t* step) {
+    given_t given;
+    prepare(self, rung, ticks, &given);
+    predict(self, ticks, step);
+    // Until the second change, that of the step before counts twice, and the more the longer this step is.
+    step->contraction = self->stride > 0 ? 2.0 * self->ratio * self->contraction : 1.0;
+    if (self->stride == 0 || step->contraction < HOPELESS) {
+        memcpy(step->begun, &self->z[column_of(self, 0, 0)], (size_t)self->products * sizeof step->begun[0]);
+        if (relax(self, rung, &given, step)) {
+            return true;
+        }
+        predict(self, ticks, step);
+    }
+    return approach(self, rung, &given, step) || (ticks == 1 && hold(self, rung, &given, step));
+}
+
+/// Largest last Legendre coefficient of the arguments.
+static double find_strain(const engine_t* const self, const rung_t* rung, int64_t ticks, const step_t* step) {
+    const double* const now     = &self->w[self->kinks - 2 * self->products];
+    double              largest = 0.0;
+    given_t             held, given;
+    place_t             place = { .moved = 0.0 };
+    prepare(self, rung, ticks, &held);
+    restart(self, rung, &held, step, &given);
+    move(self, rung, &given, step, &place);
+    for (int i = 0; i < 2 * self->products; i++) {
+        largest = fmax(largest, fabs(last_moment(self, now[i], &place.at[i * NODES])) / LEADING);
+    }
+    return largest;
 }
 
 /// Set z to the state at a node.
@@ -524,12 +817,14 @@ typedef enum { ACCEPTED, TOO_LONG, LEFT, FAILED } outcome_t;
 static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, step_t* step, double* tail) {
     const int64_t ticks = INT64_C(1) << level;
     self->counts.steps++;
-    predict(self, ticks, step);
     if (!iterate(self, rung, ticks, step)) {
         return level > 0 ? TOO_LONG : FAILED;
     }
     fit(self, step);
     *tail = find_tail(self, step);
+    if (self->mode->collocation->is_fast) {
+        *tail = fmax(*tail, WEIGHT * find_strain(self, rung, ticks, step));
+    }
     if (level > 0 && !(*tail <= TAIL_V)) {
         return TOO_LONG;
     }
@@ -545,7 +840,7 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
 /// Accept a step.
 static void accept(engine_t* const self, int level, const step_t* step) {
     for (int i = 0; i < self->products; i++) {
-        self->moments[i][0] = self->z[column_of(self, i, 0)];
+        self->moments[i][0] = step->vector[column_of(self, i, 0)];
         memcpy(&self->moments[i][1], &step->vector[column_of(self, i, 1)], NODES * sizeof self->moments[0][0]);
     }
     self->contraction = step->contraction;

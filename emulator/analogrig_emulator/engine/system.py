@@ -81,17 +81,17 @@ class Edges:
 
     def within(self, start: int, stop: int) -> Edges:
         """Edges at ticks start <= tick < stop."""
-        part = slice(*np.searchsorted(self.ticks, (start, stop)))
+        part = slice(*self.ticks.searchsorted((start, stop)))
         return Edges(self.ticks[part], self.levels_v[part])
 
     def until(self, tick: int) -> Edges:
         """Edges up to and including a tick."""
-        part = slice(None, np.searchsorted(self.ticks, tick, "right"))
+        part = slice(None, self.ticks.searchsorted(tick, "right"))
         return Edges(self.ticks[part], self.levels_v[part])
 
     def after(self, tick: int) -> Edges:
         """Edges later than a tick."""
-        part = slice(np.searchsorted(self.ticks, tick, "right"), None)
+        part = slice(self.ticks.searchsorted(tick, "right"), None)
         return Edges(self.ticks[part], self.levels_v[part])
 
     def shifted(self, ticks: int) -> Edges:
@@ -168,8 +168,7 @@ _NODES = (0.0, 0.5 - 0.5 * math.sqrt(3.0 / 7.0), 0.5, 0.5 + 0.5 * math.sqrt(3.0 
 """Lobatto nodes of a step."""
 
 
-@dataclass(frozen=True)
-class Kink:
+class Kink(NamedTuple):
     """A continuous function of three linear pieces, with slopes below lower, between, and above upper.
 
     Between, phi(w) = slopes[1] w.
@@ -213,8 +212,7 @@ class Kink:
         return 2 if math.isfinite(self.upper) else 1
 
 
-@dataclass(frozen=True)
-class Product:
+class Product(NamedTuple):
     """Product of two polynomials, each of one element of w: coefficients x and y in order of powers."""
 
     x: tuple[float, ...]
@@ -251,11 +249,10 @@ class Layout(NamedTuple):
     @classmethod
     def of(cls, system: PiecewiseLinear, outputs: tuple[str, ...]) -> Layout:
         rows = system.rows(outputs)
-        arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
+        arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn.take(rows, 0), system.v_phi.take(rows, 0))
         tables = (_kink_table(system.kinks), _product_table(system.products))
-        parts = [array.ravel() for array in (*arrays, *tables)]
-        block = np.concatenate(parts)
-        starts = tuple(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
+        block = np.concatenate((*arrays, *tables), axis=None)
+        starts = tuple(itertools.accumulate([part.nbytes for part in (*arrays, *tables[:-1])], initial=0))
         return cls._placed(block, starts)
 
     def with_drives(self, abc: Matrix, cde: Matrix) -> Layout:
@@ -275,7 +272,13 @@ class Layout(NamedTuple):
 @functools.lru_cache(maxsize=64)
 def _kink_table(kinks: tuple[Kink, ...]) -> Matrix:
     """Rows of engine_kink_t: (kinks, 8)."""
-    return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)
+    return np.array([_kink_row(kink.lower, kink.upper, kink.slopes) for kink in kinks]).reshape(-1, 8)
+
+
+@functools.lru_cache(maxsize=64)
+def _kink_row(lower: float, upper: float, slopes: tuple[float, float, float]) -> tuple[float, ...]:
+    """Row of an engine_kink_t. The amplifiers of a machine have few limits that differ."""
+    return lower, upper, *slopes, *Kink(lower, upper, slopes).intercepts
 
 
 @functools.lru_cache(maxsize=64)

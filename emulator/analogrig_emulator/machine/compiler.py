@@ -55,8 +55,15 @@ _CAPACITORS_FARAD = (1e-6, 1e-7, 1e-8, 1e-9)
 _LOOP_FARAD = 47e-12
 """Capacitor across an amplifier with a multiplier in its loop: without it the loop rings."""
 
+
 _BARRED_V = 0.05
 """Voltage beyond zero at which a root's diode conducts: at zero itself it would switch without end at rest."""
+
+_IDEAL_LOOP = 1e-5, 1e-4
+"""Parts of that capacitor and of that voltage with an ideal amplifier, which needs neither.
+
+The loop is late by 5 ps times 10 V over the divisor's voltage.
+"""
 
 _OFF_OHM = 1e12
 _ON_OHM = 1e3
@@ -112,7 +119,8 @@ class PatchedProgram(ProgramCircuit):
     """Program compiled from equations.
 
     patch: computing elements in the order of the diagram; inverters: names of the last amplifiers, by quantity;
-    input_nodes: node by input; reach: range in the trial play by quantity.
+    input_nodes: node by input; reach: range in the trial play by quantity; loops: elements to replace those of the same
+    names if an amplifier is ideal, by amplifier.
     """
 
     equations: Equations
@@ -123,6 +131,7 @@ class PatchedProgram(ProgramCircuit):
     inverters: Mapping[str, str]
     input_nodes: Mapping[str, str]
     elements: tuple[Element, ...]
+    loops: Mapping[str, Sequence[Element]]
 
     __hash__ = object.__hash__
 
@@ -158,7 +167,7 @@ class PatchedProgram(ProgramCircuit):
     def pots(self) -> Mapping[str, PotRow]:
         return {
             pot: PotRow(
-                cord.resistor, tuple(name for name in _names(self.stages, cord.cord.factors) if name in self.values)
+                cord.resistor, tuple([name for name in _names(self.stages, cord.cord.factors) if name in self.values])
             )
             for pot, cord in self._cords.items()
         }
@@ -183,8 +192,12 @@ class PatchedProgram(ProgramCircuit):
         return tuple(each.name for each in self.patch if each.stage.kind is StageKind.INTEGRATOR)
 
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
-        given = iter(models)
-        return [replace(each, model=next(given)) if isinstance(each, OpAmp) else each for each in self.elements]
+        given = dict(zip((each.name for each in self.elements if isinstance(each, OpAmp)), models, strict=True))
+        ideal = {each.name: each for amp, parts in self.loops.items() if not given[amp].has_state for each in parts}
+        return [
+            replace(each, model=given[each.name]) if isinstance(each, OpAmp) else ideal.get(each.name, each)
+            for each in self.elements
+        ]
 
 
 def wired(equations: Equations) -> ProgramCircuit:
@@ -319,7 +332,7 @@ def _names(stages: Stages, factors: Factors) -> list[str]:
     found: dict[str, None] = {}
     for name, _ in factors:
         inner = stages.composites[name].names() if name in stages.composites else (name,)
-        found |= dict.fromkeys(each for each in inner if each in stages.equations.parameters)
+        found |= dict.fromkeys([each for each in inner if each in stages.equations.parameters])
     return list(found)
 
 
@@ -338,7 +351,9 @@ class _Patcher:
         self._signs = signs_of(rows, self._inputs, self._divisor_signs)
         self._nodes: dict[tuple[str, int], str] = {}
         self._elements: list[Element] = []
+        self._loops: dict[str, Sequence[Element]] = {}
         self._amplifiers: dict[str, int] = {}
+        self._inverters: dict[str, int] = {}
         self._uses = self._users(rows)
         self._pots: list[str] = []
         self._pot_numbers = itertools.count(1)
@@ -363,9 +378,10 @@ class _Patcher:
             fulls=self._fulls,
             reach=self._reach,
             patch=tuple(patch),
-            inverters={name: f"U{self._amplifiers[f'-{name}']}" for name in inverters},
+            inverters={name: f"U{self._inverters[name]}" for name in inverters},
             input_nodes={name: self._nodes[name, 1] for name in self._inputs},
             elements=tuple(self._elements),
+            loops=self._loops,
         )
 
     # ---- names
@@ -384,7 +400,7 @@ class _Patcher:
                 self._amplifiers[stage.name] = number = next(amplifiers)
                 self._nodes[stage.name, self._signs[stage.name]] = f"u{number}"
         for name in inverters:
-            self._amplifiers[f"-{name}"] = number = next(amplifiers)
+            self._inverters[name] = number = next(amplifiers)
             self._nodes[name, -self._signs[name]] = f"u{number}"
 
     def _users(self, rows: Sequence[PatchStage]) -> Counter[str]:
@@ -482,17 +498,22 @@ class _Patcher:
         product_sign = -self._source_sign(stage, dividend)
         name, node = f"XU{number}", f"xu{number}"
         scale_v = MACHINE_V * sign * other_sign * product_sign
+        capacitor = Capacitor(f"C{number}", junction, out, _LOOP_FARAD)
         self._elements += [
             Multiplier(name, out, self._nodes[other, other_sign], node, scale_v),
             Resistor(f"R{number}X", node, junction, ohm),
-            Capacitor(f"C{number}", junction, out, _LOOP_FARAD),
+            capacitor,
         ]
+        ideal: list[Element] = [replace(capacitor, farad=_IDEAL_LOOP[0] * _LOOP_FARAD)]
         if is_root:  # The diode bars the other root, where the loop would latch up.
             ends = (junction, out) if sign > 0 else (out, junction)
-            self._elements.append(DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM))
+            diode = DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM)
+            self._elements.append(diode)
+            ideal.append(replace(diode, threshold_v=_IDEAL_LOOP[1] * _BARRED_V))
         else:
             self._elements.append(Resistor(f"R{number}FB", junction, out, _OFF_OHM))
             cords.append(PatchedCord(stage.cords[1], self._nodes[other, other_sign], other_sign, 1.0, 1, name))
+        self._loops[f"U{number}"] = ideal
         return self._amplifier(stage, cords)
 
     def _multiplier(self, stage: PatchStage) -> PatchedElement:
@@ -521,7 +542,7 @@ class _Patcher:
         return PatchedCord(cord, self._nodes[cord.source, sign], sign, 1.0, 1, "")
 
     def _invert(self, name: str) -> None:
-        number, sign = self._amplifiers[f"-{name}"], self._signs[name]
+        number, sign = self._inverters[name], self._signs[name]
         self._elements += [
             Resistor(f"R{number}_1", self._nodes[name, sign], f"s{number}", INVERTER_OHM),
             Resistor(f"R{number}FB", f"s{number}", f"u{number}", INVERTER_OHM),

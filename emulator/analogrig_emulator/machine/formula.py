@@ -9,6 +9,7 @@ import ast
 import difflib
 import math
 import operator
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ _MOST_PARTS = 400
 _DEEPEST = 40
 _MOST_POWER = 8
 _LARGEST = 1e100
+_LEAST = 1e-100
 
 Law = Callable[[Mapping[str, Any]], Any]
 """Formula as a function of the values by name, numbers or arrays."""
@@ -247,7 +249,10 @@ def _same_unit(left: Formula, one: Unit | None, right: Formula, other: Unit | No
     if one is None or other is None:
         return one or other
     if not one.matches(other):
-        raise ProgramError(f"{left} is in {one.text} and {right} in {other.text}; make both units the same")
+        cure = "make both units the same"
+        if one.exponents == other.exponents:
+            cure = "the dimension is the same, the size is not: write one unit for all, such as m and no mm"
+        raise ProgramError(f"{left} is in {one.text} and {right} in {other.text}; {cure}")
     return one
 
 
@@ -265,7 +270,7 @@ def parse_formula(text: str, tables: Iterable[str] = ()) -> Formula:
     except (SyntaxError, ValueError, RecursionError, MemoryError) as cause:
         raise ProgramError(_malformed(text.strip(), cause)) from None
     _check_size(tree)
-    return _Reading(frozenset(tables)).formula(tree)
+    return _Reading(text.strip(), frozenset(tables)).formula(tree)
 
 
 def _malformed(text: str, cause: Exception) -> str:
@@ -289,8 +294,9 @@ def _check_size(tree: ast.expr) -> None:
 
 @dataclass(frozen=True)
 class _Reading:
-    """Translation of Python's tree into a Formula."""
+    """Translation of Python's tree into a Formula. text: what Python parsed."""
 
+    text: str
     tables: frozenset[str]
 
     def formula(self, node: ast.expr) -> Formula:
@@ -298,7 +304,7 @@ class _Reading:
             case ast.Name(id=name):
                 return Name(name)
             case ast.Constant(value=value):
-                return _number(node, value)
+                return self._number(node, value)
             case ast.UnaryOp(op=op, operand=operand):
                 return self._signed(node, op, self.formula(operand))
             case ast.BinOp():
@@ -306,6 +312,16 @@ class _Reading:
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
                 return self._call(node, name, arguments)
         raise _not_allowed(node)
+
+    def _number(self, node: ast.expr, value: object) -> Number:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ProgramError(f"{ast.unparse(node)[:40]} is no number")
+        written = ast.get_source_segment(self.text, node) or ""
+        if not abs(value) <= _LARGEST:
+            raise ProgramError(f"number {written[:20]} exceeds {_LARGEST:g}; scale the quantities")
+        if abs(value) < _LEAST and re.search("[1-9]", re.split("[eE]", written)[0]):
+            raise ProgramError(f"number {written[:20]} is smaller than {_LEAST:g}; write 0, or scale the quantities")
+        return Number(ast.unparse(node), float(value))
 
     def _signed(self, node: ast.expr, op: ast.unaryop, operand: Formula) -> Formula:
         if isinstance(op, ast.UAdd):
@@ -339,14 +355,6 @@ def _not_allowed(node: ast.expr) -> ProgramError:
     )
 
 
-def _number(node: ast.expr, value: object) -> Number:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ProgramError(f"{ast.unparse(node)[:40]} is no number")
-    if not abs(value) <= _LARGEST:
-        raise ProgramError(f"number {ast.unparse(node)[:20]} is not finite, or exceeds {_LARGEST:g}")
-    return Number(ast.unparse(node), float(value))
-
-
 def _power(node: ast.expr) -> int:
     sign, inner = (-1, node.operand) if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) else (1, node)
     power = inner.value if isinstance(inner, ast.Constant) else None
@@ -355,6 +363,35 @@ def _power(node: ast.expr) -> int:
             f"power {ast.unparse(node)[:20]}: write an integer from {-_MOST_POWER} to {_MOST_POWER}, or sqrt()"
         )
     return sign * power
+
+
+def constant_value(formula: Formula, tables: Tables) -> float:
+    """Value of a formula of numbers alone. Raises ProgramError naming a part without a value."""
+    for part in formula.parts:
+        number = constant_value(part, tables)
+        if isinstance(formula, FunctionCall) and formula.function == "sqrt" and number < 0.0:
+            raise ProgramError(f"{formula} is the root of a negative number")
+    try:
+        with np.errstate(all="ignore"):
+            number = float(formula.law(tables)({}))
+    except (ArithmeticError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ProgramError(f"{formula} is no finite number")
+    return number
+
+
+def check_constants(formula: Formula) -> None:
+    """Raise ProgramError for a part of numbers alone without a value, and for a division by 0."""
+    if all(name in CONSTANTS for name in formula.names()):
+        constant_value(formula, {})
+        return
+    for part in formula.parts:
+        check_constants(part)
+    if isinstance(formula, Operation) and formula.sign == "/":
+        divisor = formula.right
+        if all(name in CONSTANTS for name in divisor.names()) and constant_value(divisor, {}) == 0.0:
+            raise ProgramError(f"{formula} divides by zero")
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

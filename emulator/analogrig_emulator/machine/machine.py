@@ -351,8 +351,10 @@ class AnalogComputer:
         Raises ModeError before anything is played, and EngineError.
         """
         edges = edges or {}
+        if not switches:
+            return self._play(samples, edges)
         self._check_switches([mode for _, mode in switches])
-        if switches and self._turns:
+        if self._turns:
             raise ModeError(
                 f"relays cannot switch within a run while {', '.join(self._turns)} are being turned: "
                 "switch() between two runs"
@@ -363,9 +365,8 @@ class AnalogComputer:
         for (tick, mode), taken in zip(switches, _split_at(edges, [tick for tick, _ in switches]), strict=False):
             volts.append(self._play_to(tick, taken))
             self._enter(mode)
-        rest = _edges_after(edges, switches[-1][0]) if switches else edges
-        volts.append(self._play(stop - self.recorded, rest))
-        return volts[0] if len(volts) == 1 else np.concatenate(volts)
+        volts.append(self._play(stop - self.recorded, _edges_after(edges, switches[-1][0])))
+        return np.concatenate(volts)
 
     def run_jumping(
         self, samples: int, jumps: Sequence[tuple[int, Mapping[str, float]]], edges: Mapping[str, Edges]
@@ -675,12 +676,10 @@ class _Wipers:
     """Wipers of a circuit's pots: resting places, and noise of the contacts."""
 
     def __init__(self, circuit: Circuit, components: Components) -> None:
-        names = [pot.name for pot in circuit.of(Pot)]
-        contacts = {contact_of(name) for name in names}
-        self.pots = {
-            pot.name: components.pots.model(pot.track_ohm) for pot in circuit.of(Pot) if pot.name not in contacts
-        }
-        self._contacts = {pot.name: components.contact(pot) for pot in circuit.of(Pot) if contact_of(pot.name) in names}
+        pots = {pot.name: pot for pot in circuit.of(Pot)}
+        contacts = {contact_of(name): name for name in pots if contact_of(name) in pots}
+        self.pots = {name: components.pots.model(pot.track_ohm) for name, pot in pots.items() if name not in contacts}
+        self._contacts = {name: components.contact(pots[name]) for name in contacts.values()}
 
     def resting(self, pot: str, dial: float) -> float:
         """Dial of the nearest winding."""

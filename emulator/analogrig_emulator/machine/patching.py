@@ -7,9 +7,7 @@ junction, and every cord leads from an output to an input; this module rejects a
 from __future__ import annotations
 
 import functools
-import itertools
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from analogrig_emulator.circuit.circuit import (
@@ -19,11 +17,10 @@ from analogrig_emulator.circuit.circuit import (
     Element,
     OpAmp,
     Pot,
-    VoltageSource,
     Ways,
     label,
+    leads,
     neighbours,
-    reachable,
 )
 from analogrig_emulator.circuit.components import is_part_of
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
@@ -58,7 +55,7 @@ def patches(circuit: Circuit) -> dict[str, Patch]:
 
 
 def _patches_by_wiring(circuit: Circuit) -> dict[str, Patch]:
-    wires = tuple((type(element), element.name, element.nodes) for element in circuit.elements)
+    wires = tuple([(type(element), element.name, element.nodes) for element in circuit.elements])
     return _patches(_Wiring(wires, circuit))
 
 
@@ -73,14 +70,18 @@ class _Wiring:
 @functools.lru_cache(maxsize=64)
 def _patches(panel: _Wiring) -> dict[str, Patch]:
     circuit = panel.circuit
+    amps, ends = circuit.of(OpAmp), [nodes for _, _, nodes in panel.wires]
     drivers = _drivers(circuit)
-    passive = neighbours(bond for element in circuit.elements for bond in _passive_bonds(element))
-    _check_ends(circuit)
-    _check_feeds(circuit, drivers, passive)
-    for amp in circuit.of(OpAmp):
-        _check_feedback(circuit, amp, reachable(amp.minus, passive, drivers | {GROUND}))
-    found = {amp.name: _patch(circuit, amp) for amp in circuit.of(OpAmp)}
-    for amp in circuit.of(OpAmp):
+    passive = neighbours(bond for element in circuit.elements if element.output is None for bond in element.bonds)
+    _check_ends(circuit, ends, drivers)
+    _check_feeds(circuit, ends, drivers, passive)
+    _check_feedback(circuit, passive, drivers | {GROUND})
+    parts: dict[str, list[Element]] = {amp.minus: [] for amp in amps}
+    for element, nodes in zip(circuit.elements, ends, strict=True):
+        for node in parts.keys() & nodes:
+            parts[node].append(element)
+    found = {amp.name: _patch(circuit, amp, parts[amp.minus]) for amp in amps}
+    for amp in amps:
         if amp.plus == GROUND and not found[amp.name].inputs:
             raise CircuitError(f"{label(amp)}: nothing feeds its input at node {amp.minus}")
     return found
@@ -90,7 +91,7 @@ def _drivers(circuit: Circuit) -> set[str]:
     """Nodes driven by an output."""
     holder: dict[str, Element] = {}
     for element in circuit.elements:
-        node = _output(element)
+        node = element.output
         if node is not None and holder.setdefault(node, element) is not element:
             raise CircuitError(
                 f"{label(element)}: its output at node {node} is joined to that of {label(holder[node])}"
@@ -98,20 +99,16 @@ def _drivers(circuit: Circuit) -> set[str]:
     return set(holder)
 
 
-def _output(element: Element) -> str | None:
-    if isinstance(element, OpAmp | Multiplier | Function):
-        return element.out
-    if isinstance(element, VoltageSource):
-        return element.minus if element.plus == GROUND else element.plus
-    return None
-
-
-def _check_ends(circuit: Circuit) -> None:
+def _check_ends(circuit: Circuit, ends: Sequence[tuple[str, ...]], drivers: set[str]) -> None:
     """Raise CircuitError for a node with one end, unless that is an output."""
-    ends = Counter(itertools.chain.from_iterable(element.nodes for element in circuit.elements))
-    for element in circuit.elements:
+    once, again = {GROUND, *drivers}, {GROUND, *drivers}
+    for nodes in ends:
+        for node in nodes:
+            (again if node in once else once).add(node)
+    is_open = once - again
+    for element in circuit.elements if is_open else ():
         for node in element.nodes:
-            if ends[node] == 1 and node not in (GROUND, _output(element)):
+            if node in is_open:
                 raise CircuitError(f"{label(element)}: {_open_end(element, node)}")
 
 
@@ -123,48 +120,42 @@ def _open_end(element: Element, node: str) -> str:
     return f"nothing feeds its node {node}"
 
 
-def _check_feeds(circuit: Circuit, drivers: set[str], passive: Ways) -> None:
+def _check_feeds(circuit: Circuit, ends: Sequence[tuple[str, ...]], drivers: set[str], passive: Ways) -> None:
     """Raise CircuitError for passive elements that neither reach an output nor ground an input."""
-    drivers = drivers | {node for source in circuit.of(CurrentSource) for node in source.nodes}
+    drivers = drivers.union(*(source.nodes for source in circuit.of(CurrentSource)))
     rests = {amp.plus for amp in circuit.of(OpAmp)}
     held = drivers | {amp.minus for amp in circuit.of(OpAmp)} | {GROUND}
     fed = set(held)
-    for element in circuit.elements:
-        for node in element.nodes:
+    for element, nodes in zip(circuit.elements, ends, strict=True):
+        for node in nodes:
             if node in fed:
                 continue
             fed.add(node)
-            reached = reachable(node, passive, held)
-            if not reached & drivers and not (GROUND in reached and reached & rests):
+            if not leads(node, passive, drivers, held) and not all(
+                leads(node, passive, goals, held) for goals in ({GROUND}, rests)
+            ):
                 raise CircuitError(f"{label(element)}: nothing feeds its node {node}")
 
 
-def _check_feedback(circuit: Circuit, amp: OpAmp, reached: set[str]) -> None:
-    """Raise CircuitError if what the junction reaches is no feedback."""
+def _check_feedback(circuit: Circuit, passive: Ways, borders: set[str]) -> None:
+    """Raise CircuitError for an amplifier without feedback of its own."""
     computing: tuple[Multiplier | Function, ...] = (*circuit.of(Multiplier), *circuit.of(Function))
-    fed_back = {amp.out} | {part.out for part in computing if amp.out in part.nodes[:-1]}
-    if amp.minus != amp.out and not fed_back & reached:
-        raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
+    for amp in circuit.of(OpAmp):
+        fed_back = {amp.out, *(part.out for part in computing if amp.out in part.nodes[:-1])}
+        if amp.minus != amp.out and not leads(amp.minus, passive, fed_back, borders):
+            raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
 
-def _patch(circuit: Circuit, amp: OpAmp) -> Patch:
+def _patch(circuit: Circuit, amp: OpAmp, parts: Iterable[Element]) -> Patch:
+    """Patch of an amplifier with these parts at its junction."""
     capacitors = tuple(part.name for part in circuit.of(Capacitor) if {part.a, part.b} == {amp.minus, amp.out})
-    inputs = () if amp.minus == amp.out else tuple(part.name for part in _inputs(circuit, amp))
+    inputs = () if amp.minus == amp.out else tuple(part.name for part in parts if _is_input(circuit, amp, part))
     return Patch(amp.name, amp.minus, amp.out, inputs, capacitors)
 
 
-def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
-    """Elements at the junction that also connect to something other than the amplifier's own output."""
+def _is_input(circuit: Circuit, amp: OpAmp, part: Element) -> bool:
+    """True if a part at the junction also connects to something other than the amplifier's own output."""
+    if part.output is not None or isinstance(part, Capacitor) or is_part_of(part, amp.name):
+        return False
     own = {amp.minus, amp.out}
-    elsewhere = reachable(GROUND, circuit.ways, own) - own - {GROUND}
-    for element in circuit.elements:
-        if amp.minus not in element.nodes or isinstance(
-            element, OpAmp | VoltageSource | Capacitor | Multiplier | Function
-        ):
-            continue
-        if not is_part_of(element, amp.name) and elsewhere.intersection(element.nodes):
-            yield element
-
-
-def _passive_bonds(element: Element) -> tuple[tuple[str, str], ...]:
-    return () if isinstance(element, OpAmp | VoltageSource | Multiplier | Function) else element.bonds
+    return any(leads(node, circuit.ways, {GROUND}, own) for node in part.nodes if node not in own and node != GROUND)

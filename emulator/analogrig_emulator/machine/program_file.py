@@ -45,6 +45,7 @@ from analogrig_emulator.machine.formula import (
     FUNCTIONS,
     Formula,
     Law,
+    check_constants,
     parse_formula,
     suggestion,
 )
@@ -391,7 +392,7 @@ class _Reader:
                 yield self._line(number, line)
 
     def _line(self, number: int, line: str) -> tuple[Equation, bool]:
-        with _at(f"equations, line {number}"):
+        with at_place(f"equations, line {number}"):
             match = _LINE.fullmatch(line)
             if not match or not _NAME.fullmatch(match["name"]):
                 raise ProgramError(f"{line.strip()[:60]!r} is no equation; write x' = ... or S = ...")
@@ -440,14 +441,17 @@ class _Reader:
         units = self._response_units()
         found: dict[str, Formula] = {}
         for name, text in rows.items():
-            with _at(f"estimates.{name[:40]}"):
+            with at_place(f"estimates.{name[:40]}"):
                 shown = [each for each, row in self.parameters.items() if row.pot]
                 if name not in shown:
                     raise ProgramError(f"no pot shows a parameter {name[:40]!r}{suggestion(name, shown)}")
                 formula = parse_formula(_text("formula", text))
+                check_constants(formula)
                 for used in formula.names():
                     if used not in units and used not in CONSTANTS:
                         raise ProgramError(f"unknown name {used[:40]!r}{suggestion(used, units)}")
+                if all(used in CONSTANTS for used in formula.names()):
+                    raise ProgramError(f"{formula} is the same for every response; write it with {', '.join(units)}")
                 units[name] = self.parameters[name].unit
                 _check_unit(name, units[name], formula.unit(units, {}))
                 found[name] = formula
@@ -507,12 +511,12 @@ class _Reader:
         units |= {name: row.unit for name, row in self.parameters.items()}
         functions = {name: (row.of, row.unit) for name, row in self.functions.items()}
         for line in definitions:
-            with _at(line.place):
+            with at_place(line.place):
                 found, wanted = line.formula.unit(units, functions), units[line.name]
                 _check_unit(line.name, wanted, found)
                 units[line.name] = wanted or found
         for line in derivatives:
-            with _at(line.place):
+            with at_place(line.place):
                 unit = units[line.name]
                 rate = None if unit is None else unit / parse_unit("s")
                 _check_unit(f"{line.name}'", rate, line.formula.unit(units, functions))
@@ -527,7 +531,7 @@ def _check_unit(left: str, wanted: Unit | None, found: Unit | None) -> None:
 
 
 @contextlib.contextmanager
-def _at(place: str) -> Iterator[None]:
+def at_place(place: str) -> Iterator[None]:
     """Put a place before the ProgramErrors of the body."""
     try:
         yield
@@ -578,5 +582,5 @@ def _text(place: str, value: Any) -> str:
 def _unit(place: str, row: Mapping[str, Any], key: str = "unit") -> Unit | None:
     if key not in row:
         return None
-    with _at(place):
+    with at_place(place):
         return parse_unit(_text(key, row[key]))

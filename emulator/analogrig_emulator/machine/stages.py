@@ -7,6 +7,7 @@ derivative stay outside: a summer, one pot, the integrator. So a change of J or 
 from __future__ import annotations
 
 import enum
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -16,8 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.errors import ProgramError
-from analogrig_emulator.machine.formula import CONSTANTS, Formula, FunctionCall, Name, Negative, Operation, Power
-from analogrig_emulator.machine.program_file import Equation, Equations, Points
+from analogrig_emulator.machine.formula import (
+    CONSTANTS,
+    Formula,
+    FunctionCall,
+    Name,
+    Negative,
+    Operation,
+    Power,
+    constant_value,
+)
+from analogrig_emulator.machine.program_file import Equation, Equations, Points, at_place
 
 REFERENCE = "1"
 """Source of a cord from the reference voltage."""
@@ -109,7 +119,7 @@ class Stages:
                     value = _computed(self.composites[name], values, self.equations.functions)
             else:
                 value = values[name]
-            if not (np.isfinite(value) and value > 0):
+            if not 0 < value < math.inf:
                 raise ProgramError(
                     f"{name} is {value:g} with {_settings(self.composites.get(name), values)}; "
                     "a pot needs it positive: change a value or range, or the sign in the equation"
@@ -222,7 +232,8 @@ class _Builder:
     def _coefficient(self, node: Formula) -> _Terms:
         """Term of a formula without signals."""
         if all(name in CONSTANTS for name in node.names()):
-            return {((), ()): self._number(node)}
+            with at_place(self.place):
+                return {((), ()): constant_value(node, self.equations.functions)}
         match node:
             case Negative():
                 return _scaled(self._coefficient(node.of), -1.0)
@@ -233,20 +244,6 @@ class _Builder:
         if not isinstance(node, Name):
             self.composites[node.text] = node
         return {(((node.text, 1),), ()): 1.0}
-
-    def _number(self, node: Formula) -> float:
-        for part in node.parts:
-            number = self._number(part)
-            if isinstance(node, FunctionCall) and node.function == "sqrt" and number < 0.0:
-                raise ProgramError(f"{self.place}: {node} is the root of a negative number")
-        try:
-            with np.errstate(all="ignore"):
-                number = float(node.law(self.equations.functions)({}))
-        except (ArithmeticError, ValueError):
-            number = np.nan
-        if not np.isfinite(number):
-            raise ProgramError(f"{self.place}: {node} is no finite number")
-        return number
 
     def _product(self, one: _Terms, other: _Terms) -> _Terms:
         if len(one) * len(other) > _MOST_TERMS:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -289,8 +289,7 @@ class SuspensionComputer:
 _EXACT = 1e-9
 
 
-@dataclass(frozen=True)
-class _LoadedPot:
+class _LoadedPot(NamedTuple):
     """Pot with its load to a virtual ground."""
 
     model: PotModel

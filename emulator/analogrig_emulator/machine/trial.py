@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.errors import ProgramError
-from analogrig_emulator.machine.program_file import Equations
+from analogrig_emulator.machine.program_file import Equations, at_place
 from analogrig_emulator.machine.stages import StageKind, Stages
 
 _MOST_INPUTS = 4
@@ -159,7 +159,11 @@ def _check_bounded(
 
 
 def _check_rest(stages: Stages, values: Mapping[str, float]) -> None:
-    """Raise ProgramError for a divisor that is zero at rest."""
+    """Raise ProgramError for a coefficient that is not positive, and for a divisor that is zero at rest."""
+    for stage in stages.stages:
+        with at_place(stage.place):
+            for cord in stage.cords:
+                stages.factor(cord.factors, values)
     levels = {name: np.float64(quantity.trial[1]) for name, quantity in stages.equations.inputs.items()}
     quantities: dict[str, Any] = levels | dict.fromkeys(stages.equations.states, np.float64(0.0))
     stages.add_signals(quantities, values)

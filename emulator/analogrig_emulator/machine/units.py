@@ -46,6 +46,17 @@ class Unit:
             self.factor, other.factor, rel_tol=_FACTOR_TOLERANCE, abs_tol=0.0
         )
 
+    def factor_to(self, other: Unit) -> float | None:
+        """Number of ``other`` in one of this unit; None if it measures something else.
+
+        Frequencies and angular velocities, fractions and angles have the same dimension, but measure different things.
+        """
+        if self.exponents != other.exponents or any(
+            (each in self.text) != (each in other.text) for each in ("Hz", "%")
+        ):
+            return None
+        return self.factor / other.factor
+
 
 def _named(exponents: tuple[int, ...], factor: float) -> Unit:
     """Unit with a text made of its factor and exponents."""

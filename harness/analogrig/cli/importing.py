@@ -6,10 +6,21 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import FILE, RIG_NAMES, SCENARIO, add_command, add_json, add_rig, files_read, trust_of
+from analogrig.cli.options import (
+    FILE,
+    PROGRAM,
+    RIG_NAMES,
+    SCENARIO,
+    add_command,
+    add_json,
+    add_rig,
+    files_read,
+    trust_of,
+)
 from analogrig.cli.terminal import PASSED, show, show_result, show_work
 
 if TYPE_CHECKING:
+    from analogrig.program import Program
     from analogrig.recordings.imported import ImportDescription
     from analogrig.run import Run
     from analogrig.scenario import Scenario
@@ -25,6 +36,7 @@ def add(commands: Any) -> None:
         "import SNLS80mV.csv --input V1 --output V2 --rate 610.3515625 --out build/silverbox.npz",
         "import bench.mat --map bench.toml --scenario mine.toml --out build/bench.npz",
         "import build/signals.csv --scenario thesis --out build/again.npz",
+        "import build/pendulum.csv --program pendulum --out build/pendulum.npz",
     )
     command.add_argument(
         "file", type=Path, metavar=FILE, help=".csv, .tsv, .txt, .npy, .npz, .mat, .mf4, .parquet or .wav"
@@ -33,7 +45,7 @@ def add(commands: Any) -> None:
     command.add_argument("--map", type=Path, metavar="FILE.toml", help="the settings below as a file")
     for side in _SIDES:
         command.add_argument(f"--{side}", metavar="COLUMN", help=f"column of the plant's {side}")
-        command.add_argument(f"--{side}-unit", metavar="UNIT", help="its unit (default: V)")
+        command.add_argument(f"--{side}-unit", metavar="UNIT", help="its unit (default: that of the header, or V)")
         command.add_argument(f"--{side}-scale", type=float, metavar="X", help="units per number in it (default: 1)")
         command.add_argument(
             f"--{side}-range",
@@ -46,7 +58,7 @@ def add(commands: Any) -> None:
             f"--{side}-noise", type=float, metavar="X", help="its noise, rms in units (default: unknown)"
         )
     command.add_argument("--rate", type=float, metavar="HZ", help="sample rate (default: that of the file)")
-    command.add_argument("--time", metavar="COLUMN", help="column of the instants in seconds, instead of --rate")
+    command.add_argument("--time", metavar="COLUMN", help="column of the instants, instead of --rate")
     command.add_argument(
         "--clock",
         choices=("plant", "machine"),
@@ -60,7 +72,17 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--scenario", metavar=SCENARIO, help="scenario with the truth: shipped name or .toml file (default: unknown)"
     )
-    add_rig(command, f"rig of a file of analogrig emulate: {RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)")
+    command.add_argument(
+        "--program",
+        metavar=PROGRAM,
+        help="program whose input and output the columns are: shipped name or .toml file (default: the scenario's, or"
+        " front)",
+    )
+    add_rig(
+        command,
+        f"rig of a file of analogrig emulate: {RIG_NAMES} (default: $ANALOGRIG_RIG, that of the scenario, or emulator)",
+        None,
+    )
     add_json(command)
     command.set_defaults(command=_run)
 
@@ -69,14 +91,18 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError
     from analogrig.identity import Identity
     from analogrig.output import move_aside
+    from analogrig.program import Program
     from analogrig.scenario import Scenario
 
     if arguments.out.suffix != ".npz":
         raise ConfigurationError(f"--out {arguments.out}: the file's name must end with .npz")
     move_aside(arguments.out, (*files_read(arguments), *([arguments.map] if arguments.map else [])))
     scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    program = None if arguments.program is None else Program.load(arguments.program)
+    if scenario is not None and program is not None:
+        scenario = scenario.on_program(program)
     with show_work("reading"):
-        run = _import(arguments, scenario)
+        run = _import(arguments, scenario, program)
         run = run.with_identity(Identity.here(arguments.command_line, arguments.started))
         run.save(arguments.out)
     table = _as_json(run, arguments)
@@ -87,12 +113,12 @@ def _run(arguments: argparse.Namespace) -> int:
     return PASSED
 
 
-def _import(arguments: argparse.Namespace, scenario: Scenario | None) -> Run:
+def _import(arguments: argparse.Namespace, scenario: Scenario | None, program: Program | None) -> Run:
     from analogrig.cli.options import DEFAULT_SCENARIO
     from analogrig.errors import RecordingError
     from analogrig.recordings.columns import read_columns
     from analogrig.recordings.imported import import_columns, import_signals, is_emulated
-    from analogrig.rigs.description import open_rig
+    from analogrig.rigs.description import DEFAULT_RIG, open_rig
     from analogrig.scenario import Scenario
 
     table = _table(arguments)
@@ -101,9 +127,11 @@ def _import(arguments: argparse.Namespace, scenario: Scenario | None) -> Run:
         if not is_emulated(arguments.file, names):
             shown = ", ".join(name[:40] for name in names[:20]) + (", ..." if len(names) > 20 else "") or "none"
             raise RecordingError(f"{arguments.file}: name the columns with --input and --output: there are {shown}")
-        with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
-            return import_signals(arguments.file, rig, scenario, scenario or Scenario.load(DEFAULT_SCENARIO))
-    return import_columns(arguments.file, _described(table, arguments), scenario)
+        usual = Scenario.load(DEFAULT_SCENARIO) if program is None else Scenario.of_program(program)
+        rig_name = arguments.rig or (scenario.rig if scenario else "") or DEFAULT_RIG
+        with open_rig(rig_name, allow=trust_of(arguments)) as rig:
+            return import_signals(arguments.file, rig, scenario, scenario or usual)
+    return import_columns(arguments.file, _described(table, arguments), scenario, program)
 
 
 def _table(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -154,7 +182,7 @@ def _caveats(run: Run) -> list[str]:
     """Reasons to doubt a recording, one line each."""
     import numpy as np
 
-    from analogrig.recordings.imported import unit_in_name
+    from analogrig.recordings.imported import known_unit
     from analogrig.wording import number_of
 
     names, rig = run.conditions.program.channels, run.conditions.rig
@@ -163,11 +191,13 @@ def _caveats(run: Run) -> list[str]:
         for name in run.conditions.program.measured
         if np.ptp(run.codes[~run.clipped[:, names.index(name)], names.index(name)]) == 0
     ]
-    for side in _SIDES if "rig" not in rig else ():
+    for side, header in zip(_SIDES, rig.get("header_units", ()), strict=False):
         column, unit, scale = (rig[side][key] for key in ("column", "unit", "scale"))
-        if scale == 1.0 and unit_in_name(column) not in ("", unit):
+        known = known_unit(header)
+        if scale == 1.0 and header and (known is None or known.text != unit):
             lines.append(
-                f"caveat: column {column} is imported in {unit}: pass --{side}-unit, and --{side}-scale to convert"
+                f"caveat: column {column}, in {header}, is imported in {unit}: pass --{side}-unit, and --{side}-scale"
+                " to convert"
             )
     if "rig" not in rig and rig["input"]["column"] == rig["output"]["column"]:
         lines.append("caveat: input and output are the same column")
@@ -184,9 +214,13 @@ def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
     if conditions.time_scale != 1.0:
         rate += f" of the machine, {1.0 / conditions.sample_period_problem_s:.6g} Hz of the plant"
     lines = [f"{arguments.out}: {run.samples} samples at {rate}, {int(run.missing.sum())} of them missing"]
+    described = [conditions.rig[side] for side in _SIDES if side in conditions.rig]
+    units = {name: each["unit"] for name, each in zip(conditions.program.measured, described, strict=False)}
     for name, channel in conditions.channels.items():
         high = channel.low_v + channel.codes * channel.lsb_v
         low, high = (volts * channel.unit_per_v for volts in (channel.low_v, high))
-        lines.append(f"{name.replace('_', ' ')}: {channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}")
+        converted = "" if units.get(name, channel.unit) == channel.unit else f", converted from {units[name]}"
+        span = f"{channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}"
+        lines.append(f"{name.replace('_', ' ')}: {span}{converted}")
     known = f"that of scenario {conditions.scenario['name']}" if conditions.segments else "unknown: UNJUDGED"
     return [*lines, *_caveats(run), f"truth: {known}", f"next: analogrig replay {arguments.out} --dut inproc"]

@@ -10,10 +10,16 @@ from analogrig.cli.options import FILE, add_command, add_json
 from analogrig.cli.terminal import PASSED, show, show_plain, show_result
 
 if TYPE_CHECKING:
+    from analogrig.program import Program
     from analogrig_emulator import PatchedProgram
     from analogrig_emulator.machine.that_sheet import ThatSheet
 
 _SAMPLES = 800
+
+_CARD_RATE_HZ = 20_000.0
+"""Sample rate of the usual rigs."""
+_LEAST_SETTLING_N, _SETTLING_N, _MOST_SETTLING_N = 10, 100, 200
+"""Samples in which a plant settles: the fewest, the usual ones and the most that need no note."""
 
 
 def add(commands: Any) -> None:
@@ -61,8 +67,9 @@ def _patch(arguments: argparse.Namespace) -> int:
     for path in wanted:
         move_aside(path, [file])
     program = load_program(file)
+    loaded = Program.load(str(file))
     with emulator_errors(f"{file}: "):
-        SuspensionComputer(Program.load(str(file)).circuit)  # refuses what a run would
+        SuspensionComputer(loaded.circuit)  # refuses what a run would
     that = _that_sheet(program) if arguments.machine == "that" else None
     texts = {}
     if arguments.drawing is not None:
@@ -80,9 +87,25 @@ def _patch(arguments: argparse.Namespace) -> int:
         show_result({"program": program.name, "full": full, "dials": dials(program), **files}, arguments)
     else:
         show_plain((scaling_sheet(program) if that is None else that.text()).rstrip("\n"))
+        if that is None:
+            for line in _notes(loaded):
+                show(line)
         for path in wanted:
             show(f"written: {path}")
     return PASSED
+
+
+def _notes(program: Program) -> list[str]:
+    """Reasons to choose another speed, which only a run would show: as failures of the device."""
+    period_s = 1.0 / _CARD_RATE_HZ
+    if program.settling_s is None:
+        return []
+    settling_n = program.settling_s / (program.equations.speed * period_s)
+    if _LEAST_SETTLING_N <= settling_n <= _MOST_SETTLING_N:
+        return []
+    speed = program.settling_s / (_SETTLING_N * period_s)
+    note = f"note: the plant settles in {settling_n:.3g} samples of {1e6 * period_s:g} us: write speed"
+    return [f"{note} = {float(f'{speed:.2g}'):g} for {_SETTLING_N}, unless excitation or rig suit it"]
 
 
 def _check_options(arguments: argparse.Namespace) -> None:

@@ -151,9 +151,16 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 def _judge(arguments: argparse.Namespace) -> int:
     with _output_folder(arguments) as output:
+        from analogrig.errors import ConfigurationError
         from analogrig.rigs.recording import RecordingRig
+        from analogrig.run import IMPORTED
 
         run = load_capture(arguments)
+        if run.conditions.dut.get("kind") == IMPORTED:
+            raise ConfigurationError(
+                f"{arguments.file}: no device has answered these samples: judge the run of analogrig replay"
+                f" {arguments.file} --dut NAME"
+            )
         RecordingRig.of(run, arguments.file)
         return _conclude(run, output, output.identity(), arguments)
 

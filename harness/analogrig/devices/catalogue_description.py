@@ -12,7 +12,7 @@ from analogrig.datasheet import Datasheet
 from analogrig.devices.can_description import CanLineDescription
 from analogrig.devices.description import Capability, DeviceDescription
 from analogrig.devices.device import Device
-from analogrig.devices.library import library_for
+from analogrig.devices.library import estimator_library_for
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.line import SerialLine
@@ -99,7 +99,7 @@ class CatalogueDescription(DeviceDescription):
     @property
     def estimator_library(self) -> Path:
         """Shared library with the device's estimator, to be run in this process."""
-        return library_for(self.estimator)
+        return estimator_library_for(self.estimator)
 
     @property
     def can_run_in_blocks(self) -> bool:

@@ -44,7 +44,7 @@ class InprocDevice(EitherDevice):
 
     @property
     def estimator_library(self) -> Path:
-        return self.program
+        return self.program if self.library else super().estimator_library
 
     @property
     def can_run_in_blocks(self) -> bool:

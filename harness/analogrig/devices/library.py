@@ -20,6 +20,14 @@ LIBRARY = Path(__file__).parents[1] / "_device.so"
 WIDE_LIBRARY = LIBRARY.with_name("_device_wide.so")
 """The same with room for plants of higher order."""
 
+FIXED_LIBRARY = LIBRARY.with_name("_device_fixed.so")
+"""The same with fixed orders, which takes fewer instructions."""
+
+_OWN = (LIBRARY, WIDE_LIBRARY, FIXED_LIBRARY)
+
+_FIXED_ORDERS = {"na": 2, "nb": 3, "nk": 0, "nc": 0, "offset": True}
+"""FIXED_ORDERS of setup.py."""
+
 EXIT_GUARD = LIBRARY.with_name("_exit_guard.so")
 """exit_guard.c: after exit() in a user's library, the status of this process is no success."""
 
@@ -59,11 +67,11 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
     if library.exists() and not library.is_file():
         raise ConfigurationError(f"{library}: not a file")
     try:
-        if library not in (LIBRARY, WIDE_LIBRARY):
+        if library not in _OWN:
             _exit_guard().exit_guard_arm(str(library).encode())
         c = ctypes.CDLL(str(library))
     except OSError as error:
-        if library in (LIBRARY, WIDE_LIBRARY):
+        if library in _OWN:
             raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
         reason = str(error).removeprefix(f"{library}: ")
         raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
@@ -76,6 +84,12 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
 def library_for(estimator: EstimatorConfig) -> Path:
     """The project's own device, with room for these settings."""
     return WIDE_LIBRARY if estimator.is_wide else LIBRARY
+
+
+def estimator_library_for(estimator: EstimatorConfig) -> Path:
+    """The fastest build of the estimator alone for these settings, whose orders are final."""
+    is_fixed = all(getattr(estimator, name) == order for name, order in _FIXED_ORDERS.items())
+    return FIXED_LIBRARY if is_fixed else library_for(estimator)
 
 
 @functools.cache

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChannelFault, MisfitPeriod, Verdict, unreported
+from analogrig.judging.verdict import (
+    DIAGNOSES,
+    ESTIMATES,
+    ChannelFault,
+    MisfitPeriod,
+    Verdict,
+    is_beyond_model,
+    unreported,
+)
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -35,7 +43,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     return (
         *_statement(run),
         *_misfits(verdict),
-        *_orders(run),
+        *_orders(run, verdict),
         *_unjudged_quantities(run, verdict),
         *_theta_without_a_model(run),
         *_assumed_settings(run),
@@ -52,16 +60,21 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
 
 
 def _misfits(verdict: Verdict) -> Iterator[str]:
-    """One sentence for each cause of a misfit."""
-    for cause, periods in itertools.groupby(sorted(verdict.fit or (), key=_cause), _cause):
-        yield f"the model does not fit ({cause}): alarms may be false, and changes missed; {next(periods).cure}"
+    """One sentence for each cure of a misfit."""
+    for cure, periods in itertools.groupby(sorted(verdict.fit or (), key=_cure_and_cause), _cure):
+        causes = ", ".join(dict.fromkeys(period.cause for period in periods))
+        yield f"the model does not fit ({causes}): alarms may be false, and changes missed; {cure}"
 
 
-def _cause(period: MisfitPeriod) -> str:
-    return period.cause
+def _cure(period: MisfitPeriod) -> str:
+    return period.cure
 
 
-def _orders(run: Run) -> Iterator[str]:
+def _cure_and_cause(period: MisfitPeriod) -> tuple[str, str]:
+    return period.cure, period.cause
+
+
+def _orders(run: Run, verdict: Verdict) -> Iterator[str]:
     """Sentence on the orders of a model that the program chose, or that are below those of the program."""
     program, model, estimator = run.conditions.program, run.datasheet.model, run.conditions.dut.get("estimator", {})
     if not run.conditions.segments or model is None or estimator.get("trigger") == "none":
@@ -74,10 +87,13 @@ def _orders(run: Run) -> Iterator[str]:
     elif model.na < program.order:
         cure = ' set orders = "program" under [estimator]' if estimator else " choose a model of that order"
         yield f"the device models {model.na} of the {program.order} poles of the program {program.name}:{cure}"
-    elif model.na < (states := len(program.equations.states)):
+    elif is_beyond_model(run) and (
+        model.na < (states := len(program.equations.states)) or (verdict.outcome == "failed" and not verdict.fit)
+    ):
         yield (
-            f"the program {program.name} is not linear and has {states} states, the device models order {model.na}:"
-            " if it does not fit, raise na and nb in a device file"
+            f"the program {program.name} is not linear and has {number_of(states, 'state')}, the device's model is"
+            f" linear, of order {model.na}: if it does not fit, reduce the amplitude of the excitation, or raise na and"
+            " nb in a device file"
         )
 
 

@@ -44,7 +44,7 @@ _NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
 Outcome = Literal["passed", "failed", "inconclusive", "unjudged"]
 """``unjudged``: nothing is known of the plant, so that no alarm can be true or false."""
 
-UNKNOWN_PLANT = "nothing is known of the plant and its changes: pass a scenario that holds them with --scenario"
+UNKNOWN_PLANT = "nothing is known of the plant and its changes: import again with --scenario FILE to judge it"
 """Reason of an unjudged run."""
 
 UNDETECTABLE = (
@@ -93,6 +93,15 @@ FAULT_CURES: Mapping[str, str] = {
 }
 """Measure against each fault of a channel."""
 
+NONLINEAR_CURE = (
+    "the program is not linear, the device's model is: reduce the amplitude of the excitation, or raise the orders na"
+    " and nb"
+)
+"""Measure against a cause or a fault that a plant beyond the device's linear model explains."""
+
+_UNEXPLAINED_CAUSES = frozenset({"slow plant", "excitation"})
+_UNEXPLAINED_FAULTS = frozenset({"stuck"})
+
 
 @dataclass(frozen=True)
 class ChannelFault:
@@ -106,11 +115,15 @@ class ChannelFault:
     """Likeliest sample of its beginning."""
     extent: float | None
     """Gain after over gain before; None unless the fault is a gain, or non-finite."""
+    beyond_model: bool = False
+    """True if the program is not linear and the device's model is: no channel need be at fault."""
 
     @property
     def cure(self) -> str:
         """Measure against the fault."""
         channel, kind = self.name.split()
+        if self.beyond_model and kind not in _UNEXPLAINED_FAULTS:
+            return NONLINEAR_CURE
         return f"{channel}: {FAULT_CURES[kind]}"
 
 
@@ -126,6 +139,8 @@ class MisfitPeriod:
     """Statistic over its limit at ``start``; None if the device does not report it."""
     frequency_hz: float | None
     """Frequency of the disturbance; None unless the cause is ``hum``, or if the device does not report it."""
+    beyond_model: bool = False
+    """True if the program is not linear and the device's model is: nothing need disturb the rig."""
 
     @property
     def text(self) -> str:
@@ -136,7 +151,8 @@ class MisfitPeriod:
     @property
     def cure(self) -> str:
         """Measure against the cause."""
-        return CURES[self.cause]
+        is_explained = self.beyond_model and self.cause not in _UNEXPLAINED_CAUSES
+        return NONLINEAR_CURE if is_explained else CURES[self.cause]
 
 
 @dataclass(frozen=True)
@@ -382,8 +398,14 @@ def _judge(
     )
 
 
+def is_beyond_model(run: Run) -> bool:
+    """True if the device's model is linear and the plant is not."""
+    return bool(run.conditions.segments) and run.datasheet.model is not None and not run.conditions.program.is_linear
+
+
 def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
     """Faults of the channels that the device diagnosed."""
+    beyond_model = is_beyond_model(run) if len(run.diagnosis_index) else False
     reported = zip(run.diagnosis_change, run.diagnosis_index, run.diagnosis_onset, run.diagnosis_extent, strict=True)
     return tuple(
         ChannelFault(
@@ -391,6 +413,7 @@ def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
             sample=int(sample),
             onset=int(onset),
             extent=float(extent) if Change(change) in GAINS and math.isfinite(extent) else None,
+            beyond_model=beyond_model,
         )
         for change, sample, onset, extent in reported
         if change in CHANNEL_FAULTS
@@ -400,6 +423,7 @@ def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
 def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
     """Periods in which the device reported a misfit. Each ends with the next report, or with its record."""
     changes = [*run.misfit_index.tolist(), run.samples]
+    beyond_model = is_beyond_model(run) if len(run.misfit_index) else False
     out = []
     for i, cause in enumerate(map(Cause, run.misfit_cause.tolist())):
         start = changes[i]
@@ -414,6 +438,7 @@ def misfit_periods(run: Run) -> tuple[MisfitPeriod, ...]:
                     end=min(changes[i + 1], record_end),
                     strength=float(run.misfit_strength[i]) or None,
                     frequency_hz=frequency / run.conditions.sample_period_s if is_known else None,
+                    beyond_model=beyond_model,
                 )
             )
     return tuple(out)
@@ -590,23 +615,20 @@ def _attribute_alarms(
     run: Run, model: Model | None, expect: Expectations, level: float
 ) -> tuple[tuple[ChangeVerdict, ...], tuple[int, ...]]:
     """Verdict on each change, and the samples of the false alarms."""
-    alarms = run.alarm_index.tolist()
     by_start = {segment.start: segment for segment in run.conditions.segments}
-    detected: set[int] = set()
     tweaks = []
     diagnosed, is_bounded = run.conditions.program.diagnosed, information.is_bounded(run)
     isolates = len(run.diagnosis_index) and diagnosed
     model = model or information.model_of(run)
     isolation_bounds = information.isolation_bounds(run, model) if isolates else [None] * len(run.segments)
-    for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
-        run.segments, run.segments[1:], information.change_information(run, model), isolation_bounds, strict=False
+    informations = information.change_information(run, model)
+    alarms = _alarms_by_change(run, informations)
+    for (_, _, before), (start, end, after), gathered, in_segment, isolation_bound_n in zip(
+        run.segments, run.segments[1:], informations, alarms, isolation_bounds, strict=False
     ):
         if start in run.conditions.records:
             continue  # a device that restarts has no earlier plant to compare with
-        # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
-        in_segment = [index for index in alarms if start < index <= end] if _may_alarm(gathered) else []
         detection = in_segment[0] if in_segment else None
-        detected |= alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
         late = first_at_level(gathered, expect.late_information_ratio * level)
         bound_n = first_at_level(gathered, level)
@@ -627,7 +649,35 @@ def _attribute_alarms(
                 else _judge_diagnosis(run, by_start[start], (detection, end), changed, isolation_bound_n),
             )
         )
-    return tuple(tweaks), tuple(sorted(set(alarms) - detected))
+    return tuple(tweaks), _unexplained(run, alarms)
+
+
+def unexplained_alarms(run: Run) -> tuple[int, ...]:
+    """Sample indices of the alarms that no change explains, at the likeliest instants of the changes.
+
+    :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
+    """
+    return _unexplained(run, _alarms_by_change(run, information.change_information(run)))
+
+
+def _alarms_by_change(run: Run, informations: Iterable[NDArray[np.float64]]) -> list[list[int]]:
+    """Alarms in the segment of each change; none where it gives too little information."""
+    # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
+    return [
+        [index for index in run.alarm_index.tolist() if start < index <= end] if _may_alarm(gathered) else []
+        for (start, end, _), gathered in zip(run.segments[1:], informations, strict=True)
+    ]
+
+
+def _unexplained(run: Run, alarms: Iterable[list[int]]) -> tuple[int, ...]:
+    """Alarms other than those of the changes, to which ``alarms`` attributes them; a record begins without a change."""
+    ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
+    explained = [
+        _alarms_of_change(in_segment, start + ramps_n[start])
+        for (start, _, _), in_segment in zip(run.segments[1:], alarms, strict=True)
+        if start not in run.conditions.records
+    ]
+    return tuple(sorted(set(run.alarm_index.tolist()).difference(*explained)))
 
 
 def _may_alarm(gathered: NDArray[np.float64]) -> bool:
@@ -663,7 +713,7 @@ def _judge_diagnosis(
     )
 
 
-def alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
+def _alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
     """Alarms attributed to a change: all until the end of its ramp, and the first one after it.
 
     An alarm on a ramp restarts the device on a plant that keeps changing. It must detect that change again.

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from analogrig.answers import Answers
 from analogrig.bench import RunBuilder
 from analogrig.datasheet import Datasheet
-from analogrig.judging.verdict import alarms_of_change
+from analogrig.judging.verdict import unexplained_alarms
 from analogrig.plant import MAX_CHANGES, Segment
 from analogrig.rigs.rig import Block
 from analogrig.run import Run
@@ -66,33 +66,30 @@ class Take:
         return segments_of(self.scenario.plant, self.changes)
 
     def false_alarms(self, run: Run) -> int:
-        """Number of alarms of its run before any injected fault that no change explains."""
-        alarms = [k for k in run.alarm_index.tolist() if k < self.faulty_from]
-        segments = self.segments()[1:]
-        ends = [*(segment.start for segment in segments[1:]), run.samples]
-        explained = [
-            alarms_of_change([k for k in alarms if segment.start < k <= end], segment.start + segment.ramp_n)
-            for segment, end in zip(segments, ends, strict=bool(segments))
-        ]
-        return len(set(alarms).difference(*explained))
+        """Number of alarms of its concluded run before any injected fault that no change explains.
+
+        :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
+        """
+        return sum(index < self.faulty_from for index in unexplained_alarms(run))
 
     def played(self, run: Run) -> Scenario:
-        """Scenario that plays this take again, and allows the false alarms that were seen."""
+        """Scenario that plays this take again."""
         changes = tuple(change for change in self.changes if change.sample < run.samples)
         told = [f"{name} to {value:.6g} at {each.sample}" for each in changes for name, value in each.set.items()]
         more = f" and {len(told) - _MOST_TOLD} more" if len(told) > _MOST_TOLD else ""
-        expect = self.scenario.expect
         return dataclasses.replace(
             self.scenario,
             samples=run.samples,
             tweaks=changes,
-            expect=dataclasses.replace(expect, false_alarms=max(expect.false_alarms, self.false_alarms(run))),
             name="by hand",
             description=f"Recorded by hand: {', '.join(told[:_MOST_TOLD]) or 'no change'}{more}.",
         )
 
     def concluded(self, run: Run) -> Run:
-        """Run with the scenario that was played by hand, instead of the endless one."""
+        """Run with the scenario that was played by hand, instead of the endless one.
+
+        The scenario allows the false alarms that were seen. Errors as ``false_alarms``.
+        """
         scenario = self.played(run)
         conditions = dataclasses.replace(
             run.conditions,
@@ -101,7 +98,11 @@ class Take:
             segments=run.conditions.segments or scenario.segments(),
             faults=(*run.conditions.faults, *self.caveats),
         )
-        return dataclasses.replace(run, conditions=conditions)
+        concluded = dataclasses.replace(run, conditions=conditions)
+        expect = scenario.expect
+        expect = dataclasses.replace(expect, false_alarms=max(expect.false_alarms, self.false_alarms(concluded)))
+        allowing = dataclasses.replace(scenario, expect=expect).as_table()
+        return dataclasses.replace(concluded, conditions=dataclasses.replace(conditions, scenario=allowing))
 
 
 class TakeBuilder(RunBuilder):

@@ -22,6 +22,7 @@ from analogrig.rigs.rig import Block
 from analogrig.run import IMPORTED, INPUT, LOST, OUTPUT, Conditions, Run
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
+from analogrig_emulator import ProgramError, parse_unit
 
 if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
@@ -152,7 +153,7 @@ def scaled_to_program(conditions: Conditions) -> Conditions:
     if rig.get("kind") != IMPORTED or "rig" in rig:  # a play, or data with the units and the rate of a rig
         return conditions
     program, clock = conditions.program, rig.get("clock")
-    check_units(conditions, program.equations, program.measured)
+    conditions = in_units(conditions, program.equations, program.measured)
     speed = program.equations.speed
     if clock is None and speed != 1.0:
         raise ConfigurationError(
@@ -168,18 +169,28 @@ def scaled_to_program(conditions: Conditions) -> Conditions:
     return dataclasses.replace(conditions, sample_period_s=period_s, time_scale=speed)
 
 
-def check_units(conditions: Conditions, equations: Equations, quantities: Sequence[str]) -> None:
-    """Compare the units of the two measured channels with those of the quantities of a program.
+def in_units(conditions: Conditions, equations: Equations, quantities: Sequence[str]) -> Conditions:
+    """Conditions with the two measured channels in the units of these quantities of a program.
 
-    :raises ConfigurationError: they differ; names both, and the options that convert a column.
+    :raises ConfigurationError: no factor between the units is known; names both, and the options that convert a column.
     """
+    channels = dict(conditions.channels)
     for side, name, quantity in zip(("input", "output"), conditions.program.measured, quantities, strict=True):
-        unit, measured = equations.quantities[quantity].unit, conditions.channels[name].unit
-        if unit is not None and unit.text != measured:
+        unit, channel = equations.quantities[quantity].unit, channels[name]
+        measured = channel.unit
+        if unit is None or unit.text == measured:
+            continue
+        try:
+            factor = parse_unit(measured).factor_to(unit)
+        except ProgramError:
+            factor = None
+        if factor is None:
             raise ConfigurationError(
                 f"{quantity} of program {equations.name} is in {unit.text}, {name} of the recording in {measured}:"
                 f" import it with --{side}-unit {unit.text}, and --{side}-scale {unit.text} per number in its column"
             )
+        channels[name] = dataclasses.replace(channel, unit=unit.text, unit_per_v=channel.unit_per_v * factor)
+    return dataclasses.replace(conditions, channels=channels)
 
 
 def _line_counts(decoder: CaptureDecoding, frames: CapturedFrames) -> dict[str, int]:

@@ -3,7 +3,8 @@
 It runs in a process of its own with bounded memory and time, because a damaged or hostile file may exhaust the memory
 or crash the library that reads it. Nothing in a file is executed: no pickles, no formulas, no links to other files.
 REQUEST is a JSON object: ``file``; ``wanted``, the columns to read; ``skip_lines``; ``out``, the .npz to write them to.
-The answer is a JSON object on standard output: ``names``, ``rate_hz`` and ``blank_lines``, or ``error``.
+The answer is a JSON object on standard output: ``names``, ``rate_hz``, ``blank_lines``, ``units`` and
+``channels``, or ``error``.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ import os
 import re
 import resource
 import sys
+import tempfile
 import warnings
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -39,6 +43,12 @@ MOST_COLUMNS = 4096
 
 _LONGEST_LINE = 1 << 16
 _MOST_NAME = 120
+_MOST_TEXT_BYTES = 4096
+"""Largest array of texts that is read."""
+
+_MOST_FOOTER = 20
+"""Lines at the end of a text whose unwanted columns are looked at, too."""
+
 _CHUNK_BYTES = 1 << 20
 _DELIMITERS = (",", ";", "\t")
 _SPACES = " "
@@ -65,6 +75,10 @@ class Table:
     columns: dict[str, Callable[[], Column]] = field(default_factory=dict)
     rate_hz: float | None = None
     """Sample rate that the file states; None if it states none."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units that the file states beside the names of columns."""
+    channels: list[str] = field(default_factory=list)
+    """Names in the array ``channels`` of an archive, as analogrig writes it."""
 
     def add_typed(self, name: str, dtype: np.dtype[Any], shape: Sequence[int], load: Callable[[], Any]) -> None:
         """Add an array of NumPy, or each field of a structured one as ``name.field``; texts are left out."""
@@ -198,6 +212,8 @@ def _read_rows(
     """
     found = [array.array("d") for _ in places]
     blank_lines = blank_here = 0
+    first: list[str] = []
+    last: deque[tuple[int, list[str]]] = deque(maxlen=_MOST_FOOTER)
     for number, line in lines:
         if not line.strip():
             blank_here += bool(found[0])
@@ -206,6 +222,8 @@ def _read_rows(
         if len(found[0]) == MAX_SAMPLES:
             raise ColumnError(_too_many(MAX_SAMPLES))
         row = _cells(line, delimiter)
+        first = first or row
+        last.append((number, row))
         if len(row) > len(names) and any(cell.strip() for cell in row[len(names) :]):
             raise ColumnError(
                 f"line {number} has {len(row)} cells, the first line {len(names)}: cells with decimal commas need"
@@ -223,7 +241,26 @@ def _read_rows(
                 where = f"line {number}, column {names[place][:_MOST_NAME]}"
                 why = f"{row[place][:40]!r} is no number" if place < len(row) else "the line has no such cell"
                 raise ColumnError(f"{where}: {why}; mend or delete the line") from None
+    _check_footer(first, last, names, delimiter)
     return found, blank_lines
+
+
+def _check_footer(
+    first: Sequence[str], last: Iterable[tuple[int, Sequence[str]]], names: Sequence[str], delimiter: str
+) -> None:
+    """Refuse a summary below the samples, which may have numbers in the wanted columns.
+
+    :param last: last rows with the numbers of their lines.
+    :raises ColumnError: a column that begins with a number has text in them.
+    """
+    numeric = [place for place, cell in enumerate(first) if _are_numbers([cell], delimiter)]
+    for number, row in last:
+        for place in numeric:
+            if place < len(row) and row[place].strip() and not _are_numbers([row[place]], delimiter):
+                raise ColumnError(
+                    f"line {number}, column {names[place][:_MOST_NAME]}: {row[place][:40]!r} is no number, perhaps a"
+                    " footer: mend or delete the line"
+                )
 
 
 def _check_text(path: Path, skip_lines: int) -> None:
@@ -304,6 +341,9 @@ def open_npz(path: Path) -> Table:
         if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > info.file_size:
             raise ColumnError(f"{name[:_MOST_NAME]} declares the shape {shape}, larger than its member of the archive")
         table.add_typed(name, dtype, shape, partial(_npz_member, archive, info))
+        if name == "channels" and dtype.kind == "U" and info.file_size < _MOST_TEXT_BYTES:
+            channels = _npz_member(archive, info).reshape(-1).tolist()
+            table.channels = channels if all(each.isprintable() for each in channels) else []
     return table
 
 
@@ -379,6 +419,8 @@ def open_mf4(path: Path) -> Table:
             samples = int(measurement.groups[group].channel_group.cycles_nr)
             label = name if len(places) == 1 else f"{name}@{group}"
             table.add(label, (samples,), partial(_mf4_channel, measurement, group, index))
+            channel = measurement.groups[group].channels[index]
+            table.units[label] = (channel.conversion and channel.conversion.unit) or channel.unit or ""
     return table
 
 
@@ -406,8 +448,9 @@ def open_parquet(path: Path) -> Table:
     file = parquet.ParquetFile(path)
     table = Table()
     for kind in file.schema_arrow:
-        if types.is_integer(kind.type) or types.is_floating(kind.type) or types.is_boolean(kind.type):
+        if any(each(kind.type) for each in (types.is_integer, types.is_floating, types.is_boolean, types.is_decimal)):
             table.add(kind.name, (file.metadata.num_rows,), partial(_parquet_column, file, kind.name))
+            table.units[kind.name] = (kind.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
         elif types.is_timestamp(kind.type):
             table.add(kind.name, (file.metadata.num_rows,), partial(_parquet_instants, file, kind.name))
     return table
@@ -428,6 +471,11 @@ def open_wav(path: Path) -> Table:
     """Table of the channels 0, 1, ...; whole numbers are scaled to -1..1."""
     from scipy.io import wavfile
 
+    with path.open("rb") as file:
+        start = file.read(8)
+    stated, size = int.from_bytes(start[4:], "little"), path.stat().st_size
+    if start.startswith(b"RIFF") and stated > size:
+        raise ColumnError(f"is cut off: {size} of the {stated + 8} bytes that its header states; copy it once more")
     rate_hz, values = wavfile.read(path)
     scaled = np.asarray(values)
     if scaled.dtype.kind == "u":
@@ -465,6 +513,10 @@ class Columns(NamedTuple):
     """Sample rate that the file states."""
     blank_lines: int = 0
     """Blank lines between rows of text."""
+    units: Mapping[str, str] = MappingProxyType({})
+    """Units that the file states beside the names of the wanted columns."""
+    channels: Sequence[str] = ()
+    """Names in the array ``channels`` of an archive."""
 
 
 def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
@@ -480,7 +532,8 @@ def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
     names = list(table.columns)
     for name in wanted:
         _place(name, names)
-    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz)
+    units = {name: table.units[name][:_MOST_NAME] for name in wanted if table.units.get(name)}
+    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz, 0, units, table.channels)
 
 
 def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -498,16 +551,20 @@ def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
     except Exception as error:  # noqa: BLE001 - the libraries raise anything on damaged files
         cause = re.sub(r"\s+", " ", str(error))[:200] or type(error).__name__
         return {"error": f"damaged, or no {FORMATS[path.suffix.lower()][0]} file: {cause}"}
-    return {"names": found.names, "rate_hz": found.rate_hz, "blank_lines": found.blank_lines}
+    told = found._asdict() | {"units": dict(found.units)}
+    del told["columns"]
+    return told
 
 
 def main(request: str) -> None:
     """Answer one request."""
+    asked = json.loads(request)
+    tempfile.tempdir = str(Path(asked["out"]).parent)  # asammdf leaves a file there
     resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_PROCESSOR_S, MOST_PROCESSOR_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     warnings.simplefilter("ignore")  # of libraries, about damaged files
-    sys.stdout.write(json.dumps(answer(json.loads(request))))
+    sys.stdout.write(json.dumps(answer(asked)))
     sys.stdout.flush()
     os._exit(0)  # destructors of half-open files would write to standard error
 

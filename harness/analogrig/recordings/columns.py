@@ -30,8 +30,12 @@ class ColumnFile:
     names: tuple[str, ...]
     columns: Mapping[str, NDArray[np.float64]]
     rate_hz: float | None
-    blank_lines: int = 0
+    blank_lines: int
     """Blank lines between rows of text, which are skipped."""
+    units: Mapping[str, str]
+    """Units that the file states beside the names of the wanted columns."""
+    channels: tuple[str, ...]
+    """Names in the array ``channels`` of an archive, as ``analogrig emulate`` writes it."""
 
 
 def read_columns(path: Path, wanted: Sequence[str] = (), skip_lines: int = 0) -> ColumnFile:
@@ -54,7 +58,8 @@ def read_columns(path: Path, wanted: Sequence[str] = (), skip_lines: int = 0) ->
         if wanted:
             with np.load(out, allow_pickle=False) as file:
                 columns = {name: file[str(i)] for i, name in enumerate(wanted)}
-    return ColumnFile(tuple(answer["names"]), columns, answer["rate_hz"], answer["blank_lines"])
+    told = {name: answer[name] for name in ("rate_hz", "blank_lines", "units")}
+    return ColumnFile(tuple(answer["names"]), columns, **told, channels=tuple(answer["channels"]))
 
 
 def _ask(path: Path, request: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -21,7 +22,7 @@ from analogrig.recordings.columns import ColumnFile, read_columns
 from analogrig.run import IMPORTED, Channel, Conditions, Run
 from analogrig.scenario import DEFAULT_PROGRAM, Scenario
 from analogrig.wording import number_of
-from analogrig_emulator import Excitation
+from analogrig_emulator import Excitation, ProgramError, Unit, parse_unit
 
 if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
@@ -34,6 +35,14 @@ LEAST_BITS, MOST_BITS = 2, 16
 _LEAST_WIDTH, _MOST_MAGNITUDE = 1e-7, 1e8
 """Limits of a converter's range, which a run can hold."""
 
+_MOST_UNIT = 20
+"""Longest unit of a column."""
+
+_ASCII = MappingProxyType(
+    {"\u00b5": "u", "\u03bc": "u", "\u2126": "ohm", "\u03a9": "ohm", "\u00b7": " ", "\u00b2": "^2", "\u00b3": "^3"}
+)
+"""Symbols of headers in the words of a program file."""
+
 _MOST_JITTER = 0.02
 """Largest deviation of a time from the even grid, in sample periods."""
 
@@ -43,7 +52,8 @@ class ImportedColumn:
     """One column of a file: values in ``unit`` are column * scale + offset. ValueError: a number is out of range."""
 
     column: str
-    unit: str = "V"
+    unit: str | None = None
+    """None: the one in the header of an unscaled column; V without one."""
     scale: float = 1.0
     offset: float = 0.0
     range: tuple[float, float] | None = None
@@ -57,8 +67,8 @@ class ImportedColumn:
     def __post_init__(self) -> None:
         if not self.column:
             raise ValueError("column must not be empty")
-        if not self.unit or len(self.unit) > 20 or not self.unit.isprintable():
-            raise ValueError(f"unit must be 1 to 20 printable characters, not {self.unit[:40]!r}")
+        if self.unit is not None and not (0 < len(self.unit) <= _MOST_UNIT and self.unit.isprintable()):
+            raise ValueError(f"unit must be 1 to {_MOST_UNIT} printable characters, not {self.unit[:40]!r}")
         if not 1e-9 < abs(self.scale) < 1e9:
             raise ValueError(f"scale must have a magnitude between 1e-9 and 1e9, not {self.scale:g}")
         if self.range is not None and not self.range[0] < self.range[1]:
@@ -76,7 +86,7 @@ class ImportDescription:
     rate_hz: float | None = None
     """Sample rate; None: that of ``time``, or the one that the file states."""
     time: str = ""
-    """Column of the sample instants in seconds; they must be evenly spaced."""
+    """Column of the sample instants, in seconds or the unit of its header; they must be evenly spaced."""
     clock: Literal["plant", "machine"] | None = None
     """Clock of the rate and the instants: the plant's, or that of a machine that plays a program at its speed.
 
@@ -116,6 +126,28 @@ def unit_in_name(column: str) -> str:
     return found[1].strip() if found else ""
 
 
+def known_unit(text: str) -> Unit | None:
+    """Unit of a text in a file's header; None if no program file could write it."""
+    try:
+        return parse_unit("".join(_ASCII.get(each, each) for each in text)) if 0 < len(text) <= _MOST_UNIT else None
+    except ProgramError:
+        return None
+
+
+def _header_unit(column: str, found: ColumnFile) -> str:
+    """Unit that the file states for a column, as it writes it; empty if it states none."""
+    return found.units.get(column) or unit_in_name(column)
+
+
+def _in_unit(described: ImportedColumn, header: str) -> ImportedColumn:
+    """Column with the unit of its header, unless the description states unit or scale."""
+    unit = described.unit
+    if unit is None:
+        known = known_unit(header) if described.scale == 1.0 else None
+        unit = "V" if known is None else known.text
+    return dataclasses.replace(described, unit=unit)
+
+
 def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
     """True if a file with columns of these names was written by ``analogrig emulate``."""
     if path.suffix == ".npz":
@@ -124,14 +156,21 @@ def is_emulated(path: Path, names: tuple[str, ...]) -> bool:
     return len(channels) > 1 and {f"{name}_clipped" for name in channels} <= set(names)
 
 
-def import_columns(path: Path, described: ImportDescription, scenario: Scenario | None) -> Run:
+def import_columns(
+    path: Path, described: ImportDescription, scenario: Scenario | None, program: Program | None = None
+) -> Run:
     """Recording of two columns of a file, which no device has seen.
 
     :param scenario: the truth about plant and changes; None: unknown.
+    :param program: whose input and output the columns are, without a scenario; None: unknown.
     :raises RecordingError: the file cannot be read, or its columns give no samples.
     :raises ConfigurationError: the recording is longer than the scenario, or in other units than its program.
     """
     found = read_columns(path, described.columns, described.skip_lines)
+    headers = [_header_unit(each.column, found) for each in (described.input, described.output)]
+    described = dataclasses.replace(
+        described, input=_in_unit(described.input, headers[0]), output=_in_unit(described.output, headers[1])
+    )
     rows = slice(described.first, None if described.samples is None else described.first + described.samples)
     columns = {name: values[rows] for name, values in found.columns.items()}
     count = {len(values) for values in columns.values()}
@@ -144,7 +183,8 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
         raise RecordingError(f"{path}: has a single row: a recording needs two")
     if described.samples is not None and samples < described.samples:
         raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
-    program = Program.load(DEFAULT_PROGRAM) if scenario is None else scenario.program
+    is_known = scenario is not None or program is not None
+    program = scenario.program if scenario else program or Program.load(DEFAULT_PROGRAM)
     shape, channels = (samples, len(program.channels)), {}
     codes, clipped = np.zeros(shape, np.uint16), np.ones(shape, np.bool_)
     for at, (name, each) in enumerate(zip(program.measured, (described.input, described.output), strict=True)):
@@ -155,10 +195,10 @@ def import_columns(path: Path, described: ImportDescription, scenario: Scenario 
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range: give a wider range")
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
-    rig["blank_lines"] = found.blank_lines
-    truth = _truth(path, samples, 1.0 / rate_hz, scenario)
+    rig |= {"blank_lines": found.blank_lines, "header_units": headers}
+    truth = _truth(path, samples, 1.0 / rate_hz, scenario, program)
     run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
-    return run if scenario is None else dataclasses.replace(run, conditions=scaled_to_program(run.conditions))
+    return dataclasses.replace(run, conditions=scaled_to_program(run.conditions)) if is_known else run
 
 
 def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scenario) -> Run:
@@ -166,16 +206,17 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
 
     :param played: scenario whose units the rig states.
     """
-    names = played.program.channels
+    names, there = played.program.channels, read_columns(path)
     if path.suffix == ".npz":
         wanted = [f"{kind}[{i}]" for kind in ("codes", "clipped") for i in range(len(names))]
     else:
         wanted = [f"{name}_{kind}" for kind in ("code", "clipped") for name in names]
-        if not set(wanted) <= set(read_columns(path).names):
-            raise RecordingError(
-                f"{path}: lacks channels of program {played.program.name}, {', '.join(names)}: pass the scenario that"
-                " was played with --scenario"
-            )
+    channels = there.channels or tuple(name.removesuffix("_code") for name in there.names if name.endswith("_code"))
+    if channels != names:
+        raise RecordingError(
+            f"{path}: has the channels {', '.join(channels)[:200]}, program {played.program.name} {', '.join(names)}:"
+            " pass the scenario that was played with --scenario, or its program with --program"
+        )
     found = read_columns(path, wanted)
     values = np.stack([found.columns[name] for name in wanted], axis=1)
     performance = rig.perform(played, 0)
@@ -199,7 +240,7 @@ def import_signals(path: Path, rig: Rig, scenario: Scenario | None, played: Scen
         performance.sample_period_s,
         performance.time_scale,
         description,
-        *_truth(path, len(codes), performance.sample_period_s, scenario),
+        *_truth(path, len(codes), performance.sample_period_s, scenario, played.program),
     )
 
 
@@ -226,7 +267,7 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
     lsb = (high - low) / codes
     if not (noise_lsb := described.noise / lsb) < _MOST_MAGNITUDE:
         raise RecordingError(f"{where}: noise {described.noise:g} is far larger than its values: state it in the unit")
-    return Channel(low, lsb, described.unit, 1.0, noise_lsb, codes)
+    return Channel(low, lsb, described.unit or "V", 1.0, noise_lsb, codes)
 
 
 def _converted(
@@ -251,9 +292,11 @@ def _rate_hz(
         if found.rate_hz is None:
             raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN")
         return found.rate_hz
-    if unit_in_name(described.time) not in ("", "s"):
-        raise RecordingError(f"{path}: column {described.time}: must be in seconds: pass --rate HZ")
-    instants_s = columns[described.time]
+    unit = _header_unit(described.time, found) or "s"
+    in_s = None if (known := known_unit(unit)) is None else known.factor_to(parse_unit("s"))
+    if in_s is None:
+        raise RecordingError(f"{path}: column {described.time}: must be a time, not in {unit}: pass --rate HZ")
+    instants_s = columns[described.time] * in_s
     if len(instants_s) < 2 or not np.isfinite(instants_s).all():
         raise RecordingError(f"{path}: column {described.time}: instants are missing")
     period_s = float(instants_s[-1] - instants_s[0]) / (len(instants_s) - 1)
@@ -272,14 +315,14 @@ def _rate_hz(
 
 
 def _truth(
-    path: Path, samples: int, period_s: float, scenario: Scenario | None
+    path: Path, samples: int, period_s: float, scenario: Scenario | None, program: Program
 ) -> tuple[Scenario, tuple[Segment, ...]]:
     """Scenario and plant of a recording; without a scenario they are unknown.
 
     :raises ConfigurationError: the recording is longer than the scenario.
     """
     if scenario is None:
-        return _unknown(path, samples, period_s), ()
+        return _unknown(path, samples, period_s, program), ()
     if samples > scenario.samples:
         raise ConfigurationError(
             f"{path}: has {number_of(samples, 'sample')}, scenario {scenario.name} {scenario.samples}:"
@@ -331,7 +374,8 @@ def unanswered(
     )
 
 
-def _unknown(path: Path, samples: int, period_s: float) -> Scenario:
+def _unknown(path: Path, samples: int, period_s: float, program: Program) -> Scenario:
     """Scenario of samples of which nothing is known: a generator that never switches, and no change."""
     still = Excitation(low_v=0.0, high_v=0.0, frequency_hz=min(max(0.1 / period_s, 1e-6), 1e12))
-    return Scenario(samples=samples, excitation=still, name=path.stem, description="measured data, plant unknown")
+    text = "measured data, plant unknown"
+    return Scenario(samples=samples, program=program, excitation=still, name=path.stem, description=text)

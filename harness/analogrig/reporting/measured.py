@@ -37,7 +37,7 @@ class Oscillation:
     """Slowest pair of poles of an estimate, and its gain for a constant input."""
 
     resonance_hz: float
-    """Undamped natural frequency, in machine time."""
+    """Undamped natural frequency, in the time of the plant."""
     damping: float
     """Damping ratio; 1 or more: two real poles."""
     gain: float
@@ -70,7 +70,7 @@ def mode_of(run: Run, theta: NDArray[np.float32]) -> Oscillation | None:
     denominator, numerator = _polynomials(theta, model)
     poles = np.roots(denominator)
     with np.errstate(all="ignore"):
-        rates = np.log(poles.astype(complex)) / run.conditions.sample_period_s
+        rates = np.log(poles.astype(complex)) / run.conditions.sample_period_problem_s
     slow = rates[np.argsort(np.abs(rates))][:2]
     squared = (slow[0] * slow[1]).real
     if not (np.isfinite(slow).all() and (slow.real < 0).all() and squared > 0):
@@ -206,7 +206,7 @@ def _gain_unit(run: Run) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Averaged spectra of a run: frequencies (f,) in Hz of machine time, and at each of them the figures below."""
+    """Averaged spectra of a run: frequencies (f,) in Hz of the plant, and at each of them the figures below."""
 
     frequency_hz: NDArray[np.float64]
     input_density: NDArray[np.float64]
@@ -226,7 +226,7 @@ def spectrum(run: Run) -> Spectrum | None:
     if length < 32:
         return None
     u, y = (each - each.mean() for each in values)
-    settings = {"fs": 1.0 / run.conditions.sample_period_s, "nperseg": length}
+    settings = {"fs": 1.0 / run.conditions.sample_period_problem_s, "nperseg": length}
     frequency, uu = signal.welch(u, **settings)
     yy, uy = signal.welch(y, **settings)[1], signal.csd(u, y, **settings)[1]
     with np.errstate(all="ignore"):
@@ -239,7 +239,7 @@ def _model_response(run: Run, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
     if model is None or not run.theta.shape[1] or not np.isfinite(run.theta[-1]).all():
         return None
     denominator, numerator = _polynomials(run.theta[-1], model)
-    delay = np.exp(-2j * np.pi * frequency_hz * run.conditions.sample_period_s)
+    delay = np.exp(-2j * np.pi * frequency_hz * run.conditions.sample_period_problem_s)
     scales = [run.conditions.channels[name].lsb for name in run.conditions.program.measured]
     value = np.polynomial.polynomial.polyval(delay, numerator) / np.polynomial.polynomial.polyval(delay, denominator)
     return np.asarray(np.abs(value) * scales[1] / scales[0])
@@ -286,7 +286,7 @@ def _plot(frequency_hz: NDArray[np.float64], curves: dict[str, tuple[NDArray[np.
         parts.append(f"<g>{_curve(x, y, style)}<title>{text(name)}</title></g>")
     named = "; ".join(f"{_STYLES[style]}: {name}" for name, (_, style) in curves.items())
     return (
-        f'<figure><figcaption>{text(caption)} over Hz of machine time. {text(named)}</figcaption><div class="scroll">'
+        f'<figure><figcaption>{text(caption)} over Hz of the plant. {text(named)}</figcaption><div class="scroll">'
         f'<svg role="img" aria-label="{text(caption)}" width="{_WIDTH}" height="{_TOP + _HEIGHT + _BELOW}"'
         f' font-size="12">{"".join(parts)}</svg></div></figure>'
     )

@@ -305,17 +305,23 @@ def test_step_shows_its_own_samples(dut: str, tmp_path: Path) -> None:
     assert session.ring.end == session._taken
 
 
-def test_false_alarms_that_were_seen_are_allowed_in_the_scenario(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("at_s", "stiffness", "explained"),
+    [(0.1, 18000.0, 1), (0.03, 24500.001, 0)],  # the second change hardly acts
+)
+def test_false_alarms_that_were_seen_are_allowed_in_the_scenario(
+    at_s: float, stiffness: float, explained: int, tmp_path: Path
+) -> None:
     estimator = EstimatorConfig(orders="program", arl0=3.0)
-    script = ((0.0, SetRecording(on=True)), (0.1, Turn("K", 18000.0)), (0.2, SetRecording(on=False)))
+    script = ((0.0, SetRecording(on=True)), (at_s, Turn("K", stiffness)), (0.2, SetRecording(on=False)))
     session = scripted_session(script, tmp_path, dut=open_dut("inproc", estimator=estimator))
     (saved,) = session.saved
-    assert saved.alarms > saved.false_alarms > 0
+    assert saved.alarms - saved.false_alarms == explained and saved.false_alarms > 0
     notice = session.notices[0][1]
     assert f"{saved.false_alarms} of them without a change: allowed in the scenario" in notice
     scenario = Scenario.load(str(saved.scenario))
     assert scenario.expect.false_alarms == saved.false_alarms == len(judge(Run.load(saved.run)).false_alarms)
-    assert scenario.description.startswith("Recorded by hand: K to 18000 at ")
+    assert scenario.description.startswith(f"Recorded by hand: K to {stiffness:.6g} at ")
     assert cli.main(["replay", str(saved.run), "--out", str(tmp_path / "again")]) == 0
 
 

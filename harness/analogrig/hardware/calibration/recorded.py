@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.calibration.averages import noise_variance
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.recordings.capture import check_units
+from analogrig.recordings.capture import in_units
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import (
@@ -184,10 +184,10 @@ class RecordedPlant:
         outputs = [name for name in equations.channels if name not in equations.inputs]
         if len(equations.inputs) != 1 or not outputs:
             raise ConfigurationError(f"program {program.name}: a twin needs one input, and an output on a channel")
-        self.program, self.run = program, run
-        self._measured = run.conditions.program.measured
+        self.program, self._measured = program, run.conditions.program.measured
         self.input, self.output = next(iter(equations.inputs)), outputs[0]
-        check_units(run.conditions, equations, (self.input, self.output))
+        conditions = in_units(run.conditions, equations, (self.input, self.output))
+        self.run = dataclasses.replace(run, conditions=conditions)
         stock = computer.components_for(seed)
         components = dataclasses.replace(stock, pots=dataclasses.replace(stock.pots, windings=0))
         if computer.components != "nominal":
@@ -198,7 +198,7 @@ class RecordedPlant:
             program, opamp=computer.op_amp, components=components, sample_rate_hz=rate_hz, offset_v=0.0
         )
         self._at = equations.channels.index(self.output)
-        self.output_unit = run.conditions.channels[self._measured[1]].unit
+        self.output_unit = conditions.channels[self._measured[1]].unit
         self.plays = 0
 
     def span(self, first: int, end: int, settling_n: int = SETTLING_N) -> Span:
