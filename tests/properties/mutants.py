@@ -279,7 +279,7 @@ def _page(
         "",
         "## Survivors",
         "",
-        "`tests/properties/SURVIVORS.md` explains each by name.",
+        "`tests/properties/SURVIVORS.md` names those that have a reason.",
         "",
         "| reason | survivors |",
         "|---|---|",
