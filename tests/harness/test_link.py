@@ -180,7 +180,7 @@ def test_library_that_was_not_built_is_named_with_the_cure(tmp_path: Path, monke
     absent = tmp_path / "absent.so"
     with pytest.raises(ConfigurationError, match=r"absent\.so: cannot be loaded as a library of a device"):
         MemoryWire(1, library=absent)
-    monkeypatch.setattr("analogrig.devices.library.LIBRARY", absent)
+    monkeypatch.setattr("analogrig.devices.library.OWN_LIBRARIES", (absent,))
     with pytest.raises(LinkError, match="make setup"):
         MemoryWire(1, library=absent)
 

@@ -23,7 +23,7 @@ WIDE_LIBRARY = LIBRARY.with_name("_device_wide.so")
 FIXED_LIBRARY = LIBRARY.with_name("_device_fixed.so")
 """The same with fixed orders, which takes fewer instructions."""
 
-_OWN = (LIBRARY, WIDE_LIBRARY, FIXED_LIBRARY)
+OWN_LIBRARIES = (LIBRARY, WIDE_LIBRARY, FIXED_LIBRARY)
 
 _FIXED_ORDERS = {"na": 2, "nb": 3, "nk": 0, "nc": 0, "offset": True}
 """FIXED_ORDERS of setup.py."""
@@ -67,11 +67,11 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
     if library.exists() and not library.is_file():
         raise ConfigurationError(f"{library}: not a file")
     try:
-        if library not in _OWN:
+        if library not in OWN_LIBRARIES:
             _exit_guard().exit_guard_arm(str(library).encode())
         c = ctypes.CDLL(str(library))
     except OSError as error:
-        if library in _OWN:
+        if library in OWN_LIBRARIES:
             raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
         reason = str(error).removeprefix(f"{library}: ")
         raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
