@@ -5,9 +5,13 @@ They are numpy's to the bit. To make a generator of numpy for each seed takes as
 
 from __future__ import annotations
 
+import ctypes
+import functools
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.random import _generator
 from numpy.typing import NDArray
 
 from analogrig_emulator.engine import library
@@ -22,17 +26,24 @@ def uniforms(seeds: Sequence[int], stream: int, count: int) -> NDArray[np.float6
 
 def normals(seeds: Sequence[int], stream: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Standard normal numbers, as of standard_normal(shape): (seeds, *shape)."""
-    bits, out = np.random.PCG64(0), np.empty((len(seeds), *shape))
-    generator = np.random.Generator(bits)
-    for row, (high, low, increment_high, increment_low) in zip(out, _states(seeds, stream).tolist(), strict=True):
-        bits.state = {
-            "bit_generator": "PCG64",
-            "state": {"state": high << 64 | low, "inc": increment_high << 64 | increment_low},
-            "has_uint32": 0,
-            "uinteger": 0,
-        }
-        generator.standard_normal(out=row)
+    states, out = _states(seeds, stream), np.empty((len(seeds), *shape))
+    normal, width, limit = _ziggurat()
+    table = (normal, width.ctypes.data, limit.ctypes.data)
+    library.load().engine_normals(*table, len(seeds), math.prod(shape), states.ctypes.data, out.ctypes.data)
     return out
+
+
+@functools.cache
+def _ziggurat() -> tuple[int, NDArray[np.float64], NDArray[np.uint64]]:
+    """Address of numpy's function for normal numbers, and the widths and limits of its boxes.
+
+    Numpy exports the function for such use (Extending via CFFI).
+    """
+    function = ctypes.CDLL(_generator.__file__).random_standard_normal
+    address, width, limit = ctypes.cast(function, ctypes.c_void_p).value, np.empty(256), np.empty(256, np.uint64)
+    assert address
+    library.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
+    return address, width, limit
 
 
 def _states(seeds: Sequence[int], stream: int) -> NDArray[np.uint64]:

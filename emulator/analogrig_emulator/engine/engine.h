@@ -296,4 +296,21 @@ void engine_seed(int64_t count, const uint64_t* seed, uint32_t stream, uint64_t*
 /// Write the next `count` uniform numbers from 0 to 1 of each of the streams. The states stay as they are.
 void engine_draw(int64_t streams, int64_t count, const uint64_t* states, double* out);
 
+/// Numpy's random_standard_normal(), of a bitgen_t*.
+typedef double engine_normal_t(void* source);
+
+/// Learn from numpy's function how it makes a normal number of one word: the width of each of its 256 boxes, and the limit below
+/// which a magnitude becomes a number at once; 0 where it does otherwise than it did in numpy 2.4.
+void engine_learn(engine_normal_t* normal, double* width, uint64_t* limit);
+
+/// Write the next `count` standard normal numbers of each of the streams, those of numpy's function to the bit. It makes those
+/// that take more than one word. The states stay as they are.
+void engine_normals(engine_normal_t* normal,
+                    const double*    width,
+                    const uint64_t*  limit,
+                    int64_t          streams,
+                    int64_t          count,
+                    const uint64_t*  states,
+                    double*          out);
+
 #endif  // ENGINE_H

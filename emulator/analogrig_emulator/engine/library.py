@@ -80,6 +80,8 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_see", c_int, (c_int64, c_int64, c_int, c_void_p, c_double, *(c_void_p,) * 4)),
     ("engine_seed", None, (c_int64, c_void_p, c_uint32, c_void_p)),
     ("engine_draw", None, (c_int64, c_int64, c_void_p, c_void_p)),
+    ("engine_learn", None, (c_void_p, c_void_p, c_void_p)),
+    ("engine_normals", None, (c_void_p, c_void_p, c_void_p, c_int64, c_int64, c_void_p, c_void_p)),
     ("engine_convert", None, (c_int64, c_int, c_void_p, c_uint, c_uint, *(c_void_p,) * 3)),
 )
 
