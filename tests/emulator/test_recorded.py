@@ -150,6 +150,8 @@ def test_wrong_drives_are_refused() -> None:
     for terms in (np.zeros((3, 4)), np.zeros((0, 5)), np.full((3, 5), np.inf)):
         with pytest.raises(EngineError, match="finite coefficients"):
             Engine(system, ["out"], RATE_HZ, drives={"IN": Drive(terms)})
+    with pytest.raises(EngineError, match="a drive begins after it"):
+        Engine(system, ["out"], RATE_HZ, drives={"IN": Drive(np.zeros((3, 5)), first=3)})
     engine = Engine(system, ["out"], RATE_HZ, drives={"IN": Drive.band_limited(np.zeros(3))})
     with pytest.raises(EngineError, match="no input is called 'IN'"):
         engine.run(3, {"IN": Edges(np.zeros(1, np.int64), np.ones(1))})

@@ -42,6 +42,7 @@ from analogrig_emulator.circuit.nonlinear import Function, Multiplier, Multiplie
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotModel
+from analogrig_emulator.engine.system import Law
 from analogrig_emulator.errors import CircuitError
 
 REFERENCE_C = 25.0
@@ -436,9 +437,9 @@ class Components:
             case OpAmp():
                 yield replace(element, model=self._specimen(element, draws))
                 yield from self._inputs(element, draws)
-            case Multiplier():
+            case Multiplier(law=Law.PRODUCT):
                 yield replace(element, model=self.multipliers.specimen(element.model, draws))
-            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch() | Function():
+            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch() | Function() | Multiplier():
                 yield element
             case _:
                 raise unknown_kind_error(element)

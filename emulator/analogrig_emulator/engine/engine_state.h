@@ -118,10 +118,10 @@ typedef struct {
 /// at the speed of the step before. At the top of a peak the first alone may be zero.
 typedef enum { CLEAR, NEAR, CROSSED } judgement_t;
 
-/// A product, and the degrees of its factors.
+/// A product, the degrees of its factors, and its law.
 typedef struct {
     engine_product_t factors;
-    int              x_degree, y_degree;
+    int              x_degree, y_degree, kind;
 } law_t;
 
 /// A circuit and its modes. Arrays as in engine_system_t, in one block.

@@ -155,9 +155,12 @@ TARGET static double KERNEL(apply)(const law_t* law, const double* arguments, co
     double change[PANEL], most = 0.0;
     for (int i = 0; i < PANEL; i += LANES) {
         const lanes_t p = *(const lanes_t*)&arguments[i], q = *(const lanes_t*)&arguments[PANEL + i];
-        const lanes_t value =
-            KERNEL(evaluate)(law->factors.x, law->x_degree, p) * KERNEL(evaluate)(law->factors.y, law->y_degree, q) +
-            *(const lanes_t*)&driven[i];
+        lanes_t       x = KERNEL(evaluate)(law->factors.x, law->x_degree, p);
+        const lanes_t y = KERNEL(evaluate)(law->factors.y, law->y_degree, q);
+        for (int j = 0; j < LANES && law->kind == ENGINE_ROOT; j++) {
+            x[j] = x[j] > 0.0 ? sqrt(x[j]) : 0.0;
+        }
+        const lanes_t value   = (law->kind == ENGINE_QUOTIENT ? x / y : x * y) + *(const lanes_t*)&driven[i];
         *(lanes_t*)&change[i] = value - *(const lanes_t*)&values[i];
         *(lanes_t*)&values[i] = value;
     }

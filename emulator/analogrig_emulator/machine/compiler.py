@@ -20,6 +20,7 @@ from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element,
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
+from analogrig_emulator.engine.system import Law
 from analogrig_emulator.errors import PotError, ProgramError
 from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
@@ -58,12 +59,6 @@ _LOOP_FARAD = 47e-12
 
 _BARRED_V = 0.05
 """Voltage beyond zero at which a root's diode conducts: at zero itself it would switch without end at rest."""
-
-_IDEAL_LOOP = 1e-5, 1e-4
-"""Parts of that capacitor and of that voltage with an ideal amplifier, which needs neither.
-
-The loop is late by 5 ps times 10 V over the divisor's voltage.
-"""
 
 _OFF_OHM = 1e12
 _ON_OHM = 1e3
@@ -119,8 +114,8 @@ class PatchedProgram(ProgramCircuit):
     """Program compiled from equations.
 
     patch: computing elements in the order of the diagram; inverters: names of the last amplifiers, by quantity;
-    input_nodes: node by input; reach: range in the trial play by quantity; loops: elements to replace those of the same
-    names if an amplifier is ideal, by amplifier.
+    input_nodes: node by input; reach: range in the trial play by quantity; ideal: by amplifier and name, elements that
+    replace those of the same names if the amplifier is ideal, None for none.
     """
 
     equations: Equations
@@ -131,7 +126,7 @@ class PatchedProgram(ProgramCircuit):
     inverters: Mapping[str, str]
     input_nodes: Mapping[str, str]
     elements: tuple[Element, ...]
-    loops: Mapping[str, Sequence[Element]]
+    ideal: Mapping[str, Mapping[str, Element | None]]
 
     __hash__ = object.__hash__
 
@@ -193,11 +188,12 @@ class PatchedProgram(ProgramCircuit):
 
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
         given = dict(zip((each.name for each in self.elements if isinstance(each, OpAmp)), models, strict=True))
-        ideal = {each.name: each for amp, parts in self.loops.items() if not given[amp].has_state for each in parts}
-        return [
-            replace(each, model=given[each.name]) if isinstance(each, OpAmp) else ideal.get(each.name, each)
-            for each in self.elements
-        ]
+        ideal: dict[str, Element | None] = {}
+        for amp, parts in self.ideal.items():
+            if not given[amp].has_state:
+                ideal |= parts
+        elements = [ideal.get(each.name, each) for each in self.elements]
+        return [replace(each, model=given[each.name]) if isinstance(each, OpAmp) else each for each in elements if each]
 
 
 def wired(equations: Equations) -> ProgramCircuit:
@@ -351,7 +347,7 @@ class _Patcher:
         self._signs = signs_of(rows, self._inputs, self._divisor_signs)
         self._nodes: dict[tuple[str, int], str] = {}
         self._elements: list[Element] = []
-        self._loops: dict[str, Sequence[Element]] = {}
+        self._ideal: dict[str, Mapping[str, Element | None]] = {}
         self._amplifiers: dict[str, int] = {}
         self._inverters: dict[str, int] = {}
         self._uses = self._users(rows)
@@ -381,7 +377,7 @@ class _Patcher:
             inverters={name: f"U{self._inverters[name]}" for name in inverters},
             input_nodes={name: self._nodes[name, 1] for name in self._inputs},
             elements=tuple(self._elements),
-            loops=self._loops,
+            ideal=self._ideal,
         )
 
     # ---- names
@@ -483,7 +479,10 @@ class _Patcher:
         return self._amplifier(stage, [PatchedCord(cord, node, sign, 1.0, 1, name)])
 
     def _loop(self, stage: PatchStage) -> PatchedElement:
-        """Divider or root: the amplifier settles where its multiplier's product equals the first cord."""
+        """Divider or root: the amplifier settles where its multiplier's product equals the first cord.
+
+        An ideal amplifier is a summer instead, before an element that divides or takes the root by itself.
+        """
         number, dividend = self._amplifiers[stage.name], stage.cords[0]
         sign, junction, out = self._signs[stage.name], f"s{number}", f"u{number}"
         is_root = stage.kind is StageKind.ROOT
@@ -498,22 +497,26 @@ class _Patcher:
         product_sign = -self._source_sign(stage, dividend)
         name, node = f"XU{number}", f"xu{number}"
         scale_v = MACHINE_V * sign * other_sign * product_sign
-        capacitor = Capacitor(f"C{number}", junction, out, _LOOP_FARAD)
+        divisor = self._nodes[other, other_sign]
         self._elements += [
-            Multiplier(name, out, self._nodes[other, other_sign], node, scale_v),
+            Multiplier(name, out, divisor, node, scale_v),
             Resistor(f"R{number}X", node, junction, ohm),
-            capacitor,
+            Capacitor(f"C{number}", junction, out, _LOOP_FARAD),
         ]
-        ideal: list[Element] = [replace(capacitor, farad=_IDEAL_LOOP[0] * _LOOP_FARAD)]
         if is_root:  # The diode bars the other root, where the loop would latch up.
             ends = (junction, out) if sign > 0 else (out, junction)
-            diode = DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM)
-            self._elements.append(diode)
-            ideal.append(replace(diode, threshold_v=_IDEAL_LOOP[1] * _BARRED_V))
+            self._elements.append(DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM))
         else:
             self._elements.append(Resistor(f"R{number}FB", junction, out, _OFF_OHM))
-            cords.append(PatchedCord(stage.cords[1], self._nodes[other, other_sign], other_sign, 1.0, 1, name))
-        self._loops[f"U{number}"] = ideal
+            cords.append(PatchedCord(stage.cords[1], divisor, other_sign, 1.0, 1, name))
+        law, y = (Law.ROOT, node) if is_root else (Law.QUOTIENT, divisor)
+        self._ideal[f"U{number}"] = {
+            name: Multiplier(name, node, y, out, scale_v, law=law, sign=sign),
+            f"C{number}": None,
+            f"L{number}": None,
+            f"R{number}FB": None,
+            f"U{number}": OpAmp(f"U{number}", GROUND, junction, node, IDEAL),
+        }
         return self._amplifier(stage, cords)
 
     def _multiplier(self, stage: PatchStage) -> PatchedElement:
