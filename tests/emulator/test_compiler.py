@@ -110,7 +110,7 @@ def dials_of(program: PatchedProgram, values: dict[str, float]) -> dict[str, flo
     }
 
 
-# ---- linear programs, played
+# ---- programs, played
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -182,7 +182,7 @@ def test_a_divider_follows_a_sine() -> None:
 @pytest.mark.parametrize("rate_hz", [500.0, 100e3])
 @pytest.mark.parametrize("name", DIVIDING)
 def test_loops_that_are_faster_than_the_shortest_step_settle(name: str, rate_hz: float) -> None:
-    # At 500 Hz a tick is ten times as long as a loop of ideal parts.
+    # At 500 Hz a tick is a hundred times as long as the fastest loop of ideal parts.
     one, other = (SuspensionComputer(dividing(name), opamp=amp, sample_rate_hz=rate_hz) for amp in ("ideal", "tl07x"))
     excitation = Excitation(low_v=-10.0, frequency_hz=rate_hz / 100.0)
     ideal, real = (np.concatenate(list(computer.play(excitation, 150))) for computer in (one, other))

@@ -62,7 +62,7 @@ _BARRED_V = 0.05
 _IDEAL_LOOP = 1e-5, 1e-4
 """Parts of that capacitor and of that voltage with an ideal amplifier, which needs neither.
 
-The loop is late by 5 ps times 10 V over the divisor's voltage.
+The loop is late by 5 ps, with resistors of 100k by 50 ps, times 10 V over the divisor's voltage.
 """
 
 _OFF_OHM = 1e12
