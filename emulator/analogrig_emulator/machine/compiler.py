@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import assert_never
 
 from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
@@ -273,8 +274,7 @@ class _Scaling:
         for name, quantity in equations.states.items():
             self.found[name] = self._declared(f"states.{name}", name, quantity.full)
         for stage in self.stages.stages:
-            if stage.kind is not StageKind.INTEGRATOR:
-                self.found[stage.name] = self._full(stage)
+            self.found[stage.name] = self._full(stage)
         return self.found
 
     def _declared(self, place: str, name: str, full: float | None) -> float:
@@ -293,13 +293,19 @@ class _Scaling:
 
     def _full(self, stage: PatchStage) -> float:
         sources = [self.found[cord.source] for cord in stage.cords]
-        if stage.kind in (StageKind.RECTIFIER, StageKind.PRODUCT):
-            return math.prod(sources)
-        if stage.kind is StageKind.ROOT:
-            return math.sqrt(sources[0])
-        declared = self.stages.equations.signals.get(stage.name)
-        full = self._declared(stage.place, stage.name, declared.full if declared else None)
-        return full if declared and declared.full else self._raised(stage, full, sources)
+        match stage.kind:
+            case StageKind.INTEGRATOR:
+                return self.found[stage.name]
+            case StageKind.RECTIFIER | StageKind.PRODUCT:
+                return math.prod(sources)
+            case StageKind.ROOT:
+                return math.sqrt(sources[0])
+            case StageKind.SUMMER | StageKind.QUOTIENT | StageKind.FUNCTION:
+                declared = self.stages.equations.signals.get(stage.name)
+                full = self._declared(stage.place, stage.name, declared.full if declared else None)
+                return full if declared and declared.full else self._raised(stage, full, sources)
+            case _:
+                assert_never(stage.kind)
 
     def _raised(self, stage: PatchStage, full: float, sources: Sequence[float]) -> float:
         """Full scale raised until no coefficient exceeds 10."""
@@ -390,17 +396,15 @@ class _Patcher:
         """Give every output its node."""
         for place, name in enumerate(self._inputs):
             self._nodes[name, 1] = "in" if not place else f"in{place + 1}"
-        counts = {StageKind.PRODUCT: 0, StageKind.FUNCTION: 0}
-        amplifiers = itertools.count(1)
+        counts: Counter[str] = Counter()
         for stage in rows:
-            if stage.kind in counts:
-                counts[stage.kind] += 1
-                self._nodes[stage.name, self._signs[stage.name]] = f"{_LETTERS[stage.kind]}{counts[stage.kind]}".lower()
-            else:
-                self._amplifiers[stage.name] = number = next(amplifiers)
-                self._nodes[stage.name, self._signs[stage.name]] = f"u{number}"
-        for name in inverters:
-            self._inverters[name] = number = next(amplifiers)
+            letter = stage.kind.letter
+            counts[letter] += 1
+            self._nodes[stage.name, self._signs[stage.name]] = f"{letter}{counts[letter]}".lower()
+            if stage.kind.has_amplifier:
+                self._amplifiers[stage.name] = counts[letter]
+        for number, name in enumerate(inverters, len(self._amplifiers) + 1):
+            self._inverters[name] = number
             self._nodes[name, -self._signs[name]] = f"u{number}"
 
     def _users(self, rows: Sequence[PatchStage]) -> Counter[str]:
@@ -442,7 +446,10 @@ class _Patcher:
                 return self._summer(stage)
             case StageKind.RECTIFIER:
                 return self._rectifier(stage)
-        return self._loop(stage)
+            case StageKind.QUOTIENT | StageKind.ROOT:
+                return self._loop(stage)
+            case _:
+                assert_never(stage.kind)
 
     def _summer(self, stage: PatchStage) -> PatchedElement:
         cords = [self._cord(stage, place, self._ratio(stage, cord)) for place, cord in enumerate(stage.cords)]
@@ -604,9 +611,6 @@ class _Patcher:
             f"delete the term, lower the full scale of {_clipped(stage.name)}, or let it move more in the trial "
             "(speed, period_s)"
         )
-
-
-_LETTERS = {StageKind.PRODUCT: "X", StageKind.FUNCTION: "D"}
 
 
 def _clipped(formula: str) -> str:

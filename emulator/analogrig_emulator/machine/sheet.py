@@ -8,7 +8,7 @@ from typing import NamedTuple
 from analogrig_emulator.circuit.circuit import Pot, Resistor
 from analogrig_emulator.circuit.pot import dial_for
 from analogrig_emulator.machine.compiler import PatchedCord, PatchedElement, PatchedProgram
-from analogrig_emulator.machine.stages import StageKind, is_atom
+from analogrig_emulator.machine.stages import is_atom
 
 
 def scaling_sheet(program: PatchedProgram) -> str:
@@ -53,7 +53,7 @@ def _elements(program: PatchedProgram) -> Iterator[Sequence[str]]:
     yield "element", "kind", "output", "full scale", "input", "from", "pot", "gain", "capacitor"
     for element in program.patch:
         output = signed(element.sign, element.stage.name)
-        head = (element.name, element.stage.kind.value, output, f"{element.full:g}")
+        head = (element.name, element.stage.kind.title, output, f"{element.full:g}")
         farad = f"{element.farad * 1e9:g} nF" if element.farad else ""
         for cord in element.cords:
             yield *head, input_text(element, cord), cord.node, cord.pot, _gain(element, cord), farad
@@ -87,13 +87,13 @@ def signed(sign: int, quantity: str) -> str:
 
 def input_text(element: PatchedElement, cord: PatchedCord) -> str:
     """Term of an input; for elements without coefficients the source with its sign."""
-    if element.stage.kind in (StageKind.INTEGRATOR, StageKind.SUMMER):
+    if element.stage.kind.adds:
         return cord.cord.text
     return signed(cord.sign, cord.cord.source)
 
 
 def _gain(element: PatchedElement, cord: PatchedCord) -> str:
-    return "" if element.stage.kind in (StageKind.PRODUCT, StageKind.FUNCTION) else str(cord.gain)
+    return str(cord.gain) if element.stage.kind.has_amplifier else ""
 
 
 def _pots(program: PatchedProgram) -> Iterator[Sequence[str]]:
