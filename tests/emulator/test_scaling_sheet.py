@@ -33,7 +33,7 @@ def test_sheet_has_what_an_operator_needs() -> None:
 
 def test_dials_of_the_sheet_are_those_of_the_machine() -> None:
     program = load_program(FOLDER / "dc-motor.toml")
-    assert SuspensionComputer(program).dials == pytest.approx(dials(program))
+    assert SuspensionComputer(program).dials == pytest.approx(dials(program, program.values))
 
 
 @pytest.mark.parametrize("stem", sorted(path.stem for path in FOLDER.glob("*.toml")))

@@ -148,12 +148,16 @@ class PatchedProgram(ProgramCircuit):
         return self.equations.channels
 
     @functools.cached_property
+    def places(self) -> Mapping[str, tuple[str, int]]:
+        """Node and sign there of every quantity."""
+        elements = {each.stage.name: (each.node, each.sign) for each in self.patch}
+        return elements | {name: (node, 1) for name, node in self.input_nodes.items()}
+
+    @functools.cached_property
     def scales(self) -> Scales:
-        places = {each.stage.name: (each.node, each.sign) for each in self.patch}
-        places |= {name: (node, 1) for name, node in self.input_nodes.items()}
         return Scales(
             self.equations.speed,
-            {name: Scale(*places[name], self.fulls[name]) for name in self.equations.quantities},
+            {name: Scale(*self.places[name], self.fulls[name]) for name in self.equations.quantities},
         )
 
     @functools.cached_property

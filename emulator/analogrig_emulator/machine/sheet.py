@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from analogrig_emulator.circuit.circuit import Pot, Resistor
 from analogrig_emulator.circuit.pot import dial_for
 from analogrig_emulator.machine.compiler import PatchedCord, PatchedElement, PatchedProgram
 from analogrig_emulator.machine.stages import is_atom
@@ -30,13 +29,11 @@ def diagram_lines(program: PatchedProgram) -> list[str]:
     return [f"This patch is compiled from the equations; a run plays the diagram {diagram}."] if diagram else []
 
 
-def dials(program: PatchedProgram) -> dict[str, float]:
-    """Dials of nominal pots for the values of the file."""
-    loads_ohm = {each.name: each.ohm for each in program.elements if isinstance(each, Resistor)}
-    tracks_ohm = {each.name: each.track_ohm for each in program.elements if isinstance(each, Pot)}
+def dials(program: PatchedProgram, values: Mapping[str, float]) -> dict[str, float]:
+    """Dials of nominal pots for values of the parameters."""
     return {
-        pot: dial_for(program.pot_coefficient(pot, program.values), tracks_ohm[pot], loads_ohm[row.load], pot)
-        for pot, row in program.pots.items()
+        pot: dial_for(program.pot_coefficient(pot, values), *ohms, pot)
+        for pot, ohms in program.pot_ohms(program.elements).items()
     }
 
 
@@ -74,10 +71,8 @@ class Inverter(NamedTuple):
 
 def inverters(program: PatchedProgram) -> Iterator[Inverter]:
     """Inverters of a patch, in the order of their amplifiers."""
-    places = {each.stage.name: (each.node, each.sign) for each in program.patch}
-    places |= {name: (node, 1) for name, node in program.input_nodes.items()}
     for quantity, name in program.inverters.items():
-        yield Inverter(name, quantity, *places[quantity])
+        yield Inverter(name, quantity, *program.places[quantity])
 
 
 def signed(sign: int, quantity: str) -> str:
@@ -98,7 +93,7 @@ def _gain(element: PatchedElement, cord: PatchedCord) -> str:
 
 def _pots(program: PatchedProgram) -> Iterator[Sequence[str]]:
     yield "pot", "coefficient", "dial", "turned by"
-    at = dials(program)
+    at = dials(program, program.values)
     for pot, row in program.pots.items():
         coefficient = program.pot_coefficient(pot, program.values)
         yield pot, f"{coefficient:.4f}", f"{at[pot]:.4f}", ", ".join(row.settings) or "nothing"

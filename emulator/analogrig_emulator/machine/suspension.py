@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.recorded import RecordedExcitation
-from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
+from analogrig_emulator.circuit.circuit import Circuit
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
@@ -322,11 +322,9 @@ def _nominal(program: ProgramCircuit, model: OpAmpModel) -> tuple[Circuit, _Load
 
 
 def _pots(program: ProgramCircuit, circuit: Circuit, components: Components) -> _LoadedPots:
-    loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
-    tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
-        pot: _LoadedPot(components.pots.model(tracks_ohm[pot]), pot, loads_ohm[row.load])
-        for pot, row in program.pots.items()
+        pot: _LoadedPot(components.pots.model(track_ohm), pot, load_ohm)
+        for pot, (track_ohm, load_ohm) in program.pot_ohms(circuit.elements).items()
     }
 
 

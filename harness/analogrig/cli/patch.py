@@ -84,7 +84,9 @@ def _patch(arguments: argparse.Namespace) -> int:
         files: dict[str, Any] = {"files": [str(path) for path in wanted]}
         if that is not None:
             files |= {"speed": that.speed, "slow": that.slow, "cables": [vars(cable) for cable in that.cables]}
-        show_result({"program": program.name, "full": full, "dials": dials(program), **files}, arguments)
+        show_result(
+            {"program": program.name, "full": full, "dials": dials(program, program.values), **files}, arguments
+        )
     else:
         show_plain((scaling_sheet(program) if that is None else that.text()).rstrip("\n"))
         if that is None:
