@@ -205,7 +205,7 @@ class PatchedProgram(ProgramCircuit):
         ]
 
 
-def wired(equations: Equations) -> ProgramCircuit:
+def circuit_of(equations: Equations) -> ProgramCircuit:
     """Circuit that solves the equations: that of the diagram that the file names, or else their patch.
 
     Raises ProgramError like compile_program(), and for an unknown diagram or one with other parameters and channels.
@@ -224,8 +224,11 @@ def wired(equations: Equations) -> ProgramCircuit:
     return program
 
 
-def load_program(path: str | Path) -> PatchedProgram:
-    """Program of a file, compiled. Raises ProgramError that names the file, the place and the cure."""
+def load_patch(path: str | Path) -> PatchedProgram:
+    """Patch that solves the equations of a program file, also if the file names a diagram.
+
+    Raises ProgramError that names the file, the place and the cure.
+    """
     equations = read_program(path)
     try:
         return compile_program(equations)

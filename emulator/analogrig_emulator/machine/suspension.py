@@ -332,7 +332,7 @@ def _program(program: str | ProgramCircuit) -> ProgramCircuit:
     if isinstance(program, ProgramCircuit):
         return program
     if program not in PROGRAMS:
-        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_program(file)")
+        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_patch(file)")
     return PROGRAMS[program]
 
 
