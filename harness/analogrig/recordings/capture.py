@@ -25,7 +25,7 @@ from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
-    from analogrig.rigs.rig import Rig
+    from analogrig.rigs.rig import Performance, Rig
 
 _MOST_NAMED = 3
 
@@ -42,8 +42,8 @@ def import_run(
 ) -> Run:
     """Run of a CAN log, with the truth of ``scenario`` and the units of ``rig``.
 
-    Samples without codes or without all of their answers are LOST; those without codes are also missing. Velocity and
-    net force are not transmitted: their codes are zero and marked as clipped.
+    Samples without codes or without all of their answers are LOST; those without codes are also missing. Channels
+    other than input and output are not transmitted: their codes are zero and marked as clipped.
 
     :param dbc: DBC of the log, if it differs from the catalogue of this build.
     :param device: device with messages of its own, to which the log belongs.
@@ -54,14 +54,7 @@ def import_run(
     """
     frames = CapturedFrames(path)
     performance = rig.perform(scenario, 0)
-    try:
-        decoder: CaptureDecoding = (
-            CaptureDecoder(FrameDictionary(dbc), frames)
-            if device is None
-            else EcuDecoder(device, performance.of_device, frames, most_n=scenario.samples)
-        )
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    decoder = _decoder(frames, dbc, device, performance, scenario.samples)
     captured = _select_run(decoder, frames, number)
     if captured.extent > scenario.samples:
         raise ConfigurationError(
@@ -92,6 +85,18 @@ def import_run(
             program=scenario.program,
         )
     )
+
+
+def _decoder(
+    frames: CapturedFrames, dbc: Path | None, device: CanDbcDevice | None, performance: Performance, most_n: int
+) -> CaptureDecoding:
+    """Decoder of a log's messages: the catalogue's, or those of a device with messages of its own."""
+    try:
+        if device is None:
+            return CaptureDecoder(FrameDictionary(dbc), frames)
+        return EcuDecoder(device, performance.of_device, frames, most_n=most_n)
+    except RecordingError as error:
+        raise RecordingError(f"{frames.path}: {error}") from error
 
 
 def _plausible_counters(captured: CapturedRun, answers: Answers) -> Mapping[str, int]:
