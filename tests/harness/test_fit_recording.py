@@ -221,6 +221,16 @@ def test_a_poor_twin_is_not_kept(recording: Path, tmp_path: Path, capsys: pytest
     assert not twin.exists()
 
 
+def test_a_program_that_a_run_refuses_is_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program, text = tmp_path / "box.toml", (fixtures() / "programs" / "silverbox.toml").read_text()
+    program.write_text(text.replace("gain = {", 'gain = { alias = "sample",'))
+    command = ["calibrate", "--recording", str(recording), "--program", str(program)]
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 2
+    assert "box.toml: parameters.gain.alias: sample is a key of scenarios' changes" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
