@@ -30,7 +30,7 @@ from analogrig_emulator import (
     Multiplier,
     PatchedProgram,
     SuspensionComputer,
-    load_program,
+    load_patch,
 )
 from tests.emulator.test_compiler import levels_v
 
@@ -113,7 +113,7 @@ class Played:
     @classmethod
     def of(cls, name: str, samples: int = SAMPLES) -> Played:
         """A shipped program with AD633 multipliers."""
-        program = load_program(fixtures() / "programs" / f"{name}.toml")
+        program = load_patch(fixtures() / "programs" / f"{name}.toml")
         model = MULTIPLIERS["ad633"]
         elements = (replace(each, model=model) if isinstance(each, Multiplier) else each for each in program.elements)
         return cls(replace(program, elements=tuple(elements)), samples)

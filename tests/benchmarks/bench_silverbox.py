@@ -20,7 +20,7 @@ from analogrig.reporting.measured import Oscillation, mode_of
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
-from analogrig_emulator import CHANNELS, PatchedProgram, load_program
+from analogrig_emulator import CHANNELS, PatchedProgram, load_patch
 from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.program_file import parse_program
 
@@ -59,7 +59,7 @@ def figures() -> Iterator[Figure]:
     except FileNotFoundError as absent:
         print(f"silverbox is skipped: {absent}")
         return
-    program = load_program(fixtures() / "programs" / "silverbox.toml")
+    program = load_patch(fixtures() / "programs" / "silverbox.toml")
     for name, (computer, seed) in MACHINES.items():
         yield from _fitted(name, program, run, computer, seed)
     yield from _fitted("linear, nominal parts", linear(program), run, ComputerDescription(), 0)

@@ -17,17 +17,15 @@ from analogrig_emulator import (
     Engine,
     Excitation,
     OpAmp,
-    Pot,
     PotError,
     PotTurn,
-    Resistor,
     SuspensionComputer,
 )
 from analogrig_emulator.circuit.nodal import piecewise_linear
-from analogrig_emulator.circuit.pot import dial_for
 from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.compiler import INPUT_OHM, MACHINE_V, PatchedProgram, compile_program
 from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.sheet import dials
 from analogrig_emulator.machine.stages import StageKind, stages_of
 from analogrig_emulator.machine.trial import reaches, settings
 from tests.emulator.ideal_patch import IdealPatch
@@ -74,7 +72,7 @@ def assert_slopes(program: PatchedProgram, rng: np.random.Generator) -> None:
     slopes = equations.slopes()
     every = list(settings(equations))
     for values in (every[0], every[int(rng.integers(len(every)))]):
-        patch = IdealPatch(program.elements, dials_of(program, values))
+        patch = IdealPatch(program.elements, dials(program, values))
         quantities = {
             name: np.float64(rng.uniform(0.1 * reach.low + 0.9 * middle, 0.9 * middle + 0.1 * reach.high))
             for name, reach in program.reach.items()
@@ -101,16 +99,7 @@ def outputs_of(program: PatchedProgram) -> list[str]:
     return [each.out for each in program.elements if hasattr(each, "out")]
 
 
-def dials_of(program: PatchedProgram, values: dict[str, float]) -> dict[str, float]:
-    loads = {each.name: each.ohm for each in program.elements if isinstance(each, Resistor)}
-    tracks = {each.name: each.track_ohm for each in program.elements if isinstance(each, Pot)}
-    return {
-        pot: dial_for(program.pot_coefficient(pot, values), tracks[pot], loads[row.load], pot)
-        for pot, row in program.pots.items()
-    }
-
-
-# ---- linear programs, played
+# ---- programs, played
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -417,4 +406,4 @@ def test_parameter_without_pot_cannot_be_set() -> None:
 def test_pots_reach_the_ends_of_every_range(name: str) -> None:
     program = program_of(name)
     for values in settings(program.equations):
-        assert all(0 <= dial <= 1 for dial in dials_of(program, values).values())
+        assert all(0 <= dial <= 1 for dial in dials(program, values).values())

@@ -48,6 +48,11 @@ _WRAP = 8
 LIMITLESS = 1e99
 """Infinity in a deck."""
 
+_PRODUCT = """\
+V = ((v(x) + {vx}) * ({x1} + {x3} * (v(x) + {vx}) * (v(x) + {vx})))
++ * ((v(y) + {vy}) * ({y1} + {y3} * (v(y) + {vy}) * (v(y) + {vy}))) + {vz}"""
+"""Product of a multiplier. x1, x3 and y1, y3: linear and cubic coefficients of both factors."""
+
 LIBRARY: Mapping[str, str] = MappingProxyType(
     {
         # The capacitance only scales the currents to sizes that ngspice's tolerances suit (mA at full slew). An output
@@ -93,22 +98,20 @@ Blower wiper bottom I = v(wiper, bottom) / (max(v(dial), {END_FRACTION!r}) * {{t
 Roff a b {off}
 Bon a b I = (1 / {on} - 1 / {off}) * max(0, v(a, b) - {threshold})
 .ends""",
-        # x1, x3 and y1, y3: linear and cubic coefficients of both factors. Node inner is the product, state follows it.
+        # Node inner is the product, state follows it.
         "multiplier": f"""\
 .subckt multiplier x y out x1=0.1 x3=0 y1=1 y3=0 vx=0 vy=0 vz=0 rate=6e6 slew=1e99 swing_low=-1e99 swing_high=1e99
 + rout=0
-Bproduct inner 0 V = ((v(x) + {{vx}}) * ({{x1}} + {{x3}} * (v(x) + {{vx}}) * (v(x) + {{vx}})))
-+ * ((v(y) + {{vy}}) * ({{y1}} + {{y3}} * (v(y) + {{vy}}) * (v(y) + {{vy}}))) + {{vz}}
+Bproduct inner 0 {_PRODUCT}
 Cstate state 0 1e-10
 Bstate 0 state I = 1e-10 * (max(-{{slew}}, min({{slew}}, {{rate}} * (v(inner) - v(state))))
 + - {CLAMP_RATE!r} * (max(0, v(state) - {{swing_high}}) + min(0, v(state) - {{swing_low}})))
 Eout behind 0 state 0 1
 Rout behind out {{max(rout, 1e-4)}}
 .ends""",
-        "multiplier_without_pole": """\
+        "multiplier_without_pole": f"""\
 .subckt multiplier_without_pole x y out x1=0.1 x3=0 y1=1 y3=0 vx=0 vy=0 vz=0
-Bproduct out 0 V = ((v(x) + {vx}) * ({x1} + {x3} * (v(x) + {vx}) * (v(x) + {vx})))
-+ * ((v(y) + {vy}) * ({y1} + {y3} * (v(y) + {vy}) * (v(y) + {vy}))) + {vz}
+Bproduct out 0 {_PRODUCT}
 .ends""",
         "divider": """\
 .subckt divider x y out scale=10

@@ -11,6 +11,7 @@
 ///     kernels.c   inner loops, from lanes.h
 ///     noise.c     noise of a linear circuit, independent of the rest
 ///     card.c      steps of a data-acquisition card, independent of the rest
+///     random.c    numpy's random streams, for many seeds at once, independent of the rest
 
 #ifndef ENGINE_STATE_H
 #define ENGINE_STATE_H

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import assert_never
 
 from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
@@ -142,12 +143,16 @@ class PatchedProgram(ProgramCircuit):
         return self.equations.channels
 
     @functools.cached_property
+    def places(self) -> Mapping[str, tuple[str, int]]:
+        """Node and sign there of every quantity."""
+        elements = {each.stage.name: (each.node, each.sign) for each in self.patch}
+        return elements | {name: (node, 1) for name, node in self.input_nodes.items()}
+
+    @functools.cached_property
     def scales(self) -> Scales:
-        places = {each.stage.name: (each.node, each.sign) for each in self.patch}
-        places |= {name: (node, 1) for name, node in self.input_nodes.items()}
         return Scales(
             self.equations.speed,
-            {name: Scale(*places[name], self.fulls[name]) for name in self.equations.quantities},
+            {name: Scale(*self.places[name], self.fulls[name]) for name in self.equations.quantities},
         )
 
     @functools.cached_property
@@ -196,7 +201,7 @@ class PatchedProgram(ProgramCircuit):
         return [replace(each, model=given[each.name]) if isinstance(each, OpAmp) else each for each in elements if each]
 
 
-def wired(equations: Equations) -> ProgramCircuit:
+def circuit_of(equations: Equations) -> ProgramCircuit:
     """Circuit that solves the equations: that of the diagram that the file names, or else their patch.
 
     Raises ProgramError like compile_program(), and for an unknown diagram or one with other parameters and channels.
@@ -215,8 +220,11 @@ def wired(equations: Equations) -> ProgramCircuit:
     return program
 
 
-def load_program(path: str | Path) -> PatchedProgram:
-    """Program of a file, compiled. Raises ProgramError that names the file, the place and the cure."""
+def load_patch(path: str | Path) -> PatchedProgram:
+    """Patch that solves the equations of a program file, also if the file names a diagram.
+
+    Raises ProgramError that names the file, the place and the cure.
+    """
     equations = read_program(path)
     try:
         return compile_program(equations)
@@ -269,8 +277,7 @@ class _Scaling:
         for name, quantity in equations.states.items():
             self.found[name] = self._declared(f"states.{name}", name, quantity.full)
         for stage in self.stages.stages:
-            if stage.kind is not StageKind.INTEGRATOR:
-                self.found[stage.name] = self._full(stage)
+            self.found[stage.name] = self._full(stage)
         return self.found
 
     def _declared(self, place: str, name: str, full: float | None) -> float:
@@ -289,13 +296,19 @@ class _Scaling:
 
     def _full(self, stage: PatchStage) -> float:
         sources = [self.found[cord.source] for cord in stage.cords]
-        if stage.kind in (StageKind.RECTIFIER, StageKind.PRODUCT):
-            return math.prod(sources)
-        if stage.kind is StageKind.ROOT:
-            return math.sqrt(sources[0])
-        declared = self.stages.equations.signals.get(stage.name)
-        full = self._declared(stage.place, stage.name, declared.full if declared else None)
-        return full if declared and declared.full else self._raised(stage, full, sources)
+        match stage.kind:
+            case StageKind.INTEGRATOR:
+                return self.found[stage.name]
+            case StageKind.RECTIFIER | StageKind.PRODUCT:
+                return math.prod(sources)
+            case StageKind.ROOT:
+                return math.sqrt(sources[0])
+            case StageKind.SUMMER | StageKind.QUOTIENT | StageKind.FUNCTION:
+                declared = self.stages.equations.signals.get(stage.name)
+                full = self._declared(stage.place, stage.name, declared.full if declared else None)
+                return full if declared and declared.full else self._raised(stage, full, sources)
+            case _:
+                assert_never(stage.kind)
 
     def _raised(self, stage: PatchStage, full: float, sources: Sequence[float]) -> float:
         """Full scale raised until no coefficient exceeds 10."""
@@ -386,17 +399,15 @@ class _Patcher:
         """Give every output its node."""
         for place, name in enumerate(self._inputs):
             self._nodes[name, 1] = "in" if not place else f"in{place + 1}"
-        counts = {StageKind.PRODUCT: 0, StageKind.FUNCTION: 0}
-        amplifiers = itertools.count(1)
+        counts: Counter[str] = Counter()
         for stage in rows:
-            if stage.kind in counts:
-                counts[stage.kind] += 1
-                self._nodes[stage.name, self._signs[stage.name]] = f"{_LETTERS[stage.kind]}{counts[stage.kind]}".lower()
-            else:
-                self._amplifiers[stage.name] = number = next(amplifiers)
-                self._nodes[stage.name, self._signs[stage.name]] = f"u{number}"
-        for name in inverters:
-            self._inverters[name] = number = next(amplifiers)
+            letter = stage.kind.letter
+            counts[letter] += 1
+            self._nodes[stage.name, self._signs[stage.name]] = f"{letter}{counts[letter]}".lower()
+            if stage.kind.has_amplifier:
+                self._amplifiers[stage.name] = counts[letter]
+        for number, name in enumerate(inverters, len(self._amplifiers) + 1):
+            self._inverters[name] = number
             self._nodes[name, -self._signs[name]] = f"u{number}"
 
     def _users(self, rows: Sequence[PatchStage]) -> Counter[str]:
@@ -438,7 +449,10 @@ class _Patcher:
                 return self._summer(stage)
             case StageKind.RECTIFIER:
                 return self._rectifier(stage)
-        return self._loop(stage)
+            case StageKind.QUOTIENT | StageKind.ROOT:
+                return self._loop(stage)
+            case _:
+                assert_never(stage.kind)
 
     def _summer(self, stage: PatchStage) -> PatchedElement:
         cords = [self._cord(stage, place, self._ratio(stage, cord)) for place, cord in enumerate(stage.cords)]
@@ -607,9 +621,6 @@ class _Patcher:
             f"delete the term, lower the full scale of {_clipped(stage.name)}, or let it move more in the trial "
             "(speed, period_s)"
         )
-
-
-_LETTERS = {StageKind.PRODUCT: "X", StageKind.FUNCTION: "D"}
 
 
 def _clipped(formula: str) -> str:

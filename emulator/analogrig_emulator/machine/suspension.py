@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.recorded import RecordedExcitation
-from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
+from analogrig_emulator.circuit.circuit import Circuit
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
@@ -25,7 +25,7 @@ from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 
 PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
-"""Programs wired by hand, by name. Others are compiled from files."""
+"""Circuits wired by hand, by the name of their program. Others are compiled from files."""
 
 BLOCK_SAMPLES = 32768
 """Default block, 1 MB: in smaller blocks the calls cost more than a quiet stretch."""
@@ -34,7 +34,7 @@ BLOCK_SAMPLES = 32768
 class SuspensionComputer:
     """Machine wired with a program.
 
-    program: a name in PROGRAMS or a Program. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
+    program: a name in PROGRAMS or a ProgramCircuit. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
     components: real components for the program's diagram; Components(given=...) sets single deviations.
     Pots are set to the program's values, with the real load connected.
     rng, offset_v: with an rng, each op-amp has an offset uniform within +-offset_v, drawn from U1 on.
@@ -136,9 +136,10 @@ class SuspensionComputer:
         block_samples: int = BLOCK_SAMPLES,
         ahead_ticks: int = 0,
     ) -> Iterator[NDArray[np.float64]]:
-        """Play from rest; yield the volts of CHANNELS in blocks: float64 (block_samples or, last, fewer; 4).
+        """Play from rest; yield the volts of the channels in blocks: float64 (block_samples or, last, fewer; channels).
 
-        If ahead_ticks is not 0, a row has 8 volts: those of the sample, and those so many ticks later, as for Engine.
+        If ahead_ticks is not 0, a row has twice as many volts: those of the sample, and those so many ticks later, as
+        for Engine.
 
         The excitation's first level or sample applies at sample 0. A change takes effect right after its sample is
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
@@ -321,11 +322,9 @@ def _nominal(program: ProgramCircuit, model: OpAmpModel) -> tuple[Circuit, _Load
 
 
 def _pots(program: ProgramCircuit, circuit: Circuit, components: Components) -> _LoadedPots:
-    loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
-    tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
-        pot: _LoadedPot(components.pots.model(tracks_ohm[pot]), pot, loads_ohm[row.load])
-        for pot, row in program.pots.items()
+        pot: _LoadedPot(components.pots.model(track_ohm), pot, load_ohm)
+        for pot, (track_ohm, load_ohm) in program.pot_ohms(circuit.elements).items()
     }
 
 
@@ -333,7 +332,7 @@ def _program(program: str | ProgramCircuit) -> ProgramCircuit:
     if isinstance(program, ProgramCircuit):
         return program
     if program not in PROGRAMS:
-        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_program(file)")
+        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_patch(file)")
     return PROGRAMS[program]
 
 

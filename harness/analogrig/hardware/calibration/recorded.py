@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.calibration.averages import noise_variance
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.recordings.capture import in_units
+from analogrig.recordings.program_units import in_units
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import (
