@@ -42,7 +42,7 @@ Each row is a machine with the program `silverbox`. `analogrig calibrate` fits i
 samples {FITTED[0]:,} to {FITTED[1]:,} alone, the multisines. It then plays the arrow head, samples 0 to
 {GROWTH_END:,}, with the recorded input, and never sees the recorded output. The first 200 samples of
 either are not compared. The amplifiers are TL07x (`--op-amp tl07x`). Real parts are polyester
-capacitors, 1 % resistors, and multipliers with the errors of the AD633's data sheet. The pots are
+capacitors, 1 % resistors, and AD633 multipliers with drawn errors. The pots are
 continuous.
 
 The linear rows leave out the multipliers: the best that a mass, a damper and a linear spring do.

@@ -551,6 +551,7 @@ COMPONENTS: Mapping[str, Components] = MappingProxyType(
             dielectric=DIELECTRICS["polyester"],
             op_amps=OP_AMP_GRADES["tl07x"],
             pots=_TEN_TURN,
+            multipliers=MULTIPLIER_GRADES["ad633"],
         ),
         "polypropylene": Components(
             resistors=_METAL_FILM,
@@ -558,7 +559,8 @@ COMPONENTS: Mapping[str, Components] = MappingProxyType(
             dielectric=DIELECTRICS["polypropylene"],
             op_amps=OP_AMP_GRADES["tl07x"],
             pots=_TEN_TURN,
+            multipliers=MULTIPLIER_GRADES["ad633"],
         ),
     }
 )
-"""Components by name: 1 % metal film, ten-turn wire-wound pots, TL07x, and 5 % or 1 % film capacitors."""
+"""Components by name: 1 % metal film, ten-turn wire-wound pots, TL07x, AD633, and 5 % or 1 % film capacitors."""

@@ -16,9 +16,10 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.circuit.circuit import Circuit
 from analogrig_emulator.circuit.components import NOMINAL, Components
+from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
-from analogrig_emulator.engine.system import Edges, is_integer
+from analogrig_emulator.engine.system import Edges, Law, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
 from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
@@ -35,7 +36,8 @@ class SuspensionComputer:
     """Machine wired with a program.
 
     program: a name in PROGRAMS or a ProgramCircuit. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
-    components: real components for the program's diagram; Components(given=...) sets single deviations.
+    multiplier: model of every multiplier. components: real components for the program's diagram;
+    Components(given=...) sets single deviations.
     Pots are set to the program's values, with the real load connected.
     rng, offset_v: with an rng, each op-amp has an offset uniform within +-offset_v, drawn from U1 on.
     machine: the AnalogComputer, for operation by hand. The program's integrators (front: U2 and U3, at +velocity and
@@ -48,6 +50,7 @@ class SuspensionComputer:
         program: str | ProgramCircuit = "front",
         *,
         opamp: str | OpAmpModel = "tl07x",
+        multiplier: MultiplierModel = MULTIPLIERS["ideal"],
         components: Components = NOMINAL,
         rng: np.random.Generator | None = None,
         offset_v: float = 3e-3,
@@ -58,12 +61,12 @@ class SuspensionComputer:
         model, count = _model(opamp, offset_v), self.program.amplifiers
         offsets_v = None if rng is None else drawn_offsets_v(model, rng.random(count), offset_v).tolist()
         if components.is_perfect and isinstance(self.program, Hashable):
-            circuit, self._pots = _nominal(self.program, model)
+            circuit, self._pots = _nominal(self.program, model, multiplier)
             if offsets_v is not None:
                 circuit = circuit.with_offsets({f"U{i}": vos_v for i, vos_v in enumerate(offsets_v, 1)})
         else:
             models = [replace(model, vos_v=vos_v) for vos_v in offsets_v or [model.vos_v] * count]
-            circuit, self._pots = _wired(self.program, models, components)
+            circuit, self._pots = _wired(self.program, models, multiplier, components)
         self.machine = AnalogComputer(
             circuit,
             self.program.channel_nodes,
@@ -308,17 +311,22 @@ _LoadedPots: TypeAlias = dict[str, _LoadedPot]
 
 
 def _wired(
-    program: ProgramCircuit, models: Sequence[OpAmpModel], components: Components
+    program: ProgramCircuit, models: Sequence[OpAmpModel], multiplier: MultiplierModel, components: Components
 ) -> tuple[Circuit, _LoadedPots]:
-    """Circuit of a program with these op-amps and components, and its pots."""
-    circuit = Circuit(components.fit(program.netlist(models)))
+    """Circuit of a program with these op-amps, multipliers and components, and its pots."""
+    netlist = program.netlist(models)
+    fitted = [
+        replace(each, model=multiplier) if isinstance(each, Multiplier) and each.law is Law.PRODUCT else each
+        for each in netlist
+    ]
+    circuit = Circuit(components.fit(fitted))
     return circuit, _pots(program, circuit, components)
 
 
 @functools.lru_cache(maxsize=8)
-def _nominal(program: ProgramCircuit, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
+def _nominal(program: ProgramCircuit, model: OpAmpModel, multiplier: MultiplierModel) -> tuple[Circuit, _LoadedPots]:
     """The same with perfect components. Equal machines share their circuit, and with it its equations."""
-    return _wired(program, [model] * program.amplifiers, NOMINAL)
+    return _wired(program, [model] * program.amplifiers, multiplier, NOMINAL)
 
 
 def _pots(program: ProgramCircuit, circuit: Circuit, components: Components) -> _LoadedPots:
