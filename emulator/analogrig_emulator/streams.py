@@ -34,14 +34,13 @@ def normals(seeds: Sequence[int], stream: int, shape: tuple[int, ...]) -> NDArra
 
 
 @functools.cache
-def _ziggurat() -> tuple[int, NDArray[np.float64], NDArray[np.uint64]]:
+def _ziggurat() -> tuple[int | None, NDArray[np.float64], NDArray[np.uint64]]:
     """Address of numpy's function for normal numbers, and the widths and limits of its boxes.
 
     Numpy exports the function for such use (Extending via CFFI).
     """
     function = ctypes.CDLL(_generator.__file__).random_standard_normal
     address, width, limit = ctypes.cast(function, ctypes.c_void_p).value, np.empty(256), np.empty(256, np.uint64)
-    assert address
     library.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
     return address, width, limit
 

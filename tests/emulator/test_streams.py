@@ -30,10 +30,7 @@ def test_many_normal_numbers_are_those_of_numpy() -> None:
 
 
 def test_a_function_that_makes_numbers_otherwise_is_asked_for_each() -> None:
-    @ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)
-    def normal(_: int) -> float:
-        return 0.25
-
+    normal = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)(lambda _: 0.25)
     address = ctypes.cast(normal, ctypes.c_void_p)
     width, limit, states, out = np.empty(256), np.ones(256, np.uint64), np.array([1, 2, 3, 5], np.uint64), np.empty(9)
     library.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
