@@ -165,6 +165,18 @@ typedef struct {
     /// Look from the origin at ever later instants until `clear` is at a tick or beyond, or there is no further look. Stop at
     /// a step that is not CLEAR.
     judgement_t (*look_on)(engine_t* self, int64_t tick);
+
+    /// engine_see() of a card of PANEL channels that holds nothing. Return NaN if a voltage is not finite, else 0.
+    double (*see)(int64_t samples, const double* card, const double* volts, const double* normals, double* seen);
+
+    /// engine_convert() without levels, limited to `most`; count is a multiple of PANEL.
+    void (*convert)(int64_t       count,
+                    double        most,
+                    unsigned      stuck_high,
+                    unsigned      stuck_low,
+                    const double* seen,
+                    uint16_t*     codes,
+                    uint8_t*      clipped);
 } kernels_t;
 
 /// See engine_drive(); terms is NULL without one.
