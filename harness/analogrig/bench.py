@@ -39,7 +39,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _INTERRUPTED_BY = "interrupted by "
 """Start of the fault of an interrupted run; the name of the signal follows."""
 
-DIRECT_BLOCK_SAMPLES = 16_384
+DIRECT_BLOCK_SAMPLES = 32_768
 """Block length in samples of a direct bench; such blocks fit in the cache."""
 
 
