@@ -66,9 +66,11 @@ typedef struct {
     double* block;
     int     rank;
     int     least_level;
-    int64_t ahead;    // that of the engine for which y was built
-    bool    certain;  // s comes to rest, and energy bounds how far w strays until then
-    int     row[ENGINE_MAX_STATES];
+    int64_t ahead;   // that of the engine for which y was built
+    bool is_chosen;  // rank, row, least_level and whether it is certain are those of the mode, whatever its constants
+    int  doublings;  // of a sample period to the instant from which on these states alone matter
+    bool certain;    // s comes to rest, and energy bounds how far w strays until then
+    int  row[ENGINE_MAX_STATES];
     double* change;  // of s in one sample period
     double* leap;    // of s in LEAP sample periods
     int     base;    // |change of s| is so small in 2^base ticks that a series gives it
