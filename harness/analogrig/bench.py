@@ -439,7 +439,7 @@ def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bo
 
     If ``can_be_direct``, the runs are those over the line to the bit, without what needs messages.
 
-    :param alarms_only: omit the estimates, which take a fifth of the time: theta of the runs has no columns.
+    :param alarms_only: omit the estimates, which take a twentieth of the time: theta of the runs has no columns.
     :raises ConfigurationError: the estimator refuses its configuration.
     :raises LinkError: the library of the device was not built.
     """
