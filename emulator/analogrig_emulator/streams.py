@@ -55,7 +55,8 @@ def _ziggurat() -> tuple[int | None, NDArray[np.float64], NDArray[np.uint64]]:
     Numpy exports the function for such use (Extending via CFFI).
     """
     function = ctypes.CDLL(_generator.__file__).random_standard_normal
-    address, width, limit = ctypes.cast(function, ctypes.c_void_p).value, np.empty(256), np.empty(256, np.uint64)
+    address = ctypes.cast(function, ctypes.c_void_p).value or 0
+    width, limit = np.empty(256), np.empty(256, np.uint64)
     library.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
     return address, width, limit
 

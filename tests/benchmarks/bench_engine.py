@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import scipy.interpolate
@@ -83,7 +84,7 @@ class Setting:
     pots: "turned" by a voltage in one run, or resistors that are "altered" where the run stops and resumes.
     """
 
-    method: str
+    method: Literal["trap", "gear"]
     op_amps: str
     points: str
     reltol: float
@@ -91,6 +92,13 @@ class Setting:
     max_step_s: float
     solver: str = "sparse"
     pots: str = "turned"
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """What the deck writer enters of it."""
+        return Accuracy(
+            reltol=self.reltol, vntol_v=1e-6, trtol=self.trtol, max_step_s=self.max_step_s, method=self.method
+        )
 
     def __str__(self) -> str:
         """The setting in words."""
@@ -100,11 +108,12 @@ class Setting:
         )
 
 
+METHODS: tuple[Literal["trap", "gear"], ...] = ("trap", "gear")
 SETTINGS = tuple(
     itertools.starmap(
         Setting,
         itertools.product(
-            ("trap", "gear"),
+            METHODS,
             ("exported", "lean"),
             ("every sample", "start"),
             (1e-3, 1e-4, 1e-6),
@@ -269,16 +278,16 @@ def deck(setting: Setting, samples: int, tweaks: Sequence[PotTurn]) -> str:
         edges={"F": Excitation().edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)},
         turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks],
         nodes=["u5"],
-        accuracy=Accuracy(reltol=setting.reltol, vntol_v=1e-6, trtol=setting.trtol, max_step_s=setting.max_step_s),
+        accuracy=setting.accuracy,
     )
     text = in_setting(text, setting, "U[2-5]")
     return text if setting.pots == "turned" else _with_altered_pots(text, computer, tweaks)
 
 
 def in_setting(text: str, setting: Setting, linear: str) -> str:
-    """The deck in a setting, but for its tolerances. linear: expression of the op-amps without limits."""
-    options = f".options method={setting.method}" + (" klu" if setting.solver == "klu" else "")
-    text = _replaced(r"^(\.options reltol=.*)$", rf"\g<1>\n{options}", text)
+    """The deck in a setting, but for its accuracy. linear: expression of the op-amps without limits."""
+    if setting.solver == "klu":
+        text = _replaced(r"^(\.options reltol=.*)$", r"\g<1>\n.options klu", text)
     if setting.points == "start":
         text = _replaced(r"^(X\S* clock\S* time_points period=)\S+$", r"\g<1>1", text)
     if setting.op_amps != "exported":
@@ -380,10 +389,10 @@ def search(samples: int, tweaks: Sequence[PotTurn]) -> dict[Setting, Simulated]:
     return found
 
 
-def fastest(found: Mapping[Setting, Simulated]) -> list[Setting]:
-    """Settings within TOLERATED_LSB, the fastest first."""
+def fastest(found: Mapping[Setting, Simulated], accuracy_lsb: float = TOLERATED_LSB) -> list[Setting]:
+    """Settings with an error of accuracy_lsb at most, the fastest first."""
     return sorted(
-        (setting for setting, run in found.items() if run.error_lsb <= TOLERATED_LSB),
+        (setting for setting, run in found.items() if run.error_lsb <= accuracy_lsb),
         key=lambda setting: found[setting].spent_s,
     )
 

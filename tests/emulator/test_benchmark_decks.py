@@ -10,6 +10,7 @@ import pytest
 from analogrig_emulator import to_spice
 from tests.benchmarks import bench_engine
 from tests.benchmarks.bench_engine import (
+    METHODS,
     SETTINGS,
     THESIS_TWEAKS,
     TOLERATED_LSB,
@@ -29,8 +30,13 @@ def test_settings_reach_the_deck() -> None:
     texts = {setting: deck(setting, 5, ()) for setting in SETTINGS}
     assert len(set(texts.values())) == len(SETTINGS)
     for setting, text in texts.items():
-        assert f"method={setting.method}" in text
-        assert f"reltol={setting.reltol}" in text
+        given = re.findall(r"(method|reltol|trtol)=(\S+)", text)
+        # The last of two would count.
+        assert sorted(given) == [
+            ("method", setting.method),
+            ("reltol", f"{setting.reltol:g}"),
+            ("trtol", f"{setting.trtol:g}"),
+        ]
         assert re.findall(r"^X\S* clock \S+ period=(\S+)$", text, re.MULTILINE) == [
             "5e-05" if setting.points == "every sample" else "1"
         ]
@@ -58,6 +64,13 @@ def test_fastest_setting_is_one_that_is_accurate() -> None:
     settings = SETTINGS[:3]
     runs = [Simulated(1.0, 2 * TOLERATED_LSB), Simulated(3.0, 0.0), Simulated(2.0, TOLERATED_LSB)]
     assert fastest(dict(zip(settings, runs, strict=True))) == [settings[2], settings[1]]
+
+
+@pytest.mark.tools("ngspice")
+def test_ngspice_integrates_by_the_method_of_the_setting() -> None:
+    exact = exact_v(SAMPLES, ())
+    errors_lsb = [simulate(deck(replace(GENERAL, method=method), SAMPLES, ()), exact).error_lsb for method in METHODS]
+    assert len(set(errors_lsb)) == len(METHODS)
 
 
 @pytest.mark.tools("ngspice")

@@ -269,6 +269,11 @@ static inline void copy_z(const engine_t* self, const double* from, double* to) 
     memcpy(to, from, (size_t)self->columns * sizeof to[0]);
 }
 
+/// First element of a row of w_panels; its columns are PANEL apart.
+static inline const double* w_row_of(const engine_t* self, int row) {
+    return &self->w_panels[row / PANEL * PANEL * self->columns + row % PANEL];
+}
+
 // The functions below are shared by the chapters, but not exported by the library.
 #ifdef __GNUC__
 #pragma GCC visibility push(hidden)

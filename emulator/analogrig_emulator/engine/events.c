@@ -62,12 +62,8 @@ typedef struct {
     double  terms[TERMS * PADDED(ENGINE_MAX_STATES)];
 } place_t;
 
-static const double* row_of(const engine_t* const self, int kink) {
-    return &self->w_panels[kink / PANEL * PANEL * self->columns + kink % PANEL];
-}
-
 static double compute_excess(const engine_t* const self, const crossing_t* crossing, const double* z) {
-    const double* row = row_of(self, crossing->kink);
+    const double* row = w_row_of(self, crossing->kink);
     double        w   = 0.0;
     for (int j = 0; j < self->columns; j++) {
         w += row[j * PANEL] * z[j];
@@ -91,7 +87,7 @@ static double guess_tick(const engine_t* const self, const crossing_t* crossing,
 
 /// Improve a guess by Newton's method on the series at a place. Return true if it has converged within a shortest step.
 static bool improve_guess(const engine_t* const self, const crossing_t* crossing, const place_t* place, double* guess) {
-    const double* row  = row_of(self, crossing->kink);
+    const double* row  = w_row_of(self, crossing->kink);
     const double  step = (double)(INT64_C(1) << self->mode->base);
     double        excess[TERMS + 1], part = (*guess - (double)place->tick) / step;
     double        gain[PADDED(ENGINE_MAX_STATES)] = { 0.0 };

@@ -73,7 +73,7 @@ struct collocation {
     double* map;             // [A B c] of one tick, and once more the columns of the product for each of its g
     double* moments[NODES];  // of the level `top`
     int     base, top;       // base: the level below which moments come from their series
-    bool    is_fast;         // a product moves an argument by FAST times its change within a sample period
+    bool    is_fast;         // products move themselves by FAST times their change within a sample period
     rung_t  rungs[ENGINE_LEVELS];
 };
 
@@ -214,8 +214,7 @@ static void fill_rung(const engine_t* const self, double* const* moments, rung_t
     double    arguments[MAX_ARGUMENTS * MAX_BLOCK_STRIDE];
     for (int i = 0; i < count; i++) {
         for (int j = 0; j < columns; j++) {
-            const int row     = first + i;
-            w[i * stride + j] = self->w_panels[((row / PANEL) * columns + j) * PANEL + row % PANEL];
+            w[i * stride + j] = w_row_of(self, first + i)[j * PANEL];
         }
     }
     for (int node = 0; node < NODES; node++) {
@@ -266,22 +265,36 @@ void products_free(collocation_t* matrices) {
     free(matrices);
 }
 
-/// True if a product moves an argument by FAST times its change within a sample period, through one state.
+/// True if a product moves an argument of another by FAST times its change within a sample period, through one state.
+static bool moves(const engine_t* const self, const double* map, int product, int other) {
+    const int           row = self->kinks - 2 * (self->products - other), column = column_of(self, product, 0);
+    const double* const p      = w_row_of(self, row);
+    const double* const q      = w_row_of(self, row + 1);
+    double              p_rate = 0.0, q_rate = 0.0;
+    for (int i = 0; i < self->states; i++) {
+        p_rate += p[i * PANEL] * map[i * stride_of(self) + column];
+        q_rate += q[i * PANEL] * map[i * stride_of(self) + column];
+    }
+    return fmax(fabs(p_rate), fabs(q_rate)) * (double)ENGINE_TICKS_PER_SAMPLE > FAST;
+}
+
+/// True if products move themselves so, each by itself or in a circle.
 static bool is_fast(const engine_t* const self, const double* map) {
-    const int columns = self->columns;
-    for (int row = self->kinks - 2 * self->products; row < self->kinks; row++) {
-        const double* const w = &self->w_panels[(row / PANEL) * columns * PANEL + row % PANEL];
-        for (int product = 0; product < self->products; product++) {
-            double moved = 0.0;
-            for (int i = 0; i < self->states; i++) {
-                moved += w[i * PANEL] * map[i * stride_of(self) + column_of(self, product, 0)];
-            }
-            if (fabs(moved) * (double)ENGINE_TICKS_PER_SAMPLE > FAST) {
-                return true;
-            }
+    const int products = self->products;
+    bool      moved[ENGINE_MAX_PRODUCTS][ENGINE_MAX_PRODUCTS], is_any = false;
+    for (int i = 0; i < products * products; i++) {
+        moved[i / products][i % products] = moves(self, map, i / products, i % products);
+    }
+    for (int via = 0; via < products; via++) {  // Warshall's closure
+        for (int i = 0; i < products * products; i++) {
+            bool* const each = &moved[i / products][i % products];
+            *each            = *each || (moved[i / products][via] && moved[via][i % products]);
         }
     }
-    return false;
+    for (int i = 0; i < products; i++) {
+        is_any = is_any || moved[i][i];
+    }
+    return is_any;
 }
 
 engine_status_t products_build(engine_t* const self, const double* a) {
