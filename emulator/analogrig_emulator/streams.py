@@ -49,7 +49,7 @@ def _next_normals(states: NDArray[np.uint64], shape: tuple[int, ...]) -> NDArray
 
 
 @functools.cache
-def _ziggurat() -> tuple[int | None, NDArray[np.float64], NDArray[np.uint64]]:
+def _ziggurat() -> tuple[int, NDArray[np.float64], NDArray[np.uint64]]:
     """Address of numpy's function for normal numbers, and the widths and limits of its boxes.
 
     Numpy exports the function for such use (Extending via CFFI).

@@ -39,8 +39,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _INTERRUPTED_BY = "interrupted by "
 """Start of the fault of an interrupted run; the name of the signal follows."""
 
-DIRECT_BLOCK_SAMPLES = 32_768
-"""Block length in samples of a direct bench; such blocks fit in the cache."""
+DIRECT_BLOCK_SAMPLES = 131_072
+"""Block length in samples of a direct bench. The circuit of a longer run is prepared anew for each seed."""
 
 
 class RunBuilder:
