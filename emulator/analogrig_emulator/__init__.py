@@ -70,7 +70,7 @@ from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
 from analogrig_emulator.machine.units import Unit, parse_unit
-from analogrig_emulator.streams import normals, uniforms
+from analogrig_emulator.streams import NormalStream, normals, uniforms
 
 __all__ = [
     "ABSOLUTE_ZERO_C",
@@ -124,6 +124,7 @@ __all__ = [
     "MultiplierGrade",
     "MultiplierModel",
     "NoisySuspension",
+    "NormalStream",
     "OpAmp",
     "OpAmpGrade",
     "OpAmpModel",

@@ -312,14 +312,14 @@ typedef double engine_normal_t(void* source);
 /// which a magnitude becomes a number at once; 0 where it does otherwise than it did in numpy 2.4.
 void engine_learn(engine_normal_t* normal, double* width, uint64_t* limit);
 
-/// Write the next `count` standard normal numbers of each of the streams, those of numpy's function to the bit. It makes those
-/// that take more than one word. The states stay as they are.
+/// Write the next `count` standard normal numbers of each of the streams, those of numpy's function to the bit, and the states
+/// after them. The function makes those that take more than one word.
 void engine_normals(engine_normal_t* normal,
                     const double*    width,
                     const uint64_t*  limit,
                     int64_t          streams,
                     int64_t          count,
-                    const uint64_t*  states,
+                    uint64_t*        states,
                     double*          out);
 
 #endif  // ENGINE_H

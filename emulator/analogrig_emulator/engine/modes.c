@@ -93,6 +93,7 @@ static engine_status_t build_mode(engine_t* const self) {
     }
     memcpy(mode->piece, self->piece, (size_t)self->kinks);
     mode->has_slow        = false;
+    mode->slow.is_chosen  = false;
     mode->tuning          = self->circuit->tuning;
     self->circuit->oldest = (self->circuit->oldest + 1) % MODES;
     self->circuit->stored = self->circuit->stored < MODES ? self->circuit->stored + 1 : MODES;

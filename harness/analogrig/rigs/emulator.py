@@ -37,6 +37,7 @@ from analogrig_emulator import (
     EmulatorError,
     Excitation,
     NoisySuspension,
+    NormalStream,
     OpAmp,
     OpAmpGrade,
     Pot,
@@ -435,7 +436,7 @@ class EmulatorRig(Rig):
             sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
             channels=_channels(card, computer, scenario.program),
-            blocks=_sample(volts, Sampler(card, Stream.CARD.generator(seed))),
+            blocks=_sample(volts, Sampler(card, NormalStream(seed, Stream.CARD))),
             hindsight=lambda: Hindsight(
                 scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(card))
             ),
@@ -470,7 +471,7 @@ class EmulatorRig(Rig):
             sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
             channels=_channels(card, computer, program),
-            blocks=_sample(map(alter, volts), Sampler(card, Stream.CARD.generator(seed))),
+            blocks=_sample(map(alter, volts), Sampler(card, NormalStream(seed, Stream.CARD))),
             hindsight=lambda: Hindsight((), _lit_lamps(computer.machine.lamps, probes_per_sample(card))),
         )
 
