@@ -225,6 +225,10 @@ BAD: dict[str, tuple[Change, str]] = {
         "line 4: algebraic loop p needs q needs p; solve",
     ),
     "wrong unit": (swapped('unit = "V s/rad"', 'unit = "V"'), "line 1: .* is in .* and k \\* omega in .*; make both"),
+    "root of a unit": (
+        swapped("- k*omega) / L", "- sqrt(k)*omega) / L"),
+        r"line 1: u - R \* i is in V and sqrt\(k\) \* omega in kg\^0.5 m s\^-2 A\^-0.5; make both units the same",
+    ),
     "wrong size of a unit": (
         swapped('unit = "H"', 'unit = "mH"'),
         "line 1: i' is in A s\\^-1, the right side in 1000 A",

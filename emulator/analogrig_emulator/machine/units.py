@@ -20,7 +20,7 @@ _FACTOR_TOLERANCE = 1e-9
 class Unit:
     """Unit: exponents of kg, m, s, A, K, mol and cd, and its size in SI units. text: as the file writes it."""
 
-    exponents: tuple[int, ...] = (0,) * len(_BASE)
+    exponents: tuple[float, ...] = (0,) * len(_BASE)
     factor: float = 1.0
     text: str = "1"
 
@@ -34,11 +34,9 @@ class Unit:
     def __pow__(self, power: int) -> Unit:
         return _named(tuple(power * each for each in self.exponents), self.factor**power)
 
-    def root(self) -> Unit | None:
-        """Unit of the square root; None for an odd exponent."""
-        if any(each % 2 for each in self.exponents):
-            return None
-        return _named(tuple(each // 2 for each in self.exponents), math.sqrt(self.factor))
+    def root(self) -> Unit:
+        """Unit of the square root."""
+        return _named(tuple(each / 2 for each in self.exponents), math.sqrt(self.factor))
 
     def matches(self, other: Unit) -> bool:
         """True if both have the same dimension and size."""
@@ -58,10 +56,10 @@ class Unit:
         return self.factor / other.factor
 
 
-def _named(exponents: tuple[int, ...], factor: float) -> Unit:
+def _named(exponents: tuple[float, ...], factor: float) -> Unit:
     """Unit with a text made of its factor and exponents."""
     powers = sorted(zip(_BASE, exponents, strict=True), key=lambda pair: pair[1] < 0)
-    parts = [name if n == 1 else f"{name}^{n}" for name, n in powers if n]
+    parts = [name if n == 1 else f"{name}^{n:g}" for name, n in powers if n]
     head = [] if parts and math.isclose(factor, 1.0, rel_tol=_FACTOR_TOLERANCE) else [f"{factor:.6g}"]
     return Unit(exponents, factor, " ".join(head + parts))
 
