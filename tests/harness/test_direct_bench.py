@@ -229,7 +229,7 @@ def test_estimator_of_fixed_orders_is_that_of_any_orders_to_the_bit(settings: di
 def test_estimator_of_fixed_orders_is_for_the_default_orders_alone() -> None:
     assert estimator_library_for(EstimatorConfig()) == FIXED_LIBRARY
     assert estimator_library_for(EstimatorConfig(offset=False)) == LIBRARY
-    assert estimator_library_for(EstimatorConfig().of_order(4)) == WIDE_LIBRARY
+    assert estimator_library_for(EstimatorConfig.of_poles([0.8] * 4)) == WIDE_LIBRARY
     assert InprocDevice(name="mine", library="mine.so").estimator_library.name == "mine.so"
 
 
