@@ -214,7 +214,7 @@ class Bench:
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._pace_blocks(performance)
-        self.dut.suit(scenario.program.order)
+        self.dut.suit(_poles(scenario, performance))
         self.dut.prepare(performance.of_device, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
@@ -367,7 +367,7 @@ class DirectBench(Bench):
         if scenario.samples > DIRECT_BLOCK_SAMPLES:
             return [self.play(scenario, seed) for seed in seeds]
         performances = self.rig.perform_all(scenario, seeds)
-        self.dut.suit(scenario.program.order)
+        self.dut.suit(_poles(scenario, performances[0]))
         self.dut.prepare(performances[0].of_device, performances[0].sample_period_s)
         blocks = [next(each.blocks) for each in performances]
         played = list(zip(blocks, self.dut.play_records([block.samples() for block in blocks]), strict=True))
@@ -397,6 +397,11 @@ class DirectBench(Bench):
         builder.end_record(self.dut.line_s, counters)
         initial = self._initial_conditions(performance, scenario, seed)
         return self._final_conditions(initial, performance.hindsight(), (), builder)
+
+
+def _poles(scenario: Scenario, performance: Performance) -> tuple[complex, ...]:
+    """Poles of the plant as the scenario begins, one step a sample."""
+    return scenario.program.poles(scenario.plant.values, performance.sample_period_s * performance.time_scale)
 
 
 _Played = tuple[Block, tuple[Answers, Mapping[str, int]]]

@@ -28,7 +28,10 @@ _TRIGGER_SETTINGS = ("trigger", "ceiling", "hold_off_n", "warm_up_n", "absolute"
 """Fields with the same name in the device. The coefficients of C come between the two groups."""
 
 _BY_ORDER = ("na", "nb", "c", "refresh_n", "forgetting", "isolation", "misfit")
-"""Fields that ``of_order`` chooses."""
+"""Fields that ``of_poles`` chooses."""
+
+_OF_POLES = 0.9
+"""Zeros of a fixed C, in poles of the plant: nearer, C = A with several slow poles leaves the estimate undetermined."""
 
 _USUAL_NA, _USUAL_NB, _USUAL_PARAMETERS = 2, 3, 6
 """EST_NA_MAX, EST_NB_MAX and EST_THETA_MAX of est.h: room of the usual build."""
@@ -138,7 +141,7 @@ class EstimatorConfig:
     absolute: bool = False
     reset: ResetName = "covariance"
     orders: Orders = "given"
-    """Origin of na, nb, c, refresh_n, forgetting, isolation and misfit: ``given`` here, or chosen by the order of the
+    """Origin of na, nb, c, refresh_n, forgetting, isolation and misfit: ``given`` here, or chosen by the poles of the
     scenario's ``program``. A device without settings of its own has the latter."""
 
     def __post_init__(self) -> None:
@@ -166,35 +169,36 @@ class EstimatorConfig:
             raise ValueError(f"ceiling must be more than 0 and at most {MOST_CEILING:g}, not {self.ceiling:g}")
 
     @classmethod
-    def of_order(cls, order: int) -> Self:
-        """Configuration for a plant of this order, such as the number of a program's integrators.
+    def of_poles(cls, poles: Sequence[complex]) -> Self:
+        """Configuration for a plant with these poles in z, as ``Program.poles`` has them.
 
-        Up to order 2 the default has the right orders. Beyond it C stays at (1 - 0.8 z^-1)^order: C from so many
-        estimated coefficients would raise false alarms. Their estimate takes a longer memory, too. Isolation and the
-        watch of the fit are for order 2.
+        Up to order 2 the default has the right orders. Beyond it C stays at the plant's poles, moved towards the origin
+        by a tenth: C from so many estimated coefficients would raise false alarms. Their estimate takes a longer
+        memory, too. Isolation and the watch of the fit are for order 2.
 
         :raises ValueError: the catalogue has no such order.
         """
+        order = len(poles)
         if order <= cls.na:
             return cls()
         return cls(
             na=order,
             nb=order + 1,
-            c=tuple(np.poly([0.8] * order)[1:].tolist()),
+            c=tuple(np.poly([_OF_POLES * pole / max(1.0, abs(pole)) for pole in poles]).real[1:].tolist()),
             refresh_n=0,
             forgetting=0.998,
             isolation=False,
             misfit=False,
         )
 
-    def suited(self, order: int) -> Self:
-        """Configuration for a plant of this order, if ``orders`` leaves the choice to the program.
+    def suited(self, poles: Sequence[complex]) -> Self:
+        """Configuration for a plant with these poles, if ``orders`` leaves the choice to the program.
 
         :raises ValueError: the catalogue has no such order.
         """
         if self.orders == "given":
             return self
-        chosen = self.of_order(order)
+        chosen = self.of_poles(poles)
         return dataclasses.replace(self, **{name: getattr(chosen, name) for name in _BY_ORDER})
 
     @property

@@ -68,6 +68,11 @@ class Plant:
         """
         names = self.program.names
         for name in values:
+            if name in self.program.equations.parameters and name not in names:
+                raise ValueError(
+                    f"program {self.program.name}: {name} is on no pot (pot = false), so a scenario cannot set it:"
+                    " change the program file"
+                )
             if name not in names:
                 known = ", ".join(self.program.parameters)
                 raise ValueError(

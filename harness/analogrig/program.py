@@ -190,6 +190,17 @@ class Program:
         slowest = -float(modes.real.max())
         return math.log(100.0) / slowest if slowest > _EXACT * float(np.abs(modes).max()) else None
 
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - a program is a value
+    def poles(self, values: tuple[float, ...], period_s: float) -> tuple[complex, ...]:
+        """Poles in z of a linear plant, sampled every ``period_s`` of the plant; none of one that is not linear.
+
+        :param values: ``parameters``, in order.
+        """
+        if not self.is_linear:
+            return ()
+        modes = np.linalg.eigvals(self.generators([values])[0, :-1, :-1])
+        return tuple(np.exp(modes * period_s).tolist())
+
     def values_at(self, coefficients: Mapping[str, float]) -> dict[str, float]:
         """Values of the parameters whose pots have these coefficients under load.
 

@@ -341,7 +341,8 @@ class Run:
         except OSError as error:
             raise RecordingError(f"{path}: cannot read the recording: {error.strerror or error}") from error
         except Exception as error:  # numpy and zipfile raise a dozen types on damaged archives, undocumented
-            raise RecordingError(f"{path}: truncated, or not a recording of analogrig") from error
+            cure = "analogrig import makes one of measured data"
+            raise RecordingError(f"{path}: truncated, or not a recording of analogrig; {cure}") from error
         run = cls(conditions=_parse_conditions(header, path), **arrays)
         run._check_consistency(path)
         return run

@@ -12,6 +12,7 @@ from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import DEFAULT_ARL0, EstimatorConfig
 from analogrig.judging.bursts import BURST, upper_count
 from analogrig.judging.courses import first_at_level
+from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig_emulator import Excitation
 
@@ -22,6 +23,9 @@ from .played import HIGH_V, LOW_V, Change
 from .shipped import ONSET_N, ONSET_SPAN_N, answers_to, direct, exposure_n
 
 PROGRAM = Program.load("two-mass")
+
+SAMPLE_PERIOD_S = 50e-6
+POLES = PROGRAM.poles(Plant.of(PROGRAM).values, PROGRAM.equations.speed * SAMPLE_PERIOD_S)
 
 PARAMETERS = ("M2", "B2", "K2", "K1", "M1", "B1")
 
@@ -50,7 +54,7 @@ from {LEAST_NATS:.2f} nats."""
 
 def device() -> DirectDevice:
     """Device set for the program two-mass."""
-    return direct(InprocDevice(name="two-mass", estimator=EstimatorConfig.of_order(PROGRAM.order)))
+    return direct(InprocDevice(name="two-mass", estimator=EstimatorConfig.of_poles(POLES)))
 
 
 def _draw(rng: np.random.Generator, samples: int) -> Excitation:  # noqa: ARG001 - the same for any length

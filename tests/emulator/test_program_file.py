@@ -11,7 +11,9 @@ import pytest
 
 from analogrig_emulator.errors import ProgramError
 from analogrig_emulator.machine.compiler import load_patch
+from analogrig_emulator.machine.formula import parse_formula
 from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.units import parse_unit
 
 MOTOR = """
 name = "motor"
@@ -146,7 +148,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "call of Python": (equation("omega' = __import__('os').system('id')"), "line 3: (a derivative|.* is not allowed)"),
     "attribute": (equation("omega' = (torque - d*omega).real / J"), "line 3: .* is not allowed"),
     "comparison": (equation("omega' = (torque > d) * J"), "line 3: 'torque > d' is not allowed"),
-    "lambda": (equation("omega' = (lambda: 1)()"), "line 3: .* is not allowed"),
+    "lambda": (equation("omega' = (lambda: 1)()"), "line 3: .* is no formula"),
     "unbalanced bracket": (equation("omega' = (torque - d*omega / J"), "line 3: .* is no formula"),
     "brackets without end": (equation("omega' = " + "(" * 300 + "torque"), "line 3: .* is no formula"),
     "deep formula": (
@@ -386,3 +388,22 @@ def test_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     with pytest.raises(ProgramError, match="pipe.toml: cannot be read: it is no regular file"):
         load_patch(tmp_path / "pipe.toml")
+
+
+@pytest.mark.parametrize("name", ["lambda", "in", "is", "from", "class"])
+def test_a_keyword_of_python_is_a_name(name: str) -> None:
+    with_keyword = re.sub(r"\bk\b", name, MOTOR)
+    assert name in parse_program(with_keyword, "").parameters
+    known = {name: 3.0, "i": 2.0}
+    assert parse_formula(f"-{name}**2*i").law({})(known) == -18.0 and str(parse_formula(f"1/{name}")) == f"1 / {name}"
+
+
+@pytest.mark.parametrize("name", ["and", "or", "not", "if", "else"])
+def test_a_word_that_is_no_name_is_called_reserved(name: str) -> None:
+    with pytest.raises(ProgramError, match=f"'{name}' is a reserved word and no name; choose another name"):
+        parse_formula(f"u - R*i - {name}*omega")
+
+
+def test_a_fractional_power_of_a_unit_is_named() -> None:
+    with pytest.raises(ProgramError, match=r"unit 'm\^2.5/s': a power is no whole number"):
+        parse_unit("m^2.5/s")

@@ -251,7 +251,7 @@ def test_estimator_inside_the_loop_over_samples_is_the_one_that_is_called_to_the
 def test_estimator_of_fixed_orders_is_for_the_default_orders_alone() -> None:
     assert estimator_library_for(EstimatorConfig()) == FIXED_LIBRARY
     assert estimator_library_for(EstimatorConfig(offset=False)) == LIBRARY
-    assert estimator_library_for(EstimatorConfig().of_order(4)) == WIDE_LIBRARY
+    assert estimator_library_for(EstimatorConfig.of_poles([0.8] * 4)) == WIDE_LIBRARY
     assert InprocDevice(name="mine", library="mine.so").estimator_library.name == "mine.so"
 
 

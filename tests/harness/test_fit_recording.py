@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.cli import main
+from analogrig.cli import main, terminal
 from analogrig.config import fixtures
 from analogrig.hardware.calibration.recorded import SETTLING_N, RecordedPlant, _determined
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import Excitation, Multiplier, RecordedExcitation, SuspensionComputer, load_patch
 
-RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0}
+RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0, "rc-battery": 1.0}
 SAMPLES = 2000
 TRUE = {"rate": 410.0, "gain": 470.0, "damping": 35.0, "square": 60.0, "cube": 1400.0, "offset": 4e-3}
 
@@ -73,8 +74,8 @@ def test_a_fit_finds_the_values_of_the_machine_and_keeps_them(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     twin = tmp_path / "twin.toml"
-    command = ["calibrate", "--recording", str(recording), "--program", "silverbox", "--settle", "500", "--json"]
-    spans = ["--span", "0:1400", "--check", "900:2000"]
+    command = ["calibrate", "--recording", str(recording), "--program", "silverbox", "--settle", "400", "--json"]
+    spans = ["--span", "0:1200", "--check", "1200:2000"]
     assert main([*command, *spans, "--most-rms", "4e-5", "--out", str(twin)]) == 0
     told = json.loads(capsys.readouterr().out)
     for parameter in told["parameters"]:
@@ -265,6 +266,11 @@ def test_a_program_that_a_run_refuses_is_refused(
         (["--fix", "gain=much"], "--fix gain=much: 'much' is no number"),
         (["--fix", "gain=4"], "gain = 4: must be within its range, 300 to 800"),
         (["--out", "twin.npz"], "must be a .toml file"),
+        (["--check", "0:1000"], "--check 0:1000: samples 0 to 999 are fitted, too: end --span or begin --check"),
+        (["--span", "0:1500", "--check", "1400:2000"], "--check 1400:2000: samples 1400 to 1499 are fitted, too"),
+        ([f"--fix={name}" for name in TRUE], "every parameter with a range is fixed; leave one to fit"),
+        (["--rig", "emulator-real"], "--rig emulator-real: is not played with --recording; leave out one of them"),
+        (["--recording", __file__], "not a recording of analogrig; analogrig import makes one of measured data"),
     ],
 )
 def test_wrong_options_are_one_line(
@@ -290,6 +296,41 @@ def test_a_missing_input_cannot_be_played(tmp_path: Path, capsys: pytest.Capture
     assert main([*command, "--out", str(tmp_path / "r.npz")]) == 0
     assert main(["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "silverbox"]) == 2
     assert "sample 300: the input is missing or clipped" in capsys.readouterr().err
+
+
+def test_the_check_of_a_plant_that_integrates_begins_with_its_state(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    current_v = 1.5 + 3.0 * np.random.default_rng(5).normal(size=SAMPLES // 10).repeat(10).clip(-2.0, 2.0)
+    measured = record(tmp_path, "rc-battery", {"R0": 0.012}, RecordedExcitation(current_v, is_held=True))
+    fixed = [f"--fix={name}" for name in ("R1", "C1", "R2", "C2", "slope", "capacity")]
+    told = fit(measured, "rc-battery", capsys, "--span", "0:1400", "--check", "1400:2000", *fixed)
+    assert told["check"]["rms"] == pytest.approx(told["fit"]["rms"], rel=0.1) and not told["caveats"]
+
+
+def test_a_check_far_from_the_fit_is_a_caveat(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    signals = dict(np.load(recording.parent / "measured.npz"))
+    signals["y"][1400:] *= 1.02
+    np.savez(tmp_path / "a.npz", **signals)
+    command = ["import", str(tmp_path / "a.npz"), "--input", "u", "--output", "y", "--rate", str(RATES_HZ["silverbox"])]
+    assert main([*command, "--out", str(tmp_path / "r.npz")]) == 0
+    told = fit(tmp_path / "r.npz", "silverbox", capsys, "--span", "0:1400", "--check", "1400:2000")
+    (caveat,) = told["caveats"]
+    assert (
+        caveat.startswith("caveat: samples that were not fitted differ ") and "the twin holds for those alone" in caveat
+    )
+
+
+def test_a_fit_counts_its_plays_on_a_terminal(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "_is_terminal", lambda stream: True)  # noqa: ARG005
+    monkeypatch.setattr(terminal, "_PROGRESS_S", 0.01)
+    command = ["calibrate", "--recording", str(recording), "--program", "silverbox"]
+    assert main([*command, "--out", str(recording.parent / "fitted.toml")]) == 0
+    assert re.search(r"fitting: \d+ s, \d+ plays", capsys.readouterr().err)
 
 
 def test_the_help_states_the_settling_time(capsys: pytest.CaptureFixture[str]) -> None:

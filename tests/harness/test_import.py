@@ -573,7 +573,12 @@ BAD_FILES: dict[str, tuple[str, bytes | Callable[[], bytes], str]] = {
     ),
     "no mat": ("a.mat", b"MATLAB 5.0 " * 40, "damaged, or no MATLAB file"),
     "mat of 1e9": ("a.mat", _larger_mat, "more than 10000000"),
-    "mat of structs": ("a.mat", lambda: mat_bytes(u={"a": 1.0}, y={"a": 1.0}), "no column is called 'u'"),
+    "mat of structs": (
+        "a.mat",
+        lambda: mat_bytes(u={"a": 1.0}, y={"a": 1.0}),
+        "none; not loaded: u (struct), y (struct); save",
+    ),
+    "npy of a pickle": ("a.npy", lambda: _npy(np.array({"u": 1})), "not loaded: 0 (Python objects); save numbers"),
     "cut mat": ("a.mat", lambda: mat_bytes(u=np.ones(99), y=np.ones(99))[:-300], "MATLAB"),
     "hdf5 of 1e12": ("a.mat", lambda: hdf5_bytes(_huge), "u has 1000000000000 samples, more than 10000000"),
     "hdf5 of another file": ("a.mat", lambda: hdf5_bytes(_external), "no column is called 'u'; there are none"),

@@ -1,4 +1,4 @@
-"""Settings of the estimator by the order of the scenario's program."""
+"""Settings of the estimator by the poles of the scenario's program."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ TWO_MASS = Scenario.load("two-mass")
 SHORT = dataclasses.replace(TWO_MASS, samples=60, tweaks=())
 
 GIVEN = "[estimator]\nna = 2\nnb = 3\n"
+FOUR = (0.9, 0.8, 0.7, 0.6)
 LEFT = '[estimator]\norders = "program"\narl0 = 1e6\n'
 
 
@@ -40,6 +41,76 @@ def described(folder: Path, settings: str, kind: str = "inproc") -> str:
 )
 def test_order_of_a_linear_program_is_the_number_of_its_states(program: str, order: int) -> None:
     assert Program.load(program).order == order
+
+
+THIRD_ORDER = {
+    "shaft": """name = "shaft"
+speed = 55
+channels = ["T", "wl"]
+equations = '''
+wm' = (T - c*(wm - wl) - k*phi) / Jm
+phi' = wm - wl
+wl' = (c*(wm - wl) + k*phi - d*wl - TL) / Jl
+'''
+inputs = { T = { full = 10.0, trial = [0.0, 6.0] }, TL = { full = 10.0, trial = [0.0, 1.0] } }
+states = { wm = {}, wl = {}, phi = {} }
+[parameters]
+Jm = { value = 2e-3, range = [1.5e-3, 3e-3] }
+Jl = { value = 4e-3, range = [3e-3, 6e-3] }
+k = { value = 120.0, range = [80.0, 150.0] }
+c = { value = 0.15, range = [0.1, 0.3] }
+d = { value = 0.1, range = [0.07, 0.15] }
+""",
+    "lags": """name = "lags"
+speed = 500
+channels = ["u", "z"]
+equations = '''
+x' = (u - x)/T1
+y' = (x - y)/T2
+z' = (y - z)/T3
+'''
+inputs = { u = { full = 10.0, trial = [0.0, 8.0] } }
+states = { x = {}, y = {}, z = {} }
+[parameters]
+T1 = { value = 0.1, range = [0.07, 0.15] }
+T2 = { value = 0.05, range = [0.04, 0.08] }
+T3 = { value = 0.02, range = [0.015, 0.03] }
+""",
+    "tanks": """name = "tanks"
+speed = 20e3
+channels = ["q", "h3"]
+equations = '''
+h1' = q - g*(h1 - h2)
+h2' = g*(h1 - h2) - g*(h2 - h3)
+h3' = g*(h2 - h3) - f*h3
+'''
+inputs = { q = { full = 10.0, trial = [0.0, 5.0] } }
+states = { h1 = {}, h2 = {}, h3 = {} }
+[parameters]
+g = { value = 1.0, range = [0.7, 1.4] }
+f = { value = 0.5, range = [0.3, 0.7] }
+""",
+}
+"""Linear plants of order 3, at speeds at which they settle in 20 to 100 samples."""
+
+
+@pytest.mark.parametrize("name", THIRD_ORDER)
+def test_sound_plant_of_order_3_raises_no_alarm(name: str, tmp_path: Path) -> None:
+    """C must follow the poles: (1 - 0.8 z^-1)^3 raises one in each play."""
+    file = tmp_path / f"{name}.toml"
+    file.write_text(THIRD_ORDER[name], encoding="utf-8")
+    sound = dataclasses.replace(Scenario.of_program(Program.load(str(file))), samples=6000, tweaks=())
+    with open_rig("emulator") as rig:
+        assert can_be_direct(rig, describe("inproc"))
+        runs = direct_bench(rig, describe("inproc")).play_all(sound, range(1, 7))
+    assert [run.alarm_index.tolist() for run in runs] == [[]] * 6
+
+
+def test_prefilter_follows_the_values_that_the_scenario_begins_with() -> None:
+    stiffer = dataclasses.replace(SHORT, set={"stiffness_n_per_m": 30e3})
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        first, other = (Bench(rig, dut).play(each, 1).conditions.dut["estimator"]["c"] for each in (SHORT, stiffer))
+    assert first != other
 
 
 @pytest.mark.parametrize("device", ["inproc", "host", "can:virtual"])
@@ -77,9 +148,9 @@ def test_orders_of_the_program_go_with_other_settings(tmp_path: Path) -> None:
 
 def test_setting_of_a_test_that_names_an_order_makes_it_a_given_one() -> None:
     left = EstimatorConfig(orders="program")
-    assert left.changed("", {"arl0": 1e6}).suited(4).na == 4
-    assert left.changed("", {"nb": 2}).suited(4).nb == 2
-    assert left.suited(4).suited(2) == left
+    assert left.changed("", {"arl0": 1e6}).suited(FOUR).na == 4
+    assert left.changed("", {"nb": 2}).suited(FOUR).nb == 2
+    assert left.suited(FOUR).suited((0.9, 0.8)) == left
 
 
 def test_device_without_room_is_refused_with_its_cure() -> None:
@@ -94,7 +165,7 @@ def test_device_without_room_is_refused_with_its_cure() -> None:
 
 def test_order_beyond_the_catalogue_is_refused() -> None:
     with open_dut("inproc") as dut, pytest.raises(ConfigurationError, match=r"a program of order 99: .*\[estimator\]"):
-        dut.suit(99)
+        dut.suit([0.5] * 99)
 
 
 def test_run_states_the_chosen_orders_and_the_step_response(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -118,3 +118,59 @@ def test_a_speed_at_which_the_plant_hardly_moves_or_settles_at_once_is_noted(
     assert main(["patch", str(tmp_path / "motor.toml")]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: the plant settles in")]
     assert len(notes) == told and all("write speed = 8.8 for 100" in line for line in notes)
+
+
+def test_the_deck_is_named_with_the_command_that_runs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    deck = tmp_path / "motor.cir"
+    assert main(["patch", str(MOTOR), "--netlist", str(deck)]) == 0
+    assert capsys.readouterr().out.endswith(f"written: {deck}; run it with: ngspice -b -r out.raw {deck}\n")
+
+
+@pytest.mark.parametrize(("first", "notes"), [(-20.0, []), (12.0, ["note: friction: omega is 0 to "])])
+def test_a_table_that_the_trial_play_leaves_is_noted(
+    first: float, notes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "brake.toml"
+    file.write_text(
+        'name = "brake"\nspeed = 10\nchannels = ["u", "omega"]\nequations = "omega\' = (u - friction(omega)) / T"\n'
+        f"[functions.friction]\npoints = [[{first}, {first}], [14.0, 14.0], [30.0, 30.0]]\n"
+        "[inputs]\nu = { full = 20.0, trial = [0.0, 18.0] }\n[states]\nomega = {}\n[parameters]\nT = { value = 0.1 }\n"
+    )
+    assert main(["patch", str(file)]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: friction")]
+    assert len(told) == len(notes) and all(line.startswith(note) for line, note in zip(told, notes, strict=True))
+
+
+def test_an_input_that_no_generator_drives_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "loaded.toml"
+    file.write_text(
+        MOTOR.read_text()
+        .replace("- d*omega)", "- d*omega - load)")
+        .replace("[inputs]", '[inputs]\nload = { unit = "N m", full = 1.0, trial = [0.0, 0.1] }')
+    )
+    text = file.read_text()
+    (line,) = (each for each in text.splitlines() if each.startswith("load = "))
+    file.write_text(text.replace(line + "\n", "").replace("\n[states]", f"{line}\n\n[states]"))
+    assert main(["patch", str(file)]) == 0
+    assert "note: load: moves in the trial play; a run holds it at 0 V and drives u" in capsys.readouterr().out
+    command = ["run", "--program", str(file), "--dut", "inproc", "--seed", "1", "--out", str(tmp_path / "run")]
+    assert main(command) in {0, 1, 3}
+    assert "note: load: held at 0 V, the generator drives u alone" in capsys.readouterr().out
+
+
+def test_an_excitation_beyond_the_trial_levels_is_named_for_clipped_samples(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = tmp_path / "high.toml"
+    scenario.write_text('program = "dc-motor"\nsamples = 700\n[excitation]\nhigh_v = 14.0\n')
+    main(["run", "--scenario", str(scenario), "--dut", "inproc", "--out", str(tmp_path / "run")])
+    assert "the excitation goes from 0 to 14 V: the program dc-motor is scaled for its trial levels, 0 to 8.333 V" in (
+        capsys.readouterr().out
+    )
+
+
+def test_a_parameter_without_a_pot_is_no_unknown_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = tmp_path / "moon.toml"
+    scenario.write_text('program = "two-tanks"\nsamples = 60\nset = { g = 16.2 }\n[excitation]\nhigh_v = 8.0\n')
+    assert main(["run", "--scenario", str(scenario), "--dut", "inproc", "--out", str(tmp_path / "run")]) == 2
+    assert "program two-tanks: g is on no pot (pot = false), so a scenario cannot set it" in capsys.readouterr().err

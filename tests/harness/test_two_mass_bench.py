@@ -24,10 +24,12 @@ def test_changes_of_the_suspension_are_detected_within_the_bound_of_the_benchmar
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_default_serves_up_to_order_2(order: int) -> None:
-    assert EstimatorConfig.of_order(order) == EstimatorConfig()
+    assert EstimatorConfig.of_poles([0.9] * order) == EstimatorConfig()
 
 
-def test_higher_order_has_the_prefilter_of_equal_poles() -> None:
-    settings = EstimatorConfig.of_order(4)
+def test_higher_order_has_the_prefilter_of_the_poles_a_tenth_nearer_the_origin() -> None:
+    settings = EstimatorConfig.of_poles([0.5 + 0.5j, 0.5 - 0.5j, 1.0, 2.0])
     assert (settings.na, settings.nb, settings.parameters) == (4, 5, 10)
-    assert np.roots([1.0, *settings.c]) == pytest.approx([0.8] * 4, abs=1e-3)
+    assert sorted(np.roots([1.0, *settings.c]), key=lambda zero: zero.imag) == pytest.approx(
+        [0.45 - 0.45j, 0.9, 0.9, 0.45 + 0.45j], abs=1e-6
+    )

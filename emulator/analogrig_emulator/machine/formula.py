@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import keyword
 import math
 import operator
 import re
@@ -25,6 +26,9 @@ _MOST_CHARACTERS = 1000
 _MOST_PARTS = 400
 _DEEPEST = 40
 _MOST_POWER = 8
+_OPERATOR_WORDS = frozenset({"and", "or", "not", "if", "else", "True", "False", "None"})
+"""Python's keywords that make expressions, and can be no names. The others can, such as ``lambda``."""
+_WORDS = re.compile(rf"\b(?:{'|'.join(keyword.kwlist)})\b")
 _LARGEST = 1e100
 _LEAST = 1e-100
 
@@ -265,17 +269,28 @@ def parse_formula(text: str, tables: Iterable[str] = ()) -> Formula:
         raise ProgramError(f"formula of {len(text)} characters; write at most {_MOST_CHARACTERS}, name parts of it")
     if not text.strip():
         raise ProgramError("the formula is missing; write for instance (k*i - d*omega) / J")
+    readable = _WORDS.sub(_as_name, text.strip())
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        tree = ast.parse(readable, mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as cause:
         raise ProgramError(_malformed(text.strip(), cause)) from None
     _check_size(tree)
-    return _Reading(text.strip(), frozenset(tables)).formula(tree)
+    return _Reading(readable, frozenset(tables)).formula(tree)
+
+
+def _as_name(word: re.Match[str]) -> str:
+    """Spell a keyword with a bold first letter: no keyword to Python's parser, which reads it as the plain letter."""
+    name = word[0]
+    if name in _OPERATOR_WORDS:
+        return name
+    return chr(ord("\N{MATHEMATICAL BOLD SMALL A}") + ord(name[0]) - ord("a")) + name[1:]
 
 
 def _malformed(text: str, cause: Exception) -> str:
     if "'" in text:
         return "a derivative stands within a formula; name its right side as a signal, and use that on both sides"
+    if word := next((each for each in _WORDS.findall(text) if each in _OPERATOR_WORDS), None):
+        return f"{word!r} is a reserved word and no name; choose another name"
     at = f" (character {cause.offset})" if isinstance(cause, SyntaxError) and cause.offset else ""
     return f"{text[:60]!r} is no formula{at}; write for instance (k*i - d*omega) / J"
 

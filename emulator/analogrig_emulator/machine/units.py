@@ -122,6 +122,8 @@ def parse_unit(text: str) -> Unit:
     if len(text) > _MOST_CHARACTERS:
         raise ProgramError(f"unit of {len(text)} characters; write at most {_MOST_CHARACTERS}")
     unit, rest = _product(text, text)
+    if re.match(r"\.\d", rest):
+        raise ProgramError(f"unit {text!r}: a power is no whole number; leave out the units of its terms")
     if rest.strip():
         raise ProgramError(f"unit {text!r}: {rest.strip()[0]!r} is out of place; write N s/m, kg m^2 or V/(rad/s)")
     return Unit(unit.exponents, unit.factor, text)

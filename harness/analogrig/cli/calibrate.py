@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +35,7 @@ def add(commands: Any) -> None:
         "calibrate --rig emulator-real --program pendulum --out build/pendulum.toml",
         "calibrate --recording build/silverbox.npz --program silverbox --span 40000:130000 --check 0:40000",
     )
-    add_rig(command)
+    add_rig(command, default=None)
     command.add_argument(
         "--out",
         type=Path,
@@ -114,7 +115,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.op_amp is None:
         arguments.op_amp = "tl07x" if arguments.recording is None else "ideal"
     if arguments.recording is not None:
-        return fit_recording(arguments)
+        return _fit_recording(arguments)
+    arguments.rig = arguments.rig or "emulator"
     if arguments.program not in PROGRAMS:
         return _fit_rig(arguments)
     _check_for_a_rig(arguments, ("span", "check", "settle", "most_rms", "fix", "reconstruction"))
@@ -148,6 +150,15 @@ def _run(arguments: argparse.Namespace) -> int:
         kept = f"kept as {arguments.out}" if is_twin else f"no twin: more than {MOST_LSB:g} LSB; nothing kept"
         show("\n".join([heading, *_values(found), "", *_said(found, check_lsb), kept]))
     return PASSED if is_twin else FAILED
+
+
+def _fit_recording(arguments: argparse.Namespace) -> int:
+    """Fit the parameters of a program to a recording."""
+    from analogrig.errors import ConfigurationError
+
+    if arguments.rig not in (None, os.environ.get("ANALOGRIG_RIG")):
+        raise ConfigurationError(f"--rig {arguments.rig}: is not played with --recording; leave out one of them")
+    return fit_recording(arguments)
 
 
 def _fit_rig(arguments: argparse.Namespace) -> int:

@@ -29,6 +29,7 @@ _MOST_OF_OUTPUT = 0.5
 def fit_recording(arguments: argparse.Namespace) -> int:
     """Fit a program to a recording, and keep it as a program file with the fitted values."""
     from analogrig.config import locate
+    from analogrig.errors import ConfigurationError
     from analogrig.output import move_aside
     from analogrig.program import Program
     from analogrig.run import Run
@@ -38,8 +39,16 @@ def fit_recording(arguments: argparse.Namespace) -> int:
     run = Run.load(arguments.recording)
     plant = _plant(Program.load(str(file)), run, arguments)
     span = plant.span(*_span(arguments, "span", run.samples), _settling_n(arguments))
-    check = plant.span(*_span(arguments, "check", run.samples), _settling_n(arguments)) if arguments.check else None
-    return _fit(arguments, file, plant, span, (plant, check) if check else None)
+    if not arguments.check:
+        return _fit(arguments, file, plant, span, None)
+    check = plant.span(*_span(arguments, "check", run.samples), _settling_n(arguments), is_led_in=True)
+    shared = max(span.first, check.first), min(span.end, check.end)
+    if shared[0] < shared[1]:
+        raise ConfigurationError(
+            f"--check {check.first}:{check.end}: samples {shared[0]} to {shared[1] - 1} are fitted, too: end --span or"
+            " begin --check elsewhere"
+        )
+    return _fit(arguments, file, plant, span, (plant, check))
 
 
 def fit_rig(arguments: argparse.Namespace) -> int:
@@ -98,8 +107,9 @@ def _fit(
     from analogrig.storage import replace_file
 
     fixed = dict(_fixed(text, plant.program.values) for text in arguments.fix)
-    with show_work("fitting"):
-        twin = fit_program(plant, span, reconstruction=arguments.reconstruction or reconstruction, fixed=fixed)
+    chosen = arguments.reconstruction or reconstruction
+    with show_work("fitting") as tell:
+        twin = fit_program(plant, span, lambda plays: tell(f"{plays} plays"), reconstruction=chosen, fixed=fixed)
         checked = check and check[0].difference(twin.values, check[1], twin.reconstruction)
     unit = plant.output_unit
     if arguments.most_rms is None:
@@ -113,7 +123,7 @@ def _fit(
     ]
     if check and checked:
         lines.append(f"samples {check[1].first} to {check[1].end - 1}, not fitted: {_words(checked, unit)}")
-    caveats = [*_caveats(twin), *_settling_lines(twin.fit, checked, _settling_n(arguments))]
+    caveats = [*_caveats(twin), *_check_lines(twin.fit, checked, _settling_n(arguments))]
     lines += [_reconstruction_line(twin, unit), *caveats, *_diagram_lines(plant, arguments.out)]
     if is_twin:
         with replace_file(arguments.out) as out:
@@ -168,7 +178,8 @@ def _caveats(twin: ProgramTwin) -> list[str]:
     elif twin.fit.is_settled and not twin.fit.is_noise:
         lines.append(
             f"caveat: the residual is {twin.fit.rms / twin.fit.noise:.0f} times the noise of the output: the plant"
-            " changed, or the program does not describe it; the standard errors do not hold"
+            " changed, was not at rest where the span begins, or the program does not describe it; the standard errors"
+            " do not hold"
         )
     if twin.unseen:
         names = ", ".join(twin.unseen)
@@ -189,7 +200,8 @@ def _diagram_lines(plant: RecordedPlant, out: Path) -> list[str]:
     return [f"note: fitted with the patch of the equations; a run of {out} plays the diagram {diagram}"]
 
 
-def _settling_lines(fit: Residual, checked: Residual | None, settling_n: int) -> list[str]:
+def _check_lines(fit: Residual, checked: Residual | None, settling_n: int) -> list[str]:
+    """Reasons to doubt the state in which a span begins, or that the values hold beyond the fitted one."""
     for what, each in (("fitted", fit), ("other", checked)):
         if each is not None and not each.is_settled:
             line = (
@@ -197,6 +209,12 @@ def _settling_lines(fit: Residual, checked: Residual | None, settling_n: int) ->
                 f" the recording did not begin at rest; pass a --settle above {settling_n}"
             )
             return [line]
+    if checked is not None and (beyond := checked.beyond(fit)):
+        line = (
+            f"caveat: samples that were not fitted differ {beyond:.2g} times as much as the fitted ones:"
+            " the twin holds for those alone; fit a longer span, or another excitation"
+        )
+        return [line]
     return []
 
 

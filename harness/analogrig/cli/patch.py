@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _SAMPLES = 800
 
+_RUN_DECK = "; run it with: ngspice -b -r out.raw "
+
 _CARD_RATE_HZ = 20_000.0
 """Sample rate of the usual rigs."""
 _LEAST_SETTLING_N, _SETTLING_N, _MOST_SETTLING_N = 10, 100, 200
@@ -89,10 +91,10 @@ def _patch(arguments: argparse.Namespace) -> int:
     else:
         show_plain((scaling_sheet(program) if that is None else that.text()).rstrip("\n"))
         if that is None:
-            for line in _notes(loaded):
+            for line in (*_notes(loaded), *_input_notes(program), *_table_notes(program)):
                 show(line)
         for path in wanted:
-            show(f"written: {path}")
+            show(f"written: {path}{_RUN_DECK + str(path) if path == arguments.netlist else ''}")
     return PASSED
 
 
@@ -107,6 +109,27 @@ def _notes(program: Program) -> list[str]:
     speed = program.settling_s / (_SETTLING_N * period_s)
     note = f"note: the plant settles in {settling_n:.3g} samples of {1e6 * period_s:g} us: write speed"
     return [f"{note} = {float(f'{speed:.2g}'):g} for {_SETTLING_N}, unless excitation or rig suit it"]
+
+
+def _input_notes(program: PatchedProgram) -> list[str]:
+    """Inputs that move in the trial play alone."""
+    driven, *others = program.equations.inputs
+    names = " and ".join(others)
+    return [f"note: {names}: moves in the trial play; a run holds it at 0 V and drives {driven}"] if others else []
+
+
+def _table_notes(program: PatchedProgram) -> list[str]:
+    """Tables of the file that the trial play leaves."""
+    notes = []
+    for stage in (each.stage for each in program.patch if each.stage.function):
+        source, reach = stage.cords[0].source, program.reach[stage.cords[0].source]
+        (first, _), *_, (last, _) = program.equations.functions[stage.function].points
+        if reach.low < first or reach.high > last:
+            notes.append(
+                f"note: {stage.function}: {source} is {reach.low:.4g} to {reach.high:.4g} in the trial play, its points"
+                f" are {first:g} to {last:g}: the outer pieces go on beyond them"
+            )
+    return notes
 
 
 def _check_options(arguments: argparse.Namespace) -> None:

@@ -200,22 +200,25 @@ def progress_line(of: str = "samples") -> Progress | None:
 
 
 @contextlib.contextmanager
-def show_work(on: str) -> Iterator[None]:
-    """Show what the command works on and for how long, where there is nothing to count."""
+def show_work(on: str) -> Iterator[Callable[[str], None]]:
+    """Show what the command works on and for how long, where there is no end to count to.
+
+    Yields a function that takes what has been done so far.
+    """
     line = open_progress_line()
     if line is None:
-        yield
+        yield lambda done: None  # noqa: ARG005
         return
-    start_s, is_done = time.monotonic(), threading.Event()
+    start_s, is_done, so_far = time.monotonic(), threading.Event(), [""]
 
     def tell() -> None:
         while not is_done.wait(_PROGRESS_S):
-            line.show(f"{on}: {time.monotonic() - start_s:.0f} s", is_last=False)
+            line.show(f"{on}: {time.monotonic() - start_s:.0f} s{so_far[-1]}", is_last=False)
 
     thread = threading.Thread(target=tell, daemon=True)
     thread.start()
     try:
-        yield
+        yield lambda done: so_far.append(f", {done}")
     finally:
         is_done.set()
         thread.join()

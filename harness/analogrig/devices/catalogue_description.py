@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeGuard
@@ -110,16 +110,17 @@ class CatalogueDescription(DeviceDescription):
         return super().as_table() | {"estimator": self.estimator.as_table()}
 
 
-def suited(description: CatalogueDescription, order: int) -> EstimatorConfig:
-    """Settings of the device for a plant of this order: chosen by the order, or those given.
+def suited(description: CatalogueDescription, poles: Sequence[complex]) -> EstimatorConfig:
+    """Settings of the device for a plant with these poles: chosen by them, or those given.
 
     :raises ConfigurationError: the estimator has no such order.
     """
     try:
-        return description.estimator.suited(order)
+        return description.estimator.suited(poles)
     except ValueError as error:
         cure = "give the device settings of its own: [estimator]"
-        raise ConfigurationError(f"device {description.name}: a program of order {order}: {error}; {cure}") from error
+        where = f"device {description.name}: a program of order {len(poles)}"
+        raise ConfigurationError(f"{where}: {error}; {cure}") from error
 
 
 def has_our_estimator(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:

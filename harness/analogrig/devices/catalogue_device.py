@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import secrets
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -174,9 +174,9 @@ class CatalogueDevice(Device):
         """
         self._apply(self._as_opened.changed(f"device {self.name}", settings))
 
-    def suit(self, order: int) -> None:
-        """Choose the settings by the order of the plant, for ``prepare`` to apply; errors as ``configure``."""
-        self._describe(suited(self._description, order))
+    def suit(self, poles: Sequence[complex]) -> None:
+        """Choose the settings by the poles of the plant, for ``prepare`` to apply; errors as ``configure``."""
+        self._describe(suited(self._description, poles))
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
         """Set the code of zero force; errors as ``configure``."""

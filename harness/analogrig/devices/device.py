@@ -68,8 +68,8 @@ class Device(ABC):
         if settings:
             raise DeviceRefused(f"device {self.name}: has no setting {next(iter(settings))}")
 
-    def suit(self, order: int) -> None:  # noqa: B027 - few devices model the plant
-        """Take the order of the plant, before ``prepare``.
+    def suit(self, poles: Sequence[complex]) -> None:  # noqa: B027 - few devices model the plant
+        """Take the poles of the plant in z before ``prepare``; none for one that is not linear.
 
         A device that leaves its orders to the program chooses its settings.
         """

@@ -38,7 +38,7 @@ class DirectDevice(Device):
         self._as_opened = description.estimator
         self._alarms_only = alarms_only
         self._next_index = 0
-        self._order: int | None = None
+        self._poles: Sequence[complex] | None = None
         """Order for which the settings were chosen last: to choose them takes as long as to play a thousand samples."""
         self.configure()
 
@@ -53,16 +53,16 @@ class DirectDevice(Device):
         self._estimator.restart()
 
     def configure(self, **settings: Any) -> None:
-        self._order = None
+        self._poles = None
         self._apply(self._as_opened.changed(f"device {self.name}", settings))
 
-    def suit(self, order: int) -> None:
-        if order == self._order:
+    def suit(self, poles: Sequence[complex]) -> None:
+        if poles == self._poles:
             return
-        estimator = suited(self._description, order)
+        estimator = suited(self._description, poles)
         if estimator != self._description.estimator:
             self._apply(estimator)
-        self._order = order
+        self._poles = poles
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
         zero = channels["u"].zero

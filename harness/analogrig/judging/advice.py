@@ -35,6 +35,9 @@ MOST_EDGE_SHIFT = 1.5e-3
 
 _EXAMINED_SAMPLES = 4000
 
+_LEVEL_V = 0.01
+"""Difference of two levels that matters to no scale."""
+
 
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences of advice, the most severe first; empty if there is nothing to advise."""
@@ -48,6 +51,8 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_theta_without_a_model(run),
         *_assumed_settings(run),
         *_overloads(verdict),
+        *_excitation_beyond_the_scales(run, verdict),
+        *_inputs_at_rest(run),
         *_channel_faults(verdict),
         *_noise_setting(run),
         *_edge_spacing(run),
@@ -137,6 +142,29 @@ def _assumed_settings(run: Run) -> Iterator[str]:
             f"{settings} replaced by the default; if that is wrong, so are bounds and estimates:"
             " capture from the handshake on"
         )
+
+
+def _excitation_beyond_the_scales(run: Run, verdict: Verdict) -> Iterator[str]:
+    table, program = run.conditions.scenario.get("excitation"), run.conditions.program
+    if not run.conditions.segments or table is None or not (verdict.overloads or run.clipped.any()):
+        return
+    played = config.build(Excitation, table, "the recorded excitation")
+    driven, volts = program.channels[0], program.circuit.scales.volts(program.channels[0])
+    low_v, high_v = (level * volts for level in program.equations.inputs[driven].trial)
+    levels_v = played.samples_v or (played.low_v, played.high_v)
+    if min(levels_v) < low_v - _LEVEL_V or max(levels_v) > high_v + _LEVEL_V:
+        yield (
+            f"samples are clipped or overloaded, and the excitation goes from {min(levels_v):g} to {max(levels_v):g} V:"
+            f" the program {program.name} is scaled for its trial levels, {low_v:.4g} to {high_v:.4g} V; change the"
+            " excitation, or trial in the program file"
+        )
+
+
+def _inputs_at_rest(run: Run) -> Iterator[str]:
+    program = run.conditions.program
+    driven, *others = program.equations.inputs
+    if run.conditions.segments and others and not program.equations.diagram:
+        yield f"{' and '.join(others)}: held at 0 V, the generator drives {driven} alone"
 
 
 def _overloads(verdict: Verdict) -> Iterator[str]:

@@ -79,6 +79,8 @@ class Table:
     """Units that the file states beside the names of columns."""
     channels: list[str] = field(default_factory=list)
     """Names in the array ``channels`` of an archive, as analogrig writes it."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """What the file holds beside columns, by name."""
 
     def add_typed(self, name: str, dtype: np.dtype[Any], shape: Sequence[int], load: Callable[[], Any]) -> None:
         """Add an array of NumPy, or each field of a structured one as ``name.field``; texts are left out."""
@@ -86,6 +88,8 @@ class Table:
             each = dtype[field_name]
             label = f"{name}.{field_name}" if name else field_name
             self.add_typed(label, each.base, (*shape, *each.shape), partial(_field_of, load, field_name))
+        if dtype.hasobject and sum(size != 1 for size in shape) == 0:
+            self.refused[name] = "Python objects"
         if dtype.kind in "buifcO":
             self.add(name, shape, load if not dtype.hasobject else partial(_refuse_objects, name))
 
@@ -311,6 +315,12 @@ def _unknown(name: str, names: Sequence[str]) -> str:
     return f"no column is called {name[:_MOST_NAME]!r}; there are {shown or 'none'}"
 
 
+def _refusal(refused: Mapping[str, str]) -> str:
+    """Names and kinds of what is not loaded, and the cure."""
+    shown = [f"{name[:_MOST_NAME] or 'the array'} ({kind})" for name, kind in refused.items()]
+    return f"not loaded: {', '.join(shown[:20])}{', ...' if len(shown) > 20 else ''}; save numbers, as float64"
+
+
 # --------------------------------------------------------------------------------------------------------------- NumPy
 
 
@@ -327,7 +337,8 @@ def open_npy(path: Path) -> Table:
         table.add_typed("", dtype, shape, load)
         return table
     table.add_typed("0" if sum(size != 1 for size in shape) <= 1 else "", dtype, shape, load)
-    return Table({name.strip("[]"): load for name, load in table.columns.items()})
+    columns = {name.strip("[]"): load for name, load in table.columns.items()}
+    return Table(columns, refused=table.refused)
 
 
 def open_npz(path: Path) -> Table:
@@ -377,6 +388,8 @@ def open_matlab(path: Path) -> Table:
     for name, shape, kind in scipy.io.whosmat(path):
         if kind not in {"cell", "struct", "object", "function", "char", "opaque", "unknown", "sparse"}:
             table.add(name, shape, partial(_mat_variable, path, name))
+        else:
+            table.refused[name] = kind
     return table
 
 
@@ -398,7 +411,9 @@ def _open_hdf5(path: Path) -> Table:
         if not isinstance(file.get(name, getlink=True), h5py.HardLink):
             continue
         found = file[name]
-        if isinstance(found, h5py.Dataset) and found.shape and not found.external and not found.is_virtual:
+        if isinstance(found, h5py.Group):
+            table.refused[name] = "struct"
+        elif found.shape and not found.external and not found.is_virtual:
             table.add(name, found.shape, partial(found.__getitem__, ()))
     return table
 
@@ -531,6 +546,8 @@ def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
     table = opening(path)
     names = list(table.columns)
     for name in wanted:
+        if table.refused and name not in names:
+            raise ColumnError(f"{_unknown(name, names)}; {_refusal(table.refused)}")
         _place(name, names)
     units = {name: table.units[name][:_MOST_NAME] for name in wanted if table.units.get(name)}
     return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz, 0, units, table.channels)

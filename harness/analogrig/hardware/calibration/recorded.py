@@ -61,6 +61,8 @@ _NOISE_ALONE = 1.1
 """Largest rms of a residual, in that of the noise, that may be noise alone."""
 _MOST_COLOURED = 3.0
 """Largest rms, in that of the noise, of a residual that the noise of the output explains."""
+_MOST_BEYOND_FIT = 3.0
+"""Largest rms of samples that were not fitted, in that of the fitted ones, of a twin that holds for both."""
 _BEGINNING = 0.1
 """Part of the compared samples that is their beginning."""
 _MOST_AT_BEGINNING = 3.0
@@ -76,6 +78,8 @@ class Span:
 
     first: int
     end: int
+    before: NDArray[np.float64]
+    """Input that is played before ``first``."""
     u: NDArray[np.float64]
     y: NDArray[np.float64]
     valid: NDArray[np.bool_]
@@ -122,6 +126,11 @@ class Residual:
     def is_noise(self) -> bool:
         """True if the noise of the output explains it, for the greater part."""
         return self.rms <= _MOST_COLOURED * self.noise
+
+    def beyond(self, fit: Residual) -> float | None:
+        """Rms in that of a fit to other samples, or in the noise if it is more; None if the twin holds for both."""
+        least = max(fit.rms, self.noise)
+        return self.rms / least if self.rms > _MOST_BEYOND_FIT * least > 0.0 else None
 
     def excess(self, rms: float) -> float:
         """Rms beyond the noise, of this or another difference from the same samples."""
@@ -204,10 +213,12 @@ class RecordedPlant:
         self.output_unit = conditions.channels[self._measured[1]].unit
         self.plays = 0
 
-    def span(self, first: int, end: int, settling_n: int = SETTLING_N) -> Span:
+    def span(self, first: int, end: int, settling_n: int = SETTLING_N, *, is_led_in: bool = False) -> Span:
         """Span of the recording.
 
         :param settling_n: samples at its beginning that are played and not compared.
+        :param is_led_in: the machine plays the samples before it, too, since the last change of the plant and the last
+            missing sample of the input.
         :raises ConfigurationError: it lies outside, is too short, or lacks a sample of the input.
         """
         if not 0 <= first < end <= self.run.samples:
@@ -234,12 +245,20 @@ class RecordedPlant:
                 f"samples {first} to {end}: {count} of the output are neither missing nor clipped after settling;"
                 f" a span needs {_LEAST_N}"
             )
-        return Span(first, end, u, y, valid)
+        before = self.run.channel(self._measured[0])[self._lead(first) : first] if is_led_in else u[:0]
+        return Span(first, end, before, u, y, valid)
+
+    def _lead(self, first: int) -> int:
+        """First of the samples before ``first`` in which the input is known and the plant does not change."""
+        changes = [start for start, _, _ in self.run.segments if start <= first]
+        at = self.run.conditions.program.channels.index(self._measured[0])
+        lacking = np.flatnonzero(self.run.clipped[:first, at]) + 1
+        return max(0, *changes, *(int(each) for each in lacking[-1:]))
 
     def simulate(
         self, values: Mapping[str, float], span: Span, reconstruction: Reconstruction = "band-limited"
     ) -> NDArray[np.float64]:
-        """Output of the machine in its unit, (n,), played from rest with the input of a span.
+        """Output of the machine in its unit, (n,), played from rest with the input of a span and that before it.
 
         :param values: by parameter; those without a pot keep theirs.
         :raises PotError, EngineError: the machine cannot be set so, or is unstable.
@@ -247,9 +266,10 @@ class RecordedPlant:
         self.plays += 1
         scales = self.program.scales
         self._computer.set(**{name: value for name, value in values.items() if name in self.program.values})
-        played = RecordedExcitation(span.u * MACHINE_V / scales.full(self.input), reconstruction == "held")
-        volts = np.concatenate([block[:, self._at] for block in self._computer.play(played, span.end - span.first)])
-        return np.asarray(volts * scales.full(self.output) / MACHINE_V)
+        u = np.concatenate([span.before, span.u])
+        played = RecordedExcitation(u * MACHINE_V / scales.full(self.input), reconstruction == "held")
+        volts = np.concatenate([block[:, self._at] for block in self._computer.play(played, len(u))])
+        return np.asarray(volts[len(span.before) :] * scales.full(self.output) / MACHINE_V)
 
     def difference(
         self, values: Mapping[str, float], span: Span, reconstruction: Reconstruction = "band-limited"
@@ -304,6 +324,8 @@ class _ProgramFit:
         rows = program.equations.parameters
         _check_fixed(program, fixed)
         names = [name for name in program.values if rows[name].low < rows[name].high and name not in fixed]
+        if not names and fixed:
+            raise ConfigurationError(f"program {program.name}: every parameter with a range is fixed; leave one to fit")
         if not names:
             raise ConfigurationError(f"program {program.name}: no parameter has a range to fit it in")
         self._plant, self._span, self._fixed, self._progress = plant, span, dict(fixed), progress
