@@ -24,7 +24,7 @@ from analogrig.recordings.imported import ImportDescription
 from analogrig.rigs.description import describe
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario
-from analogrig_emulator.machine.compiler import load_program
+from analogrig_emulator.machine.compiler import load_patch
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "harness" / "docs"
@@ -109,7 +109,7 @@ def test_every_toml_file_of_a_page_is_accepted(page: Path, tmp_path: Path) -> No
         elif table.get("kind") == "emulator":
             describe(str(path))
         elif "equations" in table:
-            load_program(path)
+            load_patch(path)
             path.rename(tmp_path / f"{table['name']}.toml")  # for the scenarios of the page
         elif "input" in table:
             config.build(ImportDescription, table, "example")

@@ -50,7 +50,7 @@ from analogrig_emulator.errors import (
     ProgramError,
     SamplerError,
 )
-from analogrig_emulator.machine.compiler import PatchedProgram, load_program, wired
+from analogrig_emulator.machine.compiler import PatchedProgram, circuit_of, compile_program, load_patch
 from analogrig_emulator.machine.courses import Course, Courses, Moment, RepeatedCourses, WideProgram, Wired
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.modes import LinearMode
@@ -70,7 +70,7 @@ from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
 from analogrig_emulator.machine.units import Unit, parse_unit
-from analogrig_emulator.streams import normals, uniforms
+from analogrig_emulator.streams import NormalStream, normals, uniforms
 
 __all__ = [
     "ABSOLUTE_ZERO_C",
@@ -124,6 +124,7 @@ __all__ = [
     "MultiplierGrade",
     "MultiplierModel",
     "NoisySuspension",
+    "NormalStream",
     "OpAmp",
     "OpAmpGrade",
     "OpAmpModel",
@@ -158,11 +159,13 @@ __all__ = [
     "Wired",
     "acquired",
     "ahead_ticks",
+    "circuit_of",
+    "compile_program",
     "drawn_levels",
     "drawn_offsets_v",
     "equations_of",
     "is_repeatable",
-    "load_program",
+    "load_patch",
     "normals",
     "parse_unit",
     "piecewise_linear",
@@ -171,5 +174,4 @@ __all__ = [
     "sample_plays",
     "to_spice",
     "uniforms",
-    "wired",
 ]

@@ -3,6 +3,7 @@
 The figure of a row is max |x - x_ideal| over SAMPLES samples of a 200 Hz square wave of 0..10 V at the converter's
 input, in LSB of 10 V / 4096; for random effects, the median over DRAWS seeds. The front suspension plays the four
 changes of the thesis. The shock absorber plays the same in proportion, without M / 4, which is beyond its mass pot.
+Rows of the multiplier have a spring that hardens with the cube of the displacement, which takes two multipliers.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from analogrig_emulator.card.sampler import Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.components import (
     DIELECTRICS,
     FINE_OP_AMP_GRADES,
+    MULTIPLIER_GRADES,
     NOMINAL,
     REFERENCE_C,
     Components,
@@ -29,10 +31,13 @@ from analogrig_emulator.circuit.components import (
     OpAmpGrade,
     PotGrade,
 )
+from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, MultiplierModel
 from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
 from analogrig_emulator.circuit.pot import PotTurn
+from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.noise import ABSOLUTE_ZERO_C, QUIET, NoisySuspension, Supply
 from analogrig_emulator.machine.program import CHANNELS, ProgramCircuit
+from analogrig_emulator.machine.program_file import parse_program
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
 
@@ -55,7 +60,7 @@ class Effect:
     draws: int
 
 
-_FRONT_CHANGES: Sequence[PotTurn] = (
+FRONT_CHANGES: Sequence[PotTurn] = (
     PotTurn(200, {"K": 18000.0}),
     PotTurn(400, {"B": 3453.0}),
     PotTurn(500, {"B": 2123.0, "K": 20000.0}),
@@ -68,8 +73,8 @@ def _in_proportion(settings: Mapping[str, float]) -> dict[str, float]:
 
 
 _CHANGES: Mapping[str, Sequence[PotTurn]] = {
-    "shock": tuple(PotTurn(change.sample, _in_proportion(change.values)) for change in _FRONT_CHANGES[:-1]),
-    "front": _FRONT_CHANGES,
+    "shock": tuple(PotTurn(change.sample, _in_proportion(change.values)) for change in FRONT_CHANGES[:-1]),
+    "front": FRONT_CHANGES,
 }
 
 _SLOW_CHANGE_N = 100
@@ -110,6 +115,7 @@ class _Setup:
     """
 
     op_amp: OpAmpModel = IDEAL
+    multiplier: MultiplierModel = MULTIPLIERS["ideal"]
     components: Components = NOMINAL
     noise: OpAmpGrade | None = None
     card: Card = _CARD
@@ -133,7 +139,13 @@ class _Setup:
         """Converter input or code of the displacement at every sample: (SAMPLES,), LSB."""
         rate_hz = self.card.true_rate_hz * probes_per_sample(self.card)
         components = dataclasses.replace(self.components, seed=seed)
-        machine = SuspensionComputer(program, opamp=self.op_amp, components=components, sample_rate_hz=rate_hz)
+        machine = SuspensionComputer(
+            program,
+            opamp=self.op_amp,
+            multiplier=self.multiplier,
+            components=components,
+            sample_rate_hz=rate_hz,
+        )
         rng = np.random.default_rng(seed)
         machine.set(**self.operator(machine, program.values, rng))
         changes = [PotTurn(k, self.operator(machine, values, rng), n) for k, values, n in self._changes(program)]
@@ -160,12 +172,46 @@ _Make = Callable[[int], _Setup]
 
 
 def measure_effects(program: str) -> Iterator[Effect]:
-    """Yield the rows for a program ("shock" or "front"), about 3 s in all."""
-    chosen = PROGRAMS[program]
-    ideal_lsb = _Setup().displacement_lsb(chosen, 0)
-    for name, draws, make in _rows():
-        figures = [make(seed).figure_lsb(chosen, seed, ideal_lsb) for seed in range(draws)]
-        yield Effect(name, float(np.median(figures)), max(figures), draws)
+    """Yield the rows for a program ("shock" or "front"), about 4 s in all."""
+    for chosen, rows in ((PROGRAMS[program], _rows()), (hardening(program), _multiplier_rows())):
+        ideal_lsb = _Setup().displacement_lsb(chosen, 0)
+        for name, draws, make in rows:
+            figures = [make(seed).figure_lsb(chosen, seed, ideal_lsb) for seed in range(draws)]
+            yield Effect(name, float(np.median(figures)), max(figures), draws)
+
+
+def hardening(program: str, cubic_per_m2: float = 15.0) -> ProgramCircuit:
+    """The suspension with a spring of force K x + cubic_per_m2 K x^3, K the program's value: a fifth more at 0.12 m."""
+    base = PROGRAMS[program]
+    fulls, values = base.scales, base.values
+    least = {"M": 0.25 if program == "front" else 1.0, "B": 0.7, "K": 0.7}
+    rows = "\n".join(
+        f"{name} = {{ value = {value}, range = [{least[name] * value}, {1.2 * value}] }}"
+        for name, value in values.items()
+    )
+    return compile_program(
+        parse_program(
+            f"""
+name = "{program}"
+speed = {fulls.time}
+channels = ["force", "displacement", "velocity", "net_force"]
+equations = '''
+displacement' = velocity
+net_force = force - B*velocity - K*displacement - cubic*displacement**3
+velocity' = net_force / M
+'''
+[inputs]
+force = {{ full = {fulls.full("force")} }}
+[states]
+displacement = {{ full = {fulls.full("displacement")} }}
+velocity = {{}}
+[parameters]
+cubic = {{ value = {cubic_per_m2 * values["K"]} }}
+{rows}
+""",
+            program,
+        )
+    )
 
 
 def _rows() -> Iterator[tuple[str, int, _Make]]:
@@ -250,10 +296,34 @@ def _supply_rows() -> Iterator[tuple[str, int, _Make]]:
     yield "hum of 0.1 V, rejected by 100 dB", 1, _constant(humming)
 
 
+def _multiplier_rows() -> Iterator[tuple[str, int, _Make]]:
+    ad633, errors = MULTIPLIERS["ad633"], MULTIPLIER_GRADES["ad633"]
+    pole = MultiplierModel(bandwidth_hz=ad633.bandwidth_hz)
+    models = {
+        "scale error 0.25 %": MultiplierModel(gain_error=errors.gain_error),
+        "offset of x 5 mV": MultiplierModel(x_offset_v=errors.x_offset_v),
+        "offset of y 5 mV": MultiplierModel(y_offset_v=errors.y_offset_v),
+        "offset of output 5 mV": MultiplierModel(z_offset_v=errors.z_offset_v),
+        "non-linearity of x 0.4 %": MultiplierModel(x_nonlinearity=errors.x_nonlinearity),
+        "non-linearity of y 0.1 %": MultiplierModel(y_nonlinearity=errors.y_nonlinearity),
+        "1 MHz": pole,
+        "1 MHz, slew 20 V/us": dataclasses.replace(pole, slew_v_per_s=ad633.slew_v_per_s),
+        "1 MHz, swing +-11 V": dataclasses.replace(pole, swing_v=ad633.swing_v),
+    }
+    for name, model in models.items():
+        yield f"AD633, {name}", 1, _constant(_Setup(multiplier=model))
+    drawn = Components(multipliers=errors)
+    yield "AD633, all errors drawn", DRAWS, _constant(_Setup(multiplier=ad633, components=drawn))
+    noisy = _Setup(multiplier=ad633, noise=OpAmpGrade(), temperature_c=ABSOLUTE_ZERO_C)
+    yield "AD633, noise 0.8 uV/rtHz", DRAWS, _constant(noisy)
+
+
 def _dielectric_rows() -> Iterator[tuple[str, int, _Make]]:
     for name in ("polyester", "polypropylene"):
         absorption = dataclasses.replace(DIELECTRICS[name], leakage_s=math.inf)
         yield f"dielectric absorption, {name}", 1, _with_components(Components(dielectric=absorption))
+        fastest = dataclasses.replace(absorption, absorption=absorption.absorption[:1])
+        yield f"absorption 10 to 215 us, {name}", 1, _with_components(Components(dielectric=fastest))
     leakage = Dielectric(leakage_s=DIELECTRICS["polyester"].leakage_s)
     yield "capacitor leakage, polyester", 1, _with_components(Components(dielectric=leakage))
 

@@ -1,4 +1,4 @@
-"""First numbers of the random streams default_rng([seed, stream]) of many seeds.
+"""Numbers of the random streams default_rng([seed, stream]), the first ones of many seeds at once.
 
 They are numpy's to the bit. To make a generator of numpy for each seed takes as long as some hundred samples.
 """
@@ -26,10 +26,25 @@ def uniforms(seeds: Sequence[int], stream: int, count: int) -> NDArray[np.float6
 
 def normals(seeds: Sequence[int], stream: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Standard normal numbers, as of standard_normal(shape): (seeds, *shape)."""
-    states, out = _states(seeds, stream), np.empty((len(seeds), *shape))
-    normal, width, limit = _ziggurat()
+    return _next_normals(_states(seeds, stream), shape)
+
+
+class NormalStream:
+    """Standard normal numbers of one seed, in a third of the time of numpy's generator."""
+
+    def __init__(self, seed: int, stream: int) -> None:
+        self._states = _states([seed], stream)
+
+    def standard_normal(self, size: tuple[int, ...], /) -> NDArray[np.float64]:
+        """The next numbers: (*size,)."""
+        return _next_normals(self._states, size).reshape(size)
+
+
+def _next_normals(states: NDArray[np.uint64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """The next numbers of each stream, (streams, *shape); the states are then those after them."""
+    out, (normal, width, limit) = np.empty((len(states), *shape)), _ziggurat()
     table = (normal, width.ctypes.data, limit.ctypes.data)
-    library.load().engine_normals(*table, len(seeds), math.prod(shape), states.ctypes.data, out.ctypes.data)
+    library.load().engine_normals(*table, len(states), math.prod(shape), states.ctypes.data, out.ctypes.data)
     return out
 
 

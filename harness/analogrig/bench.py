@@ -39,8 +39,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _INTERRUPTED_BY = "interrupted by "
 """Start of the fault of an interrupted run; the name of the signal follows."""
 
-DIRECT_BLOCK_SAMPLES = 16_384
-"""Block length in samples of a direct bench; such blocks fit in the cache."""
+DIRECT_BLOCK_SAMPLES = 131_072
+"""Block length in samples of a direct bench. The circuit of a longer run is prepared anew for each seed."""
 
 
 class RunBuilder:
@@ -439,7 +439,7 @@ def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bo
 
     If ``can_be_direct``, the runs are those over the line to the bit, without what needs messages.
 
-    :param alarms_only: omit the estimates, which take a fifth of the time: theta of the runs has no columns.
+    :param alarms_only: omit the estimates, which take a twentieth of the time: theta of the runs has no columns.
     :raises ConfigurationError: the estimator refuses its configuration.
     :raises LinkError: the library of the device was not built.
     """

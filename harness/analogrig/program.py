@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.catalogue import Change
 from analogrig.errors import ConfigurationError
-from analogrig_emulator import EmulatorError, Equations, PotError, ProgramError, ProgramParameter, equations_of, wired
+from analogrig_emulator import (
+    EmulatorError,
+    Equations,
+    PotError,
+    ProgramError,
+    ProgramParameter,
+    circuit_of,
+    equations_of,
+)
 
 if TYPE_CHECKING:
     from analogrig_emulator import ProgramCircuit
@@ -106,7 +114,7 @@ class Program:
         :raises ConfigurationError: the machine cannot be patched so; names the term and the cure.
         """
         try:
-            return wired(self.equations)
+            return circuit_of(self.equations)
         except EmulatorError as error:
             raise ConfigurationError(f"program {self.name}: {error}") from error
 

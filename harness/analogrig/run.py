@@ -146,7 +146,7 @@ class Conditions:
     sample_period_s: float
     """Machine time between samples."""
     time_scale: float
-    """Problem time per machine time (200: the computer runs 200 times faster than the motorcycle)."""
+    """Problem time per machine time: the computer runs ``speed`` times faster than the plant."""
     channels: Mapping[str, Channel]
     segments: tuple[Segment, ...]
     """True plant, which the device never receives; empty if the rig does not know it."""

@@ -27,10 +27,9 @@ from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     Deck,
     Excitation,
-    Multiplier,
     PatchedProgram,
     SuspensionComputer,
-    load_program,
+    load_patch,
 )
 from tests.emulator.test_compiler import levels_v
 
@@ -112,11 +111,12 @@ class Played:
 
     @classmethod
     def of(cls, name: str, samples: int = SAMPLES) -> Played:
-        """A shipped program with AD633 multipliers."""
-        program = load_program(fixtures() / "programs" / f"{name}.toml")
-        model = MULTIPLIERS["ad633"]
-        elements = (replace(each, model=model) if isinstance(each, Multiplier) else each for each in program.elements)
-        return cls(replace(program, elements=tuple(elements)), samples)
+        """A shipped program."""
+        return cls(load_patch(fixtures() / "programs" / f"{name}.toml"), samples)
+
+    def computer(self, rng: np.random.Generator | None = None) -> SuspensionComputer:
+        """A machine with AD633; rng draws offsets of the op-amps."""
+        return SuspensionComputer(self.program, multiplier=MULTIPLIERS["ad633"], rng=rng)
 
     def play(self, computer: SuspensionComputer) -> NDArray[np.float64]:
         return np.concatenate(list(computer.play(self.excitation, self.samples)))
@@ -125,11 +125,11 @@ class Played:
     def exact_v(self) -> NDArray[np.float64]:
         """Output at its node, by the emulator."""
         sign = self.program.scales.quantities[self.program.channels[1]].sign
-        return sign * self.play(SuspensionComputer(self.program))[:, 1]
+        return sign * self.play(self.computer())[:, 1]
 
     def deck(self, setting: Setting) -> str:
         edges = self.excitation.edges(0, self.samples * TICKS_PER_SAMPLE, RATE_HZ)
-        deck = Deck(SuspensionComputer(self.program).circuit, self.samples, RATE_HZ, {"F": edges})
+        deck = Deck(self.computer().circuit, self.samples, RATE_HZ, {"F": edges})
         text = in_setting(deck.text([self.node], setting.accuracy), setting, r"U\d+")
         return text.replace(_LIMITS, _LINEAR_STATE) if setting.op_amps == "knowing" else text
 
@@ -182,7 +182,7 @@ def _best(played: Played, settings: Iterable[Setting], accuracy_lsb: float) -> t
 
 
 def _warm_s(played: Played) -> float:
-    return best_s(lambda: [played.play(SuspensionComputer(played.program)) for _ in range(WARM_PLAYS)]) / WARM_PLAYS
+    return best_s(lambda: [played.play(played.computer()) for _ in range(WARM_PLAYS)]) / WARM_PLAYS
 
 
 def _own_s(played: Played) -> float:
@@ -191,7 +191,7 @@ def _own_s(played: Played) -> float:
 
     def run() -> None:
         for seed in itertools.islice(seeds, WARM_PLAYS):
-            played.play(SuspensionComputer(played.program, rng=np.random.default_rng(seed)))
+            played.play(played.computer(np.random.default_rng(seed)))
 
     return best_s(run) / WARM_PLAYS
 
@@ -203,7 +203,7 @@ played = Played.of(sys.argv[1], int(sys.argv[2]))
 played.excitation
 next(SuspensionComputer("front").play(played.excitation, 1))
 start_s = time.process_time()
-played.play(SuspensionComputer(played.program))
+played.play(played.computer())
 print(time.process_time() - start_s)
 """
 """The engine itself is loaded by another circuit."""

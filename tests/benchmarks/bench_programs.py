@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.rigs.description import describe
+from analogrig.rigs.emulator import EmulatorDescription
 from analogrig_emulator import (
-    COMPONENTS,
-    MULTIPLIER_GRADES,
-    OP_AMP_GRADES,
+    MULTIPLIERS,
     TICKS_PER_SAMPLE,
     Circuit,
     Components,
@@ -57,11 +57,11 @@ absolute values, minima, quotients, roots, curves. The square wave of its trial 
 Ideal parts: the largest difference at any channel from the equations of the file, solved by scipy's
 DOP853 to 1e-9. Half of the programs divide by states or take roots of them.
 
-Real parts: the largest difference at any amplifier from ngspice, in the tightest setting with which
-it reaches the end. The parts are those of the rig `emulator-real`: drawn resistors, capacitors that
-leak, TL07x, AD633. Absorption is left out, for it would exceed the 64 states of the engine. The
-largest programs have more than the engine's 256 nodes and branches with real parts. They have
-nominal parts and drawn offsets.
+Real parts: the largest difference at any amplifier or multiplier from ngspice, in the tightest
+setting with which it reaches the end. The parts are those of the rig `emulator-real`: drawn
+resistors, capacitors that leak, TL07x, AD633 with errors, pole and limits. Absorption is left out,
+for it would exceed the 64 states of the engine. The largest programs have more than the engine's
+256 nodes and branches with real parts. In these only op-amps and multipliers are real.
 
 Required are {MOST_LSB:g} LSB of 12 bits. Each patch has the slopes of its equations at random places.
 """
@@ -129,29 +129,25 @@ def outcome_of(seed: int) -> Outcome:
     return Outcome(seed, "", states, products, ideal_lsb, off_ngspice_lsb(program))
 
 
-def real_parts(seed: int) -> Components:
-    """Parts of the rig ``emulator-real``, drawn from the seed; absorption would exceed the states of the engine."""
-    polypropylene = COMPONENTS["polypropylene"]
-    return replace(
-        polypropylene,
-        dielectric=replace(polypropylene.dielectric, absorption=()),
-        temperature_c=40.0,
-        op_amps=OP_AMP_GRADES["tl07x"],
-        multipliers=MULTIPLIER_GRADES["ad633"],
-        seed=seed,
-    )
-
-
 def _real_computer(program: PatchedProgram, seed: int) -> SuspensionComputer:
-    """Computer with real parts; if they are more than the engine takes, with drawn offsets alone."""
+    """Computer with the parts of the rig ``emulator-real``, drawn from the seed, as far as the engine takes them.
+
+    Absorption would exceed its states. If the others are too many, op-amps and multipliers alone are real.
+    """
+    description = describe("emulator-real")
+    assert isinstance(description, EmulatorDescription)
+    parts, multiplier = description.computer, MULTIPLIERS[description.computer.multiplier_name]
+    real = parts.components_for(seed)
+    real = replace(real, dielectric=replace(real.dielectric, absorption=()))
     try:
-        return SuspensionComputer(program, components=real_parts(seed))
+        return SuspensionComputer(program, opamp=parts.op_amp, multiplier=multiplier, components=real)
     except CircuitError:
-        return SuspensionComputer(program, rng=np.random.default_rng(seed))
+        active = Components(op_amps=replace(real.op_amps, bias_a=0.0), multipliers=real.multipliers, seed=seed)
+        return SuspensionComputer(program, opamp=parts.op_amp, multiplier=multiplier, components=active)
 
 
 def off_ngspice_lsb(program: PatchedProgram) -> float:
-    """Largest difference of real parts from ngspice at any amplifier, in LSB."""
+    """Largest difference of real parts from ngspice at any amplifier and multiplier, in LSB."""
     computer = _real_computer(program, int(program.name.removeprefix("random-")))
     low_v, high_v = levels_v(program)
     # At an edge's own instant ngspice still shows the level before it, so no edge is to fall on a sample.
@@ -159,7 +155,8 @@ def off_ngspice_lsb(program: PatchedProgram) -> float:
         0, REAL_SAMPLES * TICKS_PER_SAMPLE, RATE_HZ
     )
     deck = Deck(computer.circuit, REAL_SAMPLES, RATE_HZ, {"F": edges})
-    outputs = [amp.out for amp in deck.circuit.of(OpAmp)]
+    amplifiers, multipliers = deck.circuit.of(OpAmp), deck.circuit.of(Multiplier)
+    outputs = [each.out for each in amplifiers] + [each.out for each in multipliers]
     return float(np.abs(deck.volts(outputs) - _by_ngspice(deck, outputs)).max() / LSB_V)
 
 

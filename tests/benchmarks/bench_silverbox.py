@@ -20,7 +20,7 @@ from analogrig.reporting.measured import Oscillation, mode_of
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
-from analogrig_emulator import CHANNELS, PatchedProgram, load_program
+from analogrig_emulator import CHANNELS, PatchedProgram, load_patch
 from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.program_file import parse_program
 
@@ -42,7 +42,7 @@ Each row is a machine with the program `silverbox`. `analogrig calibrate` fits i
 samples {FITTED[0]:,} to {FITTED[1]:,} alone, the multisines. It then plays the arrow head, samples 0 to
 {GROWTH_END:,}, with the recorded input, and never sees the recorded output. The first 200 samples of
 either are not compared. The amplifiers are TL07x (`--op-amp tl07x`). Real parts are polyester
-capacitors, 1 % resistors, and multipliers with the errors of the AD633's data sheet. The pots are
+capacitors, 1 % resistors, and AD633 multipliers with drawn errors. The pots are
 continuous.
 
 The linear rows leave out the multipliers: the best that a mass, a damper and a linear spring do.
@@ -59,7 +59,7 @@ def figures() -> Iterator[Figure]:
     except FileNotFoundError as absent:
         print(f"silverbox is skipped: {absent}")
         return
-    program = load_program(fixtures() / "programs" / "silverbox.toml")
+    program = load_patch(fixtures() / "programs" / "silverbox.toml")
     for name, (computer, seed) in MACHINES.items():
         yield from _fitted(name, program, run, computer, seed)
     yield from _fitted("linear, nominal parts", linear(program), run, ComputerDescription(), 0)

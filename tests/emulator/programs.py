@@ -14,7 +14,7 @@ from analogrig_emulator import (
     PatchedProgram,
     ProgramCircuit,
     SuspensionProgram,
-    load_program,
+    load_patch,
 )
 
 FOLDER = Path(__file__).parents[2] / "fixtures" / "programs"
@@ -23,7 +23,7 @@ FILES = sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 def program_of(name: str) -> PatchedProgram:
     """Compile a shipped program, also one that is wired by hand."""
-    return load_program(FOLDER / f"{name}.toml")
+    return load_patch(FOLDER / f"{name}.toml")
 
 
 @dataclass(frozen=True)

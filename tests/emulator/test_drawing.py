@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from analogrig_emulator.machine.compiler import PatchedProgram, load_program
+from analogrig_emulator.machine.compiler import PatchedProgram, load_patch
 from analogrig_emulator.machine.drawing import patch_drawing
 from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Box, PatchLayout, Point, lay_out
 from analogrig_emulator.machine.sheet import inverters
@@ -20,7 +20,7 @@ Line = tuple[Point, Point]
 
 @pytest.fixture(params=sorted(PROGRAMS.glob("*.toml")), ids=lambda path: path.stem)
 def program(request: pytest.FixtureRequest) -> PatchedProgram:
-    return load_program(request.param)
+    return load_patch(request.param)
 
 
 def blocks_of(program: PatchedProgram) -> list[Box]:

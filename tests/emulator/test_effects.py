@@ -21,7 +21,7 @@ from analogrig_emulator import (
     PotTurn,
     SuspensionComputer,
 )
-from analogrig_emulator.effects import Effect, measure_effects
+from analogrig_emulator.effects import FRONT_CHANGES, SAMPLES, Effect, hardening, measure_effects
 
 REFERENCE_LSB = {
     "R 1 %, C 5 %, not calibrated": (47.0, 60.0),
@@ -137,6 +137,17 @@ def test_simple_effects_have_their_closed_form() -> None:
     assert front["droop 0.5 V/s, one conversion"].median_lsb == pytest.approx(5e-6 / (10.0 / 4096))
     delay, skew = front["aperture delay 50 ns"].median_lsb, front["10 us channel skew"].median_lsb
     assert delay == pytest.approx(skew * 50e-9 / 10e-6, rel=0.05)
+
+
+def test_scale_errors_of_two_multipliers_harden_the_spring() -> None:
+    """Scale errors of 0.25 % in x x and in (x x) x make the cubic part 1.0025^2 times as large."""
+
+    def displacement_v(cubic_per_m2: float) -> NDArray[np.float64]:
+        machine = SuspensionComputer(hardening("front", cubic_per_m2), opamp="ideal")
+        return np.concatenate(list(machine.play(Excitation(), SAMPLES, FRONT_CHANGES)))[:, 1]
+
+    expected_lsb = np.abs(displacement_v(15.0 * 1.0025**2) - displacement_v(15.0)).max() / (10.0 / 4096)
+    assert table("front")["AD633, scale error 0.25 %"].median_lsb == pytest.approx(expected_lsb, rel=1e-3)
 
 
 def test_noise_is_a_few_times_its_rms() -> None:

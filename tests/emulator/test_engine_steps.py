@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from analogrig_emulator import (
     TICKS_PER_SAMPLE,
+    Card,
     Circuit,
     Edges,
     Engine,
@@ -24,6 +25,7 @@ from analogrig_emulator import (
     SuspensionComputer,
     VoltageSource,
     piecewise_linear,
+    sample_plays,
 )
 from analogrig_emulator.engine import library
 from tests.emulator.programs import circuit_of
@@ -130,7 +132,14 @@ def test_bits_do_not_depend_on_the_width_of_registers_or_the_compilers_options(
         ("two-mass", "741", OVERLOAD),
         ("van-der-pol", "tl07x", FREE),
     )
-    usual = [played(*case, 200).tobytes() for case in cases]
+    volts, normals = 8.0 * np.random.default_rng(1).standard_normal((2, 3, 51, 4))
+    cards = [Card(noise_lsb=(0.3,) * 4, stuck_high=1), Card(bits=16, ranges_v=((0.0, 10.0),), noise_lsb=(0.3,))]
+
+    def sampled() -> list[bytes]:
+        codes = [sample_plays(card, volts[..., : card.channels], normals[..., : card.channels]) for card in cards]
+        return [array.tobytes() for arrays in codes for array in arrays]
+
+    usual = [played(*case, 200).tobytes() for case in cases], sampled()
     other = compiled(*options)
     monkeypatch.setattr(library, "load", lambda: other)
-    assert [played(*case, 200).tobytes() for case in cases] == usual
+    assert ([played(*case, 200).tobytes() for case in cases], sampled()) == usual

@@ -40,7 +40,7 @@ from analogrig_emulator import (
 from analogrig_emulator.circuit.components import MULTIPLIER_GRADES, OP_AMP_GRADES, Components, MultiplierGrade
 from analogrig_emulator.circuit.spice import Accuracy
 from analogrig_emulator.engine import engine as engine_module
-from analogrig_emulator.engine.system import Product
+from analogrig_emulator.engine.system import Law, Product
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]
@@ -296,6 +296,29 @@ def test_a_multiplier_in_the_feedback_divides_and_takes_square_roots() -> None:
         assert abs(root) == pytest.approx(math.sqrt(-10.0 * u), abs=1e-6)
 
 
+def test_ideal_elements_divide_and_take_roots_as_in_ngspice(ngspice: NgSpice) -> None:
+    elements: list[Element] = [
+        Resistor("R1", "x", "a", 10e3),
+        Capacitor("C1", "a", "0", 10e-9),
+        Multiplier("D", "a", "y", "q", -10.0, law=Law.QUOTIENT),
+        Multiplier("W", "q", "q", "r", -10.0, law=Law.ROOT, sign=-1),
+        Resistor("R2", "r", "b", 10e3),
+        Capacitor("C2", "b", "0", 10e-9),
+    ]
+    sources = (VoltageSource("X", "x", "0"), VoltageSource("Y", "y", "0", 4.0))
+    deck = Deck(Circuit([*elements, *sources]), samples=60, edges={"X": square(60, 6.0)})
+    volts = ngspice(deck.text(("q", "r", "b"), FINE), ("q", "r", "b"), 60)
+    assert np.abs(deck.volts(("q", "r", "b")) - volts).max() < 0.05 * LSB_V
+    q, r, _ = deck.volts(("q", "r", "b")).T
+    assert r == pytest.approx(-np.sqrt(np.maximum(0.0, -10.0 * q)), abs=1e-9)
+
+
+def test_division_by_a_voltage_that_reaches_zero_is_refused() -> None:
+    divider = Multiplier("D", "x", "y", "o", law=Law.QUOTIENT)
+    with pytest.raises(EngineError, match="a loop of ideal elements|a divisor reached zero"):
+        outputs(divider, x=3.0, y=0.0)
+
+
 def test_ideal_multipliers_follow_one_another_without_a_state_between() -> None:
     fifth: list[Element] = [
         Multiplier("M1", "x", "x", "a"),
@@ -370,6 +393,7 @@ def test_ideal_multipliers_in_a_loop_are_refused() -> None:
     [
         (Multiplier("M", "x", "x", "o", 0.0), r"Multiplier M \(x x o\): scale_v must not be 0"),
         (Multiplier("M", "x", "x", "o", math.nan), "scale_v must be finite"),
+        (Multiplier("M", "x", "x", "o", model=AD633, law=Law.ROOT), "takes roots by itself is ideal"),
         (Function("G", "x", "o", ((0.0, 1.0),)), r"Function G \(x o\): needs at least two breakpoints"),
         (Function("G", "x", "o", ((0.0, 1.0), (0.0, 2.0))), "must ascend"),
         (Function("G", "x", "o", ((0.0, 1.0), (1.0, math.inf))), "must be finite"),

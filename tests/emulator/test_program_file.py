@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from analogrig_emulator.errors import ProgramError
-from analogrig_emulator.machine.compiler import load_program
+from analogrig_emulator.machine.compiler import load_patch
 from analogrig_emulator.machine.program_file import parse_program
 
 MOTOR = """
@@ -367,7 +367,7 @@ def test_bad_file_is_refused_in_one_line(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_bytes(change(MOTOR).encode("utf-8", "surrogateescape"))
     with pytest.raises(ProgramError, match=f"{path}: .*{message}") as refusal:
-        load_program(path)
+        load_patch(path)
     text = str(refusal.value)
     assert "\n" not in text and len(text) < 400
     assert text.count(str(path)) == 1
@@ -375,10 +375,10 @@ def test_bad_file_is_refused_in_one_line(kind: str, tmp_path: Path) -> None:
 
 def test_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ProgramError, match="absent.toml: cannot be read: No such file"):
-        load_program(tmp_path / "absent.toml")
+        load_patch(tmp_path / "absent.toml")
 
 
 def test_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     with pytest.raises(ProgramError, match="pipe.toml: cannot be read: it is no regular file"):
-        load_program(tmp_path / "pipe.toml")
+        load_patch(tmp_path / "pipe.toml")

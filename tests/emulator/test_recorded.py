@@ -24,7 +24,7 @@ from analogrig_emulator import (
     Resistor,
     SuspensionComputer,
     VoltageSource,
-    load_program,
+    load_patch,
     piecewise_linear,
 )
 from analogrig_emulator.engine.system import Drive
@@ -93,7 +93,7 @@ def test_a_constant_drive_equals_an_edge_and_cuts_change_no_bit() -> None:
 
 
 def test_a_duffing_oscillator_follows_a_recorded_input_as_its_equations_do() -> None:
-    program = load_program(PROGRAMS / "duffing.toml")
+    program = load_patch(PROGRAMS / "duffing.toml")
     rate_hz, samples = 4e3, 120
     u_v = 4.0 + sine(samples, 0.03, 3.0)
     u_v[:20] *= np.linspace(0.0, 1.0, 20) ** 2
@@ -150,13 +150,15 @@ def test_wrong_drives_are_refused() -> None:
     for terms in (np.zeros((3, 4)), np.zeros((0, 5)), np.full((3, 5), np.inf)):
         with pytest.raises(EngineError, match="finite coefficients"):
             Engine(system, ["out"], RATE_HZ, drives={"IN": Drive(terms)})
+    with pytest.raises(EngineError, match="a drive begins after it"):
+        Engine(system, ["out"], RATE_HZ, drives={"IN": Drive(np.zeros((3, 5)), first=3)})
     engine = Engine(system, ["out"], RATE_HZ, drives={"IN": Drive.band_limited(np.zeros(3))})
     with pytest.raises(EngineError, match="no input is called 'IN'"):
         engine.run(3, {"IN": Edges(np.zeros(1, np.int64), np.ones(1))})
 
 
 def test_a_held_recording_is_the_square_wave_that_it_samples() -> None:
-    computer = SuspensionComputer(load_program(PROGRAMS / "duffing.toml"))
+    computer = SuspensionComputer(load_patch(PROGRAMS / "duffing.toml"))
     square = Excitation(low_v=1.0, high_v=5.0, frequency_hz=500.0)
     held = RecordedExcitation(square_levels(square, computer.sample_rate_hz), is_held=True)
     one, other = (np.concatenate(list(computer.play(each, 400))) for each in (square, held))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from analogrig_emulator import SuspensionComputer
-from analogrig_emulator.machine.compiler import compile_program, load_program
+from analogrig_emulator.machine.compiler import compile_program, load_patch
 from analogrig_emulator.machine.drawing import patch_drawing
 from analogrig_emulator.machine.program_file import parse_program
 from analogrig_emulator.machine.sheet import dials, scaling_sheet
@@ -18,7 +18,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def test_sheet_has_what_an_operator_needs() -> None:
-    lines = [" ".join(line.split()) for line in scaling_sheet(load_program(FOLDER / "dc-motor.toml")).splitlines()]
+    lines = [" ".join(line.split()) for line in scaling_sheet(load_patch(FOLDER / "dc-motor.toml")).splitlines()]
     for line in (
         "1 s of the machine is 10 s of the plant.",
         "u V 24 0 to 20 in +",
@@ -32,13 +32,13 @@ def test_sheet_has_what_an_operator_needs() -> None:
 
 
 def test_dials_of_the_sheet_are_those_of_the_machine() -> None:
-    program = load_program(FOLDER / "dc-motor.toml")
-    assert SuspensionComputer(program).dials == pytest.approx(dials(program))
+    program = load_patch(FOLDER / "dc-motor.toml")
+    assert SuspensionComputer(program).dials == pytest.approx(dials(program, program.values))
 
 
 @pytest.mark.parametrize("stem", sorted(path.stem for path in FOLDER.glob("*.toml")))
 def test_drawing_shows_every_element_and_pot(stem: str) -> None:
-    program = load_program(FOLDER / f"{stem}.toml")
+    program = load_patch(FOLDER / f"{stem}.toml")
     drawing = ET.fromstring(patch_drawing(program))  # noqa: S314 - our own
     words = " ".join(text.text or "" for text in drawing.iter(f"{SVG}text")).split()
     names = (*(element.name for element in program.patch), *program.inverters.values(), *program.pots)
@@ -47,7 +47,7 @@ def test_drawing_shows_every_element_and_pot(stem: str) -> None:
 
 def test_sheet_and_drawing_depend_on_the_file_alone() -> None:
     path = FOLDER / "pendulum.toml"
-    program, again = load_program(path), compile_program.__wrapped__(parse_program(path.read_bytes() + b"\n", "again"))
+    program, again = load_patch(path), compile_program.__wrapped__(parse_program(path.read_bytes() + b"\n", "again"))
     assert scaling_sheet(program) == scaling_sheet(again)
     assert patch_drawing(program) == patch_drawing(again)
 

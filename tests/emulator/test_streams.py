@@ -7,7 +7,7 @@ import ctypes
 import numpy as np
 import pytest
 
-from analogrig_emulator import normals, uniforms
+from analogrig_emulator import NormalStream, normals, uniforms
 from analogrig_emulator.engine import library
 
 SEEDS = [0, 1, 1995, 2**32 - 1, 2**32, 2**40 + 5, 2**63 - 1]
@@ -27,6 +27,13 @@ def test_many_normal_numbers_are_those_of_numpy() -> None:
     expected = np.stack([np.random.default_rng([seed, 4]).standard_normal(100_000) for seed in SEEDS])
     assert np.abs(expected).max() > 3.7  # the tail
     assert normals(SEEDS, 4, (100_000,)).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_normal_numbers_go_on_as_those_of_numpy(seed: int) -> None:
+    ours, generator = NormalStream(seed, 2), np.random.default_rng([seed, 2])
+    for shape in ((3, 4), (1000, 4), (0, 4), (1, 4), (20_000, 4)):
+        assert ours.standard_normal(shape).tobytes() == generator.standard_normal(shape).tobytes()
 
 
 def test_a_function_that_makes_numbers_otherwise_is_asked_for_each() -> None:

@@ -244,7 +244,7 @@ def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
         computer.play(Excitation(frequency_hz=15e3), 100)
     with pytest.raises(EngineError, match="-1 samples"):
         computer.play(Excitation(), -1)
-    with pytest.raises(CircuitError, match="unknown program 'rear'; there are front, shock, or load_program"):
+    with pytest.raises(CircuitError, match="unknown program 'rear'; there are front, shock, or load_patch"):
         SuspensionComputer("rear")
     for offset_v in (math.nan, math.inf, -1e-3):
         with pytest.raises(CircuitError, match="offset_v must be finite and not negative"):

@@ -12,7 +12,7 @@ import pytest
 
 from analogrig.config import locate, names
 from analogrig_emulator import ProgramError
-from analogrig_emulator.machine.compiler import PatchedProgram, load_program
+from analogrig_emulator.machine.compiler import PatchedProgram, load_patch
 from analogrig_emulator.machine.that_drawing import that_drawing
 from analogrig_emulator.machine.that_sheet import ThatSheet
 
@@ -31,7 +31,7 @@ REFUSED = {
 
 @functools.cache
 def program_named(name: str) -> PatchedProgram:
-    return load_program(locate("programs", name))
+    return load_patch(locate("programs", name))
 
 
 def rates(sheet: ThatSheet, outputs: dict[str, float], driven: dict[str, float]) -> dict[str, float]:

@@ -116,16 +116,17 @@ BEYOND: Mapping[str, Kind] = {
 class SimulatedPlays:
     """Counts of the plays of one simulated device, in place of workers that play."""
 
-    def __init__(self, kind: Kind, rate: float, seed: int) -> None:
+    def __init__(self, question: Question, kind: Kind, rate: float, seed: int) -> None:
+        self._question = question
         self._kind = kind
         self._rate = rate
         self._rng = np.random.default_rng(seed)
 
     def play(self, work: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
         """Yield as many counts as the certificate may need; ``work`` is its ``count_run``."""
-        question, run_n = work.args
-        armed_n = run_n - question.datasheet.warm_up_n
-        plays = math.ceil(MOST_LONGER * question.design_n / armed_n) + 1
+        (case,) = work.args
+        armed_n = case.scenario.samples - self._question.datasheet.warm_up_n
+        plays = math.ceil(MOST_LONGER * self._question.design_n / armed_n) + 1
         instants = self._kind(self._rng, self._rate, armed_n, plays)
         alarms = np.histogram(instants, bins=np.arange(plays + 1) * armed_n)[0]
         return zip(tasks, (Count(int(each), armed_n) for each in alarms), strict=False)
@@ -133,4 +134,4 @@ class SimulatedPlays:
 
 def certificates(question: Question, kind: Kind, rate: float, devices: int) -> Counter[str]:
     """Outcomes of the certificates of so many simulated devices; seeds from 0 on."""
-    return Counter(certify(question, SimulatedPlays(kind, rate, seed)).outcome for seed in range(devices))
+    return Counter(certify(question, SimulatedPlays(question, kind, rate, seed)).outcome for seed in range(devices))

@@ -118,18 +118,18 @@ def test_device_at_the_limit_is_certified_as_often_as_promised_if_its_bursts_are
 def test_certificate_says_what_it_assumed_and_which_bursts_it_saw() -> None:
     """Bursts of forty show in the counts of the plays, and the bound that is used covers more than five."""
     question = asked(far=1e-5, confidence=0.9)
-    quiet = certify(question, SimulatedPlays(COVERED["independent"], 1e-7, 0))
+    quiet = certify(question, SimulatedPlays(question, COVERED["independent"], 1e-7, 0))
     assert quiet.basis.startswith("bursts of 5 alarms on average, assumed (")
-    bursty = certify(question, SimulatedPlays(in_bursts(lambda _, n: np.full(n, 40), 40.0), 1e-4, 0))
+    bursty = certify(question, SimulatedPlays(question, in_bursts(lambda _, n: np.full(n, 40), 40.0), 1e-4, 0))
     assert "alarms on average, observed (" in bursty.basis
     assert bursty.rate[0] < 1e-4 < bursty.rate[1]
 
 
 def test_plays_are_long_enough_to_show_an_alarm_that_comes_this_long_after_every_start() -> None:
     """A device at the limit whose only alarms come 100,000 armed samples after each start."""
-    answer = certify(
-        asked(far=1e-5, confidence=0.9), SimulatedPlays(COVERED["periodic from the start of each play"], 1e-5, 0)
-    )
+    question = asked(far=1e-5, confidence=0.9)
+    periodic = SimulatedPlays(question, COVERED["periodic from the start of each play"], 1e-5, 0)
+    answer = certify(question, periodic)
     assert answer.alarms > 10
 
 

@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import EmulatorError, Sampler
 
+ROOT = Path(__file__).parents[2]
 SHORT = dataclasses.replace(Scenario.load("healthy"), samples=500)
 
 
@@ -224,6 +226,26 @@ def test_estimator_of_fixed_orders_is_that_of_any_orders_to_the_bit(settings: di
     for name in ("theta", "innovation", "statistic", "status", "alarms"):
         assert getattr(ours.run(u, y, valid), name).tobytes() == getattr(others.run(u, y, valid), name).tobytes()
         assert ours.counters == others.counters
+
+
+@pytest.mark.parametrize("options", [("-O1", "-DLIBRARY_NARROW"), ("-O2", "-fno-semantic-interposition")], ids=" ".join)
+def test_estimator_inside_the_loop_over_samples_is_the_one_that_is_called_to_the_bit(
+    options: tuple[str, ...], tmp_path: Path
+) -> None:
+    parts = [ROOT / "estimator_c" / part for part in ("core", "isolation", "fit", "device")]
+    sources = [ROOT / "estimator_c/ports/library/library.c", ROOT / "estimator_c/device/settings.c"]
+    sources += sorted((ROOT / "build/generated").glob("*.c"))
+    flags = ["-std=c99", "-shared", "-fPIC", "-ffp-contract=off", "-DEST_NC_MAX=2U", "-DLIBRARY_FLAT"]
+    include = [f"-I{folder}" for folder in (*parts, ROOT / "build/generated")]
+    subprocess.run(["cc", *options, *flags, *include, "-o", tmp_path / "flat.so", *sources], check=True)
+    run = direct_bench(emulator("emulator"), describe("inproc")).play(Scenario.load("thesis"), 7)
+    u, y = (np.ascontiguousarray(run.codes[:, channel].reshape(3, -1)) for channel in (0, 1))
+    valid = np.ones(u.shape, np.bool_)
+    ours, others = (Estimator(library=path).run_records(u, y, valid) for path in (tmp_path / "flat.so", LIBRARY))
+    for (our, our_counters), (other, other_counters) in zip(ours, others, strict=True):
+        assert our.theta.tobytes() == other.theta.tobytes()
+        assert our.statistic.tobytes() == other.statistic.tobytes()
+        assert our_counters == other_counters
 
 
 def test_estimator_of_fixed_orders_is_for_the_default_orders_alone() -> None:

@@ -29,7 +29,7 @@ SQUARE_N = np.where(np.arange(600) // 50 % 2, 2000.0, 200.0)
 
 
 def made(**changes: object) -> Run:
-    """Run of 600 samples with an edge of the force every 50."""
+    """Run of 600 samples with an edge of the input every 50."""
     estimator = {**ESTIMATOR, "edge_codes": 64.0, **{key: value for key, value in changes.items() if key != "alarms"}}
     return made_run(SQUARE_N, [(0, FRONT)], estimator=estimator, alarms=changes.get("alarms", ()))  # type: ignore[arg-type]
 
@@ -64,12 +64,13 @@ def test_every_record_has_a_warm_up_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("idle_n", [0, 400])
-def test_constant_force_gives_no_exposure_even_without_the_idle_flag(idle_n: int) -> None:
+def test_constant_input_gives_no_exposure_even_without_the_idle_flag(idle_n: int) -> None:
     estimator = {**ESTIMATOR, "edge_codes": 64.0, "idle_n": idle_n}
     run = made_run(200.0 + 0.01 * SQUARE_N, [(0, FRONT)], estimator=estimator)
     found = exposure(run)
     assert (found.armed, found.unexcited) == (0, 600)
-    assert "the trigger was armed in none of 600 samples: in 600 it was not excited" in found.lack_of_evidence
+    reason = "the trigger was armed in none of 600 samples: in 600 it was not excited (no edge of the input of"
+    assert reason in found.lack_of_evidence
     assert not rate_below(0.5, [Played(run)], confidence=0.9)
 
 

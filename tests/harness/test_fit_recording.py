@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main
 from analogrig.config import fixtures
-from analogrig.hardware.calibration.recorded import SETTLING_N, _determined
-from analogrig_emulator import Excitation, RecordedExcitation, SuspensionComputer, load_program
+from analogrig.hardware.calibration.recorded import SETTLING_N, RecordedPlant, _determined
+from analogrig.rigs.emulator import ComputerDescription
+from analogrig.run import Run
+from analogrig_emulator import Excitation, Multiplier, RecordedExcitation, SuspensionComputer, load_patch
 
 RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0}
 SAMPLES = 2000
@@ -35,7 +38,7 @@ def record(
 ) -> Path:
     """Recording of the first two channels of a program, with noise of 5e-5 of the output's full scale."""
     rate_hz = RATES_HZ[name]
-    program = load_program(fixtures() / "programs" / f"{name}.toml")
+    program = load_patch(fixtures() / "programs" / f"{name}.toml")
     computer = SuspensionComputer(program, opamp="ideal", sample_rate_hz=rate_hz * program.equations.speed)
     computer.set(**values)
     volts = np.concatenate([block[:, :2] for block in computer.play(played, SAMPLES)])
@@ -81,7 +84,7 @@ def test_a_fit_finds_the_values_of_the_machine_and_keeps_them(
     assert told["fit"]["rms"] == pytest.approx(2e-5, rel=0.2)
     assert told["check"]["rms"] == pytest.approx(2e-5, rel=0.3)
     assert told["fit"]["noise"] == pytest.approx(2e-5, rel=0.2) and not told["caveats"] and told["rig"] is None
-    kept = load_program(twin)
+    kept = load_patch(twin)
     assert kept.values == {each["name"]: each["value"] for each in told["parameters"]}
     assert kept.equations.channels == ("u", "y")
 
@@ -131,7 +134,7 @@ def test_parameters_that_act_alike_are_named_until_enough_are_fixed(
     assert not told["inseparable"] and len(told["parameters"]) == 3
     for each in told["parameters"]:
         assert abs(each["value"] - MOTOR[each["name"]]) < 5.0 * each["standard_error"] < 0.05 * each["value"]
-    assert load_program(tmp_path / "fitted.toml").values["R"] == 1.3
+    assert load_patch(tmp_path / "fitted.toml").values["R"] == 1.3
 
 
 def test_a_parameter_that_the_excitation_does_not_show_is_named(
@@ -196,9 +199,26 @@ def test_a_program_is_fitted_to_a_rig(tmp_path: Path, capsys: pytest.CaptureFixt
     twin = tmp_path / "twin.toml"
     assert main(["calibrate", "--rig", "emulator-real", "--program", "pendulum", "--json", "--out", str(twin)]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["reconstruction"] == "held" and told["check"]["rms"] < 2.0 * told["fit"]["rms"] < 0.03
-    true = load_program(fixtures() / "programs" / "pendulum.toml").values
-    assert load_program(twin).values == pytest.approx(true, rel=0.04)
+    assert told["reconstruction"] == "held" and told["check"]["rms"] < 2.0 * told["fit"]["rms"] < 0.04
+    true = load_patch(fixtures() / "programs" / "pendulum.toml").values
+    assert load_patch(twin).values == pytest.approx(true, rel=0.04)
+
+
+def test_twin_with_the_real_parts_of_the_rig_follows_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Multipliers included: nominal parts leave 0.016."""
+    command = ["calibrate", "--rig", "emulator-real", "--program", "pendulum", "--components", "polypropylene"]
+    assert main([*command, "--json", "--out", str(tmp_path / "twin.toml")]) == 0
+    assert json.loads(capsys.readouterr().out)["check"]["rms"] < 1e-3
+
+
+def test_multipliers_of_a_real_twin_have_the_pole_of_the_data_sheet(recording: Path) -> None:
+    program = load_patch(fixtures() / "programs" / "silverbox.toml")
+    for computer, bandwidth_hz in (
+        (ComputerDescription(), math.inf),
+        (ComputerDescription(components="polyester"), 1e6),
+    ):
+        plant = RecordedPlant(program, Run.load(recording), computer)
+        assert {each.model.bandwidth_hz for each in plant._computer.circuit.of(Multiplier)} == {bandwidth_hz}
 
 
 def test_a_plant_that_changes_in_the_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -219,6 +239,16 @@ def test_a_poor_twin_is_not_kept(recording: Path, tmp_path: Path, capsys: pytest
     assert main([*command, "--most-rms", "4e-5"]) == 1
     assert "no twin: more than 4e-05 V; nothing kept" in capsys.readouterr().out
     assert not twin.exists()
+
+
+def test_a_program_that_a_run_refuses_is_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program, text = tmp_path / "box.toml", (fixtures() / "programs" / "silverbox.toml").read_text()
+    program.write_text(text.replace("gain = {", 'gain = { alias = "sample",'))
+    command = ["calibrate", "--recording", str(recording), "--program", str(program)]
+    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 2
+    assert "box.toml: parameters.gain.alias: sample is a key of scenarios' changes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

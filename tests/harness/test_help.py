@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 from pathlib import Path
 
 import pytest
 
 from analogrig.cli import _COMMANDS, _parser, main
+from analogrig.recordings.column_reader import FORMATS
 
 QUICK = {
     "list",
@@ -79,6 +81,14 @@ def test_every_option_of_a_command_has_a_help_text_of_one_phrase(name: str) -> N
 def test_device_is_explained_by_the_list_of_all_kinds() -> None:
     (dut,) = (action for action in commands()["run"]._actions if action.dest == "dut")
     assert "`analogrig list devices` shows the kinds" in str(dut.help)
+
+
+def test_import_names_every_format_that_it_reads() -> None:
+    """The help is written out, as the table of formats is in a module that loads numpy."""
+    command = commands()["import"]
+    (file,) = (action for action in command._actions if action.dest == "file")
+    assert re.findall(r"\.\w+", str(file.help)) == list(FORMATS)
+    assert all(name in str(command.description) for name, _ in FORMATS.values())
 
 
 def test_examples_are_shown_as_written(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ from analogrig.reporting import effects, write_report
 from analogrig.reporting.campaign_page import write_page
 from analogrig.reporting.session import find_session, write_session
 from analogrig_emulator.effects import Effect
-from analogrig_emulator.machine.compiler import load_program
+from analogrig_emulator.machine.compiler import load_patch
 from analogrig_emulator.machine.drawing import patch_drawing
 from tests.browser import VIEWS, Watched
 from tests.harness.reported import empty_run, reported_run, reported_verdict
@@ -62,7 +62,7 @@ def effects_picture(path: Path) -> None:
 
 
 def patch(path: Path) -> None:
-    path.with_suffix(".svg").write_text(patch_drawing(load_program(locate("programs", "two-mass"))))
+    path.with_suffix(".svg").write_text(patch_drawing(load_patch(locate("programs", "two-mass"))))
     embed(path)
 
 

@@ -17,7 +17,16 @@ from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Block, Rig
 from analogrig.scenario import PotChange, Scenario
-from analogrig_emulator import CHANNELS, DIELECTRICS, Capacitor, OpAmp, Resistor
+from analogrig_emulator import (
+    CHANNELS,
+    DIELECTRICS,
+    MULTIPLIERS,
+    Capacitor,
+    Multiplier,
+    MultiplierModel,
+    OpAmp,
+    Resistor,
+)
 
 NEEDED = "[card.range_v]"
 
@@ -194,10 +203,10 @@ def own(folder: Path, computer: str, name: str = "own") -> str:
     return str(path)
 
 
-def elements(rig: str, seed: int) -> dict[str, object]:
+def elements(rig: str, seed: int, scenario: str = "healthy") -> dict[str, object]:
     with open_rig(rig) as opened:
         assert isinstance(opened, EmulatorRig)
-        return {each.name: each for each in opened.set_up(Scenario.load("healthy"), seed).computer.circuit.elements}
+        return {each.name: each for each in opened.set_up(Scenario.load(scenario), seed).computer.circuit.elements}
 
 
 def test_fine_effects_of_the_amplifiers_are_a_switch(tmp_path: Path) -> None:
@@ -211,6 +220,33 @@ def test_fine_effects_of_the_amplifiers_are_a_switch(tmp_path: Path) -> None:
     assert isinstance(before, OpAmp) and isinstance(after, OpAmp)
     assert (before.model.limits_current, after.model.limits_current) == (False, True)
     assert (before.model.cmrr, after.model.cmrr) == (math.inf, 1e5)
+
+
+def multipliers(rig: str, seed: int) -> list[MultiplierModel]:
+    return [each.model for each in elements(rig, seed, "duffing").values() if isinstance(each, Multiplier)]
+
+
+ERRORS = ("gain_error", "x_offset_v", "y_offset_v", "z_offset_v", "x_nonlinearity", "y_nonlinearity")
+
+
+def test_multipliers_of_a_real_rig_have_drawn_errors_and_the_limits_of_the_data_sheet() -> None:
+    models = multipliers("emulator-real", 1)
+    assert len(models) == 2 and models[0] != models[1] and models != multipliers("emulator-real", 2)
+    for model in models:
+        assert all(getattr(model, error) for error in ERRORS)
+        assert dataclasses.replace(model, **dict.fromkeys(ERRORS, 0.0)) == MULTIPLIERS["ad633"]  # type: ignore[arg-type]
+
+
+def test_multipliers_are_a_switch(tmp_path: Path) -> None:
+    real = own(tmp_path, 'components = "polyester"\nmultiplier = "ideal"', "real")
+    nominal = own(tmp_path, 'multiplier = "ad633"', "nominal")
+    assert multipliers("emulator", 1) == multipliers(real, 1) == 2 * [MULTIPLIERS["ideal"]]
+    assert multipliers(nominal, 1) == 2 * [MULTIPLIERS["ad633"]]
+
+
+def test_multipliers_of_a_measured_machine_have_no_drawn_errors(tmp_path: Path) -> None:
+    measured = own(tmp_path, 'components = "polyester"\n[computer.values]\noffset_v = { U1 = 1e-3 }', "measured")
+    assert multipliers(measured, 1) == 2 * [MULTIPLIERS["ad633"]]
 
 
 def test_measured_values_are_those_of_the_machine_whatever_the_seed(tmp_path: Path) -> None:

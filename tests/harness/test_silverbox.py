@@ -15,7 +15,7 @@ from analogrig.hardware.calibration.recorded import RecordedPlant, fit_program
 from analogrig.judging.verdict import judge
 from analogrig.reporting.measured import mode_of
 from analogrig.rigs.emulator import ComputerDescription
-from analogrig_emulator import load_program
+from analogrig_emulator import load_patch
 from tests.benchmarks import bench_silverbox, silverbox
 
 EXAMPLES = Path(__file__).parents[2] / "harness" / "examples"
@@ -49,7 +49,7 @@ def test_the_example_is_judged(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_the_twin_fitted_to_the_multisines_simulates_the_arrow_head() -> None:
-    program = load_program(fixtures() / "programs" / "silverbox.toml")
+    program = load_patch(fixtures() / "programs" / "silverbox.toml")
     plant = RecordedPlant(program, silverbox.import_record(), ComputerDescription())
     twin = fit_program(plant, plant.span(*bench_silverbox.FITTED))
     assert plant.difference(twin.values, plant.span(0, silverbox.GROWTH_END)).rms < bench_silverbox.MOST_V

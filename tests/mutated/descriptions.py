@@ -49,6 +49,7 @@ RIG: dict[str, Any] = {
         "op_amp": "tl07x",
         "offset_v": 0.003,
         "components": "polyester",
+        "multiplier": "ad633",
         "specimen": 3,
         "pots": "dial",
         "temperature_c": 30.0,

@@ -15,6 +15,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,6 +180,13 @@ class Card:
             raise SamplerError(f"card: {field} {what}, got {getattr(self, field)!r}")
 
 
+class NormalSource(Protocol):
+    """Generator of the noise, such as a NormalStream or a np.random.Generator."""
+
+    def standard_normal(self, size: tuple[int, ...], /) -> NDArray[np.float64]:
+        """Standard normal numbers of this shape."""
+
+
 class Sampler:
     """Converter of voltages to codes, with the state of one card.
 
@@ -186,7 +194,7 @@ class Sampler:
     nor another channel's noise changes a channel.
     """
 
-    def __init__(self, card: Card, rng: np.random.Generator) -> None:
+    def __init__(self, card: Card, rng: NormalSource) -> None:
         self.card = card
         self._rng = rng
         self._held_v: NDArray[np.float64] | None = None

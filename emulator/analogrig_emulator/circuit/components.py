@@ -42,6 +42,7 @@ from analogrig_emulator.circuit.nonlinear import Function, Multiplier, Multiplie
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotModel
+from analogrig_emulator.engine.system import Law
 from analogrig_emulator.errors import CircuitError
 
 REFERENCE_C = 25.0
@@ -436,9 +437,9 @@ class Components:
             case OpAmp():
                 yield replace(element, model=self._specimen(element, draws))
                 yield from self._inputs(element, draws)
-            case Multiplier():
+            case Multiplier(law=Law.PRODUCT):
                 yield replace(element, model=self.multipliers.specimen(element.model, draws))
-            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch() | Function():
+            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch() | Function() | Multiplier():
                 yield element
             case _:
                 raise unknown_kind_error(element)
@@ -550,6 +551,7 @@ COMPONENTS: Mapping[str, Components] = MappingProxyType(
             dielectric=DIELECTRICS["polyester"],
             op_amps=OP_AMP_GRADES["tl07x"],
             pots=_TEN_TURN,
+            multipliers=MULTIPLIER_GRADES["ad633"],
         ),
         "polypropylene": Components(
             resistors=_METAL_FILM,
@@ -557,7 +559,8 @@ COMPONENTS: Mapping[str, Components] = MappingProxyType(
             dielectric=DIELECTRICS["polypropylene"],
             op_amps=OP_AMP_GRADES["tl07x"],
             pots=_TEN_TURN,
+            multipliers=MULTIPLIER_GRADES["ad633"],
         ),
     }
 )
-"""Components by name: 1 % metal film, ten-turn wire-wound pots, TL07x, and 5 % or 1 % film capacitors."""
+"""Components by name: 1 % metal film, ten-turn wire-wound pots, TL07x, AD633, and 5 % or 1 % film capacitors."""

@@ -475,6 +475,19 @@ class _Parts(NamedTuple):
     """Those of each function generator."""
 
 
+def _ends(row: Mapping[str, int], branch: Mapping[str, int], parts: _Parts) -> list[tuple[int, int]]:
+    """Plus and minus of each law, in their order: states, limiters, bends, recoveries, and factors of products."""
+    ground = row[GROUND]
+    ends = [(branch[capacitor.name], ground) for capacitor in parts.capacitors]
+    ends += [(row[amp.plus], row[amp.minus]) for amp in parts.poles]
+    ends += [(ground, ground) for part in parts.multipliers if part.model.has_state]
+    ends += [(row[limiter.a], row[limiter.b]) for limiter in parts.limiters]
+    ends += [(row[part.x], ground) for part, bent in zip(parts.functions, parts.bends, strict=True) for _ in bent]
+    ends += [(ground, ground) for amp in parts.poles if amp.model.recovers]
+    ends += [(row[node], ground) for part in parts.multipliers for node in (part.x, part.y)]
+    return ends
+
+
 class _Laws(NamedTuple):
     """Laws of capacitors (by current), and of op-amps, multipliers, limiters and bends (by voltages), as arrays.
 
@@ -509,27 +522,20 @@ class _Laws(NamedTuple):
     @classmethod
     def of(cls, row: Mapping[str, int], branch: Mapping[str, int], parts: _Parts, first_product: int) -> _Laws:
         """Laws of a circuit with numbered nodes (row) and branches."""
-        capacitors, poles, multipliers, limiters, functions, limits, bends = parts
+        capacitors, poles, multipliers, *_ = parts
         fed_products = [i for i, part in enumerate(multipliers) if part.model.has_state]
         followers = [multipliers[i] for i in fed_products]
         limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
-        first, states, ground = len(capacitors), len(capacitors) + len(limited), row[GROUND]
+        first, states = len(capacitors), len(capacitors) + len(limited)
         recovering = [(i, amp) for i, amp in enumerate(poles, first) if amp.model.recovers]
-        ends = [(branch[capacitor.name], ground) for capacitor in capacitors]
-        ends += [(row[amp.plus], row[amp.minus]) for amp in poles]
-        ends += [(ground, ground)] * len(followers)
-        ends += [(row[limiter.a], row[limiter.b]) for limiter in limiters]
-        ends += [(row[function.x], ground) for function, bent in zip(functions, bends, strict=True) for _ in bent]
-        ends += [(ground, ground)] * len(recovering)
-        last_source = len(ends)
-        ends += [(row[node], ground) for part in multipliers for node in (part.x, part.y)]
+        ends = _ends(row, branch, parts)
+        last_source = len(ends) - 2 * len(multipliers)
         # The columns of sources follow those of the last product and the constant.
         last_column = first_product + len(multipliers) + 1 + last_source - states
         excess = {amp.name: column for column, (_, amp) in enumerate(recovering, last_column - len(recovering))}
         drive_of_kink: list[int] = []
-        slews, of_state, state, currents = [], [], [], []
-        loaded, saturations = [], []
-        for i, (part, kinks) in enumerate(zip(limited, limits, strict=True), first):
+        slews, of_state, state, currents, loaded, saturations = [], [], [], [], [], []
+        for i, (part, kinks) in enumerate(zip(limited, parts.limits, strict=True), first):
             for kink, (limit, _) in enumerate(kinks, len(drive_of_kink)):
                 drive_of_kink.append(i)
                 if limit is _Limit.SLEW:
@@ -546,10 +552,8 @@ class _Laws(NamedTuple):
         drive_of_kink += range(states, len(ends))
         slewing = [drive_of_kink[kink] for kink in slews]
         g = np.zeros((states, len(drive_of_kink)))
-        for i, kink in zip(slewing, slews, strict=True):
-            g[i, kink] = 1.0
-        for i, kink in zip(state, of_state, strict=True):
-            g[i, kink] = -CLAMP_RATE
+        g[slewing, slews] = 1.0
+        g[state, of_state] = -CLAMP_RATE
         of_state += range(limits_count + last_source - states - len(recovering), limits_count + last_source - states)
         state += [i for i, _ in recovering]
         offset = [0.0] * first + [amp.model.vos_v for amp in poles] + [part.model.z_offset_v for part in followers]

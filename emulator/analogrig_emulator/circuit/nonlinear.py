@@ -21,7 +21,7 @@ from typing import ClassVar
 
 from analogrig_emulator.circuit.opamp import OutputStage
 from analogrig_emulator.circuit.part import GROUND, CircuitPart
-from analogrig_emulator.engine.system import Kink, Product
+from analogrig_emulator.engine.system import Kink, Law, Product
 from analogrig_emulator.errors import CircuitError
 
 _CUBIC = 1.5 * math.sqrt(3.0)
@@ -108,6 +108,9 @@ class Multiplier(CircuitPart):
 
     scale_v: 10 V in a usual machine. A negative scale is a differential x input with its two ends exchanged. The same
     node at both inputs makes a squarer. In the feedback of an op-amp it divides.
+
+    law: that of a multiplier; or of an ideal divider, v(out) = scale_v v(x) / v(y), or an ideal root,
+    v(out) = sign sqrt(max(0, scale_v v(x))), whose input y does nothing.
     """
 
     finite: ClassVar[tuple[str, ...]] = ("scale_v",)
@@ -117,6 +120,8 @@ class Multiplier(CircuitPart):
     out: str
     scale_v: float = 10.0
     model: MultiplierModel = MULTIPLIERS["ideal"]
+    law: Law = Law.PRODUCT
+    sign: int = 1
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -136,11 +141,17 @@ class Multiplier(CircuitPart):
 
     @property
     def fault(self) -> str | None:
+        if self.law is not Law.PRODUCT and self.model != MULTIPLIERS["ideal"]:
+            return "an element that divides or takes roots by itself is ideal"
         return "scale_v must not be 0" if self.scale_v == 0 else None
 
     @property
     def product(self) -> Product:
-        """Product of the inputs."""
+        """Product of the inputs, or what the law makes of them."""
+        if self.law is Law.QUOTIENT:
+            return Product((0.0, self.scale_v), (0.0, 1.0), self.name, self.law)
+        if self.law is Law.ROOT:
+            return Product((0.0, self.scale_v), (float(self.sign),), self.name, self.law)
         return self.model.product(self.scale_v, self.name)
 
 

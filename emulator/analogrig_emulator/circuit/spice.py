@@ -36,7 +36,7 @@ from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
 from analogrig_emulator.circuit.pot import END_FRACTION, PotTurn
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Law
 from analogrig_emulator.errors import CircuitError
 
 STEP_S = 1e-11
@@ -47,6 +47,11 @@ _WRAP = 8
 
 LIMITLESS = 1e99
 """Infinity in a deck."""
+
+_PRODUCT = """\
+V = ((v(x) + {vx}) * ({x1} + {x3} * (v(x) + {vx}) * (v(x) + {vx})))
++ * ((v(y) + {vy}) * ({y1} + {y3} * (v(y) + {vy}) * (v(y) + {vy}))) + {vz}"""
+"""Product of a multiplier. x1, x3 and y1, y3: linear and cubic coefficients of both factors."""
 
 LIBRARY: Mapping[str, str] = MappingProxyType(
     {
@@ -93,22 +98,28 @@ Blower wiper bottom I = v(wiper, bottom) / (max(v(dial), {END_FRACTION!r}) * {{t
 Roff a b {off}
 Bon a b I = (1 / {on} - 1 / {off}) * max(0, v(a, b) - {threshold})
 .ends""",
-        # x1, x3 and y1, y3: linear and cubic coefficients of both factors. Node inner is the product, state follows it.
+        # Node inner is the product, state follows it.
         "multiplier": f"""\
 .subckt multiplier x y out x1=0.1 x3=0 y1=1 y3=0 vx=0 vy=0 vz=0 rate=6e6 slew=1e99 swing_low=-1e99 swing_high=1e99
 + rout=0
-Bproduct inner 0 V = ((v(x) + {{vx}}) * ({{x1}} + {{x3}} * (v(x) + {{vx}}) * (v(x) + {{vx}})))
-+ * ((v(y) + {{vy}}) * ({{y1}} + {{y3}} * (v(y) + {{vy}}) * (v(y) + {{vy}}))) + {{vz}}
+Bproduct inner 0 {_PRODUCT}
 Cstate state 0 1e-10
 Bstate 0 state I = 1e-10 * (max(-{{slew}}, min({{slew}}, {{rate}} * (v(inner) - v(state))))
 + - {CLAMP_RATE!r} * (max(0, v(state) - {{swing_high}}) + min(0, v(state) - {{swing_low}})))
 Eout behind 0 state 0 1
 Rout behind out {{max(rout, 1e-4)}}
 .ends""",
-        "multiplier_without_pole": """\
+        "multiplier_without_pole": f"""\
 .subckt multiplier_without_pole x y out x1=0.1 x3=0 y1=1 y3=0 vx=0 vy=0 vz=0
-Bproduct out 0 V = ((v(x) + {vx}) * ({x1} + {x3} * (v(x) + {vx}) * (v(x) + {vx})))
-+ * ((v(y) + {vy}) * ({y1} + {y3} * (v(y) + {vy}) * (v(y) + {vy}))) + {vz}
+Bproduct out 0 {_PRODUCT}
+.ends""",
+        "divider": """\
+.subckt divider x y out scale=10
+Bquotient out 0 V = {scale} * v(x) / v(y)
+.ends""",
+        "root": """\
+.subckt root x y out scale=10 sign=1
+Broot out 0 V = {sign} * sqrt(max(0, {scale} * v(x)))
 .ends""",
         "switch": """\
 .subckt switch a b on=1 off=1g closed=1
@@ -412,6 +423,10 @@ def _opamp_instance(model: OpAmpModel) -> tuple[str, dict[str, float]]:
 
 def _multiplier_instance(element: Multiplier) -> tuple[str, dict[str, float]]:
     model, product = element.model, element.product
+    if element.law is Law.QUOTIENT:
+        return "divider", {"scale": element.scale_v}
+    if element.law is Law.ROOT:
+        return "root", {"scale": element.scale_v, "sign": element.sign}
     for side, factor in (("x", product.x), ("y", product.y)):
         if unsaid := [power for power, number in enumerate(factor) if number and power not in (1, 3)]:
             raise CircuitError(

@@ -1,6 +1,6 @@
 /// Edges of the generator, and the steps of a data-acquisition card.
 
-#include "engine.h"
+#include "engine_state.h"
 
 #include <float.h>
 #include <math.h>
@@ -51,15 +51,15 @@ void engine_edges(int64_t       plays,
     }
 }
 
-/// engine_see() of one play, for a number of channels that the compiler may know.
-static inline double see(int64_t samples,
-                         int     channels,
-                         const double* restrict card,
-                         double residual,
-                         const double* restrict volts,
-                         const double* restrict normal,
-                         double* restrict held,
-                         double* restrict seen) {
+/// engine_see() of one play.
+static double see(int64_t samples,
+                  int     channels,
+                  const double* restrict card,
+                  double residual,
+                  const double* restrict volts,
+                  const double* restrict normal,
+                  double* restrict held,
+                  double* restrict seen) {
     const double *gain = card, *droop = &gain[channels], *low = &droop[channels], *lsb = &low[channels];
     const double *noise = &lsb[channels], *offset = &noise[channels];
     double        excess[4] = { 0.0 };
@@ -88,8 +88,8 @@ int engine_see(int64_t       plays,
     const int64_t count  = samples * channels;
     double        excess = 0.0;
     for (int64_t i = 0; i < plays; i++, volts += count, normal += count, seen += count) {
-        excess += channels == 4 && held == NULL ? see(samples, 4, card, 0.0, volts, normal, NULL, seen)
-                                                : see(samples, channels, card, residual, volts, normal, held, seen);
+        excess += channels == PANEL && held == NULL ? kernels_find()->see(samples, card, volts, normal, seen)
+                                                    : see(samples, channels, card, residual, volts, normal, held, seen);
         held = held == NULL ? NULL : held + channels;
     }
     return isnan(excess) ? 0 : 1;
@@ -134,8 +134,10 @@ void engine_convert(int64_t       count,
     const unsigned last = (1U << bits) - 1U;
     const double   most = (1.0 - 0.5 * DBL_EPSILON) * (last + 1.0);  // the next number below the end
     // To check the levels takes as long as to convert a part of as many inputs.
-    const bool rising = levels != NULL && count > last && are_rising(last + 1U, levels);
-    for (int64_t k = 0; k < count; k++) {
+    const bool    rising = levels != NULL && count > last && are_rising(last + 1U, levels);
+    const int64_t whole  = levels == NULL ? count / PANEL * PANEL : 0;
+    kernels_find()->convert(whole, most, stuck_high, stuck_low, seen, codes, clipped);
+    for (int64_t k = whole; k < count; k++) {
         const double above   = seen[k] + 0.5;
         const double below   = above < most ? above : most;
         const double limited = below > 0.0 ? below : 0.0;

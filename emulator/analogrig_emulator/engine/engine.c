@@ -321,15 +321,20 @@ static void record_sample(const engine_t* const self, double* y) {
     }
 }
 
+/// The place in a copy of an engine's array, of which `there` points to a row.
+static double* place_in(engine_t* copy, const engine_t* const self, const double* there) {
+    return (double*)(void*)((char*)copy + ((const char*)there - (const char*)self));
+}
+
 /// Record y of engine_look_ahead(), unless record_sample() has. A copy advances, whose modes are those of the original.
 static engine_status_t record_ahead(const engine_t* const self, double* y) {
     if (self->is_slow && self->clear >= self->now + self->ahead) {
         return ENGINE_OK;
     }
     engine_t copy                = *self;
-    copy.w                       = &copy.arguments[0][self->w - self->arguments[0]];
-    copy.w_before                = &copy.arguments[0][self->w_before - self->arguments[0]];
-    copy.w_there                 = &copy.arguments[0][self->w_there - self->arguments[0]];
+    copy.w                       = place_in(&copy, self, self->w);
+    copy.w_before                = place_in(&copy, self, self->w_before);
+    copy.w_there                 = place_in(&copy, self, self->w_there);
     self->mode->is_pinned        = true;
     const engine_status_t status = advance(&copy, self->now + self->ahead);
     self->mode->is_pinned        = false;
@@ -480,7 +485,8 @@ void engine_get_overdue(const engine_t* const self, int64_t* tick) {
 }
 
 engine_status_t engine_drive(engine_t* const self, int product, int64_t first, int64_t samples, const double* terms) {
-    if (product < 0 || product >= self->products || first < 0 || samples < 1) {
+    if (product < 0 || product >= self->products || first < 0 || samples < 1 ||
+        first > self->now / ENGINE_TICKS_PER_SAMPLE) {
         return ENGINE_EDGE;
     }
     self->drives[product] = (drive_t){ first, samples, terms };

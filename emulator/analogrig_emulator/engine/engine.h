@@ -22,7 +22,7 @@
 /// device. One engine must not be used by two threads at once; different engines may. Results depend on the inputs alone,
 /// not on how a run is cut into calls, on the compiler's options or on the processor. RAM: 10 kB an engine, 40 kB a
 /// circuit; for each of up to 64 modes 45 kB with seven states, and 40 kB once it has been without events for a sample period.
-/// With products, a mode takes some 12 kB for each length of step in use instead.
+/// With products, a mode takes some 12 kB for each length of step in use instead. Stack: up to 600 kB with products.
 ///
 /// Rows of [A B c], [C D e] and [L M n] are stored side by side: (states + inputs + 1) columns, row-major.
 ///
@@ -56,6 +56,7 @@ typedef enum {
     ENGINE_EDGE      = 5,  ///< an edge is out of order, in the past, beyond the run, or of an input that does not exist
     ENGINE_NO_SYSTEM = 6,  ///< no circuit was set, or the last one was refused
     ENGINE_NOT_UNIQUE = 7,  ///< w = r + P phi(w) has no solution, or several, for some r; or products feed one another
+    ENGINE_NOT_CONVERGED = 8,  ///< products grow without bound, or have no solution; or their steps become ever shorter
 } engine_status_t;
 
 /// One kink: phi(w) = slope[p] w + intercept[p], with p = 0 below lower, 1 between, 2 above upper.
@@ -66,11 +67,19 @@ typedef struct {
     double intercept[3];
 } engine_kink_t;
 
-/// One product: the value at p of the polynomial with coefficients x, in order of powers, times that of y at q. Its arguments
-/// p and q are two elements of w without limits.
+/// Laws of a product, with X and Y the values of its polynomials.
+enum {
+    ENGINE_PRODUCT  = 0,  ///< X Y
+    ENGINE_QUOTIENT = 1,  ///< X / Y
+    ENGINE_ROOT     = 2,  ///< sqrt(max(0, X)) Y
+};
+
+/// One product: a law of the value at p of the polynomial with coefficients x, in order of powers, and that of y at q. Its
+/// arguments p and q are two elements of w without limits.
 typedef struct {
     double x[ENGINE_MAX_FACTOR_TERMS];
     double y[ENGINE_MAX_FACTOR_TERMS];
+    double law;
 } engine_product_t;
 
 /// A circuit, as arrays of the caller. They are copied. The arguments of the products are the last elements of w, in their
@@ -303,14 +312,14 @@ typedef double engine_normal_t(void* source);
 /// which a magnitude becomes a number at once; 0 where it does otherwise than it did in numpy 2.4.
 void engine_learn(engine_normal_t* normal, double* width, uint64_t* limit);
 
-/// Write the next `count` standard normal numbers of each of the streams, those of numpy's function to the bit. It makes those
-/// that take more than one word. The states stay as they are.
+/// Write the next `count` standard normal numbers of each of the streams, those of numpy's function to the bit, and the states
+/// after them. The function makes those that take more than one word.
 void engine_normals(engine_normal_t* normal,
                     const double*    width,
                     const uint64_t*  limit,
                     int64_t          streams,
                     int64_t          count,
-                    const uint64_t*  states,
+                    uint64_t*        states,
                     double*          out);
 
 #endif  // ENGINE_H

@@ -26,10 +26,13 @@ _REASONS = {
     2: "the circuit is too stiff: it has a time constant 10^17 times shorter than a sample period",
     3: "more events within one sample than events_per_sample allows: does an amplifier oscillate?",
     4: "the state is no longer finite: the circuit is unstable",
-    5: "the edges are out of order, before the last sample recorded, or beyond the last sample of the run",
+    5: "the edges are out of order, before the last sample recorded, or beyond the last sample of the run; "
+    "or a drive begins after it",
     6: "no circuit was set, or the last one was refused",
     7: "limiters, amplifiers and multipliers feed one another so that there is no unique solution: "
     "is there positive feedback, or a loop of ideal elements?",
+    8: "the products of multipliers cannot be followed: they grow without bound, or a divisor reached zero, "
+    "or a radicand is negative",
 }
 
 

@@ -11,6 +11,7 @@
 ///     kernels.c   inner loops, from lanes.h
 ///     noise.c     noise of a linear circuit, independent of the rest
 ///     card.c      steps of a data-acquisition card, independent of the rest
+///     random.c    numpy's random streams, for many seeds at once, independent of the rest
 
 #ifndef ENGINE_STATE_H
 #define ENGINE_STATE_H
@@ -66,9 +67,11 @@ typedef struct {
     double* block;
     int     rank;
     int     least_level;
-    int64_t ahead;    // that of the engine for which y was built
-    bool    certain;  // s comes to rest, and energy bounds how far w strays until then
-    int     row[ENGINE_MAX_STATES];
+    int64_t ahead;   // that of the engine for which y was built
+    bool is_chosen;  // rank, row, least_level and whether it is certain are those of the mode, whatever its constants
+    int  doublings;  // of a sample period to the instant from which on these states alone matter
+    bool certain;    // s comes to rest, and energy bounds how far w strays until then
+    int  row[ENGINE_MAX_STATES];
     double* change;  // of s in one sample period
     double* leap;    // of s in LEAP sample periods
     int     base;    // |change of s| is so small in 2^base ticks that a series gives it
@@ -118,10 +121,10 @@ typedef struct {
 /// at the speed of the step before. At the top of a peak the first alone may be zero.
 typedef enum { CLEAR, NEAR, CROSSED } judgement_t;
 
-/// A product, and the degrees of its factors.
+/// A product, the degrees of its factors, and its law.
 typedef struct {
     engine_product_t factors;
-    int              x_degree, y_degree;
+    int              x_degree, y_degree, kind;
 } law_t;
 
 /// A circuit and its modes. Arrays as in engine_system_t, in one block.
@@ -165,6 +168,18 @@ typedef struct {
     /// Look from the origin at ever later instants until `clear` is at a tick or beyond, or there is no further look. Stop at
     /// a step that is not CLEAR.
     judgement_t (*look_on)(engine_t* self, int64_t tick);
+
+    /// engine_see() of a card of PANEL channels that holds nothing. Return NaN if a voltage is not finite, else 0.
+    double (*see)(int64_t samples, const double* card, const double* volts, const double* normals, double* seen);
+
+    /// engine_convert() without levels, limited to `most`; count is a multiple of PANEL.
+    void (*convert)(int64_t       count,
+                    double        most,
+                    unsigned      stuck_high,
+                    unsigned      stuck_low,
+                    const double* seen,
+                    uint16_t*     codes,
+                    uint8_t*      clipped);
 } kernels_t;
 
 /// See engine_drive(); terms is NULL without one.

@@ -109,16 +109,12 @@ void ladder_retune(engine_t* const self, double* a) {
     double        f[MAX_COLUMNS] = { 0.0 }, term[ENGINE_MAX_STATES], next[PADDED(ENGINE_MAX_STATES)];
     scale(self, a);
     for (int k = 1; k <= TERMS; k++) {
-        for (int i = 0; i < n; i++) {
-            double sum = 0.0;
-            for (int j = 0; j < n && k > 1; j++) {
-                sum += a[i * stride + j] * term[j];
-            }
-            next[i] = k == 1 ? a[i * stride + last] : 1.0 / (double)k * sum;
-            f[i]    = k == 1 ? next[i] : f[i] + next[i];
+        for (int i = 0; i < n && k > 1; i += PANEL) {  // the first term is a, but for its last column
+            self->kernels->multiply(PANEL, n, &mode->terms[i * TERMS * columns], term, &next[i]);
         }
         for (int i = 0; i < n; i++) {
-            term[i]                                                                         = next[i];
+            term[i] = k == 1 ? a[i * stride + last] : 1.0 / (double)k * next[i];
+            f[i]    = k == 1 ? term[i] : f[i] + term[i];
             mode->terms[((i / PANEL * TERMS + k - 1) * columns + last) * PANEL + i % PANEL] = term[i];
         }
     }

@@ -137,6 +137,51 @@ KERNEL(add)(int count, double factor, const double* restrict from, double gain, 
     }
 }
 
+/// Converter inputs of PANEL channels without a memory. Return NaN if a voltage is not finite, else 0.
+TARGET static double
+KERNEL(see)(int64_t samples, const double* card, const double* volts, const double* normals, double* seen) {
+    double excess = 0.0;
+    for (int i = 0; i < PANEL; i += LANES) {
+        const lanes_t gain = *(const lanes_t*)&card[i], droop = *(const lanes_t*)&card[PANEL + i];
+        const lanes_t low = *(const lanes_t*)&card[2 * PANEL + i], lsb = *(const lanes_t*)&card[3 * PANEL + i];
+        const lanes_t noise = *(const lanes_t*)&card[4 * PANEL + i], offset = *(const lanes_t*)&card[5 * PANEL + i];
+        lanes_t       sum = { 0.0 };
+        for (int64_t k = i; k < PANEL * samples; k += PANEL) {
+            const lanes_t volt  = *(const lanes_t*)&volts[k];
+            *(lanes_t*)&seen[k] = (volt * gain - droop - low) / lsb + (*(const lanes_t*)&normals[k] * noise + offset);
+            sum += volt - volt;
+        }
+        for (int j = 0; j < LANES; j++) {
+            excess += sum[j];
+        }
+    }
+    return excess;
+}
+
+/// Codes 0 to `most` of an ideal converter, with `most` a little below their number; count is a multiple of PANEL.
+TARGET static void KERNEL(convert)(int64_t       count,
+                                   double        most,
+                                   unsigned      stuck_high,
+                                   unsigned      stuck_low,
+                                   const double* seen,
+                                   uint16_t*     codes,
+                                   uint8_t*      clipped) {
+    typedef int32_t  numbers_t __attribute__((vector_size(LANES * sizeof(int32_t))));
+    typedef uint16_t codes_t
+        __attribute__((vector_size(LANES * sizeof(uint16_t)), aligned(sizeof(uint16_t)), may_alias));
+    typedef uint8_t flags_t __attribute__((vector_size(LANES), aligned(1), may_alias));
+    const lanes_t   zero = { 0.0 };
+    for (int64_t k = 0; k < count; k += LANES) {
+        const lanes_t   above = *(const lanes_t*)&seen[k] + 0.5, end = zero + most;
+        const mask_t    within  = above < most;
+        const lanes_t   below   = (lanes_t)(((mask_t)above & within) | ((mask_t)end & ~within));
+        const lanes_t   limited = (lanes_t)((mask_t)below & (below > 0.0));
+        const numbers_t code    = (__builtin_convertvector(limited, numbers_t) | (int)stuck_high) & ~(int)stuck_low;
+        *(codes_t*)&codes[k]    = __builtin_convertvector(code, codes_t);
+        *(flags_t*)&clipped[k]  = __builtin_convertvector((limited < above) | (limited > above), flags_t) & 1;
+    }
+}
+
 INLINE bool KERNEL(is_any)(mask_t mask) {
     return LANES == 2 ? (mask[0] | mask[1]) != 0 : (mask[0] | mask[1] | mask[LANES - 2] | mask[LANES - 1]) != 0;
 }
@@ -155,9 +200,12 @@ TARGET static double KERNEL(apply)(const law_t* law, const double* arguments, co
     double change[PANEL], most = 0.0;
     for (int i = 0; i < PANEL; i += LANES) {
         const lanes_t p = *(const lanes_t*)&arguments[i], q = *(const lanes_t*)&arguments[PANEL + i];
-        const lanes_t value =
-            KERNEL(evaluate)(law->factors.x, law->x_degree, p) * KERNEL(evaluate)(law->factors.y, law->y_degree, q) +
-            *(const lanes_t*)&driven[i];
+        lanes_t       x = KERNEL(evaluate)(law->factors.x, law->x_degree, p);
+        const lanes_t y = KERNEL(evaluate)(law->factors.y, law->y_degree, q);
+        for (int j = 0; j < LANES && law->kind == ENGINE_ROOT; j++) {
+            x[j] = x[j] > 0.0 ? sqrt(x[j]) : 0.0;
+        }
+        const lanes_t value   = (law->kind == ENGINE_QUOTIENT ? x / y : x * y) + *(const lanes_t*)&driven[i];
         *(lanes_t*)&change[i] = value - *(const lanes_t*)&values[i];
         *(lanes_t*)&values[i] = value;
     }
@@ -254,8 +302,9 @@ TARGET static judgement_t KERNEL(look_on)(engine_t* self, int64_t tick) {
     return CLEAR;
 }
 
-static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose), KERNEL(add),
-                                           KERNEL(apply),    KERNEL(look),    KERNEL(look_on) };
+static const kernels_t KERNEL(kernels) = { KERNEL(multiply), KERNEL(advance), KERNEL(compose),
+                                           KERNEL(add),      KERNEL(apply),   KERNEL(look),
+                                           KERNEL(look_on),  KERNEL(see),     KERNEL(convert) };
 
 #undef INLINE
 #undef JOINED

@@ -1,7 +1,11 @@
 #include "engine_state.h"
 
+#include <limits.h>
 #include <stdlib.h>
 #include <string.h>
+
+/// Of a mode whose matrices could not be made: it must not be found.
+#define NO_PIECE UCHAR_MAX
 
 int64_t mode_overdue_tick(const engine_t* const self, int kink) {
     if (self->overdue[kink] != NEVER || self->outside[kink] == NEVER) {
@@ -89,6 +93,7 @@ static engine_status_t build_mode(engine_t* const self) {
     }
     memcpy(mode->piece, self->piece, (size_t)self->kinks);
     mode->has_slow        = false;
+    mode->slow.is_chosen  = false;
     mode->tuning          = self->circuit->tuning;
     self->circuit->oldest = (self->circuit->oldest + 1) % MODES;
     self->circuit->stored = self->circuit->stored < MODES ? self->circuit->stored + 1 : MODES;
@@ -99,7 +104,9 @@ static engine_status_t build_mode(engine_t* const self) {
     }
     point_readings(self);
     if (self->products > 0) {
-        return products_build(self, a);
+        const engine_status_t built = products_build(self, a);
+        mode->piece[0]              = built == ENGINE_OK ? mode->piece[0] : NO_PIECE;
+        return built;
     }
     ladder_build(self, a);
     return ENGINE_OK;

@@ -26,21 +26,19 @@
 #define MAX_BLOCK (ENGINE_MAX_STATES * MAX_BLOCK_STRIDE)
 
 /// Largest last Legendre coefficient of a product in a step, in V. Below GROWING of it the next step is twice as long.
-#define TAIL_V 1e-4
+#define TAIL_V 1e-6
 #define GROWING 0.02
 
-/// Weight of an argument's last Legendre coefficient beside a product's, in a circuit with fast loops: where such a loop divides,
-/// its output is an argument, and by a divisor near zero it changes much more than the product.
-#define WEIGHT 100.0
-#define FAST 20.0
+/// Steps within a sample period after which products are given up; shipped programs take at most some 1,000.
+#define MOST_STEPS 1000000
 
-/// Error of a product, in V, at which an iteration has converged. It is estimated as the sum of all changes to come: each is
+/// Change of a product, in V, after which an iteration has converged, or error: the sum of all changes to come, of which each is
 /// the same part, the contraction, of the one before.
 #define CONVERGED_V 1e-7
 #define ITERATIONS 14
-#define HELD_ITERATIONS 60
 
-/// Contraction of relaxation, from its last step, from which Newton's iteration begins; relaxation itself leaves at most 4.
+/// Contraction of relaxation, from its last step, from which Newton's iteration begins. Relaxation itself leaves at most 4 to a
+/// step that is at most twice as long.
 #define HOPELESS 8.0
 
 /// Least change of a product, in V, of which a contraction is computed: smaller ones are rounding. A contraction of 0 would
@@ -73,7 +71,6 @@ struct collocation {
     double* map;             // [A B c] of one tick, and once more the columns of the product for each of its g
     double* moments[NODES];  // of the level `top`
     int     base, top;       // base: the level below which moments come from their series
-    bool    is_fast;         // products move themselves by FAST times their change within a sample period
     rung_t  rungs[ENGINE_LEVELS];
 };
 
@@ -126,7 +123,7 @@ sum_series(const engine_t* const self, const collocation_t* matrices, double tic
     }
 }
 
-/// Moments of a node for twice the step: the second half begins where the first ends, with s / h in 1/2 .. 1.
+/// Moments of a node for twice the step: the second half begins where the first ends, with s / h in c/2 .. c.
 static void double_moments(const engine_t* const self, int node, double* moments) {
     const int n = self->states, stride = stride_of(self);
     double    product[MAX_BLOCK];
@@ -265,38 +262,6 @@ void products_free(collocation_t* matrices) {
     free(matrices);
 }
 
-/// True if a product moves an argument of another by FAST times its change within a sample period, through one state.
-static bool moves(const engine_t* const self, const double* map, int product, int other) {
-    const int           row = self->kinks - 2 * (self->products - other), column = column_of(self, product, 0);
-    const double* const p      = w_row_of(self, row);
-    const double* const q      = w_row_of(self, row + 1);
-    double              p_rate = 0.0, q_rate = 0.0;
-    for (int i = 0; i < self->states; i++) {
-        p_rate += p[i * PANEL] * map[i * stride_of(self) + column];
-        q_rate += q[i * PANEL] * map[i * stride_of(self) + column];
-    }
-    return fmax(fabs(p_rate), fabs(q_rate)) * (double)ENGINE_TICKS_PER_SAMPLE > FAST;
-}
-
-/// True if products move themselves so, each by itself or in a circle.
-static bool is_fast(const engine_t* const self, const double* map) {
-    const int products = self->products;
-    bool      moved[ENGINE_MAX_PRODUCTS][ENGINE_MAX_PRODUCTS], is_any = false;
-    for (int i = 0; i < products * products; i++) {
-        moved[i / products][i % products] = moves(self, map, i / products, i % products);
-    }
-    for (int via = 0; via < products; via++) {  // Warshall's closure
-        for (int i = 0; i < products * products; i++) {
-            bool* const each = &moved[i / products][i % products];
-            *each            = *each || (moved[i / products][via] && moved[via][i % products]);
-        }
-    }
-    for (int i = 0; i < products; i++) {
-        is_any = is_any || moved[i][i];
-    }
-    return is_any;
-}
-
 engine_status_t products_build(engine_t* const self, const double* a) {
     mode_t* const mode = self->mode;
     const int     n = self->states, stride = stride_of(self), from = PADDED(self->columns);
@@ -321,7 +286,6 @@ engine_status_t products_build(engine_t* const self, const double* a) {
             matrices->map[i * stride + self->columns + j] = matrices->map[i * stride + column_of(self, j / NODES, 0)];
         }
     }
-    matrices->is_fast = is_fast(self, matrices->map);
     matrices->base = matrices->top = mode->base;
     int    halvings                = 0;
     double ticks                   = (double)(INT64_C(1) << mode->base);
@@ -389,12 +353,20 @@ static void follow_drive(const drive_t* drive, double tick, double* value) {
                        since < 1.0 ? since : 1.0);
 }
 
+/// Value of a product at its arguments.
+static double value_of(const law_t* law, double p, double q) {
+    const double x = evaluate(law->factors.x, law->x_degree, p), y = evaluate(law->factors.y, law->y_degree, q);
+    if (law->kind == ENGINE_ROOT) {
+        return (x > 0.0 ? sqrt(x) : 0.0) * y;
+    }
+    return law->kind == ENGINE_QUOTIENT ? x / y : x * y;
+}
+
 /// Evaluate all products at the present instant.
 static void multiply_out(const engine_t* const self, const double* arguments, double* values) {
     const law_t* law = self->circuit->law;
     for (int i = 0; i < self->products; i++, law++, arguments += 2) {
-        values[i] = evaluate(law->factors.x, law->x_degree, arguments[0]) *
-                    evaluate(law->factors.y, law->y_degree, arguments[1]);
+        values[i] = value_of(law, arguments[0], arguments[1]);
         if (self->drives[i].terms != NULL) {
             follow_drive(&self->drives[i], (double)self->now, &values[i]);
         }
@@ -412,7 +384,7 @@ static int degree_of(const double* coefficients) {
 void products_set_laws(const engine_t* self, const engine_product_t* products) {
     law_t* const law = self->circuit->law;
     for (int i = 0; i < self->products; i++) {
-        law[i] = (law_t){ products[i], degree_of(products[i].x), degree_of(products[i].y) };
+        law[i] = (law_t){ products[i], degree_of(products[i].x), degree_of(products[i].y), (int)products[i].law };
     }
 }
 
@@ -587,8 +559,19 @@ restart(const engine_t* const self, const rung_t* rung, const given_t* held, con
 
 /// Slopes of a product over its arguments p and q.
 static void find_slopes(const law_t* law, double p, double q, double* by_p, double* by_q) {
-    *by_p = slope_at(law->factors.x, law->x_degree, p) * evaluate(law->factors.y, law->y_degree, q);
-    *by_q = slope_at(law->factors.y, law->y_degree, q) * evaluate(law->factors.x, law->x_degree, p);
+    const double x = evaluate(law->factors.x, law->x_degree, p), y = evaluate(law->factors.y, law->y_degree, q);
+    const double x_slope = slope_at(law->factors.x, law->x_degree, p),
+                 y_slope = slope_at(law->factors.y, law->y_degree, q);
+    if (law->kind == ENGINE_ROOT) {
+        *by_p = x > 0.0 ? 0.5 * x_slope / sqrt(x) * y : 0.0;
+        *by_q = x > 0.0 ? sqrt(x) * y_slope : 0.0;
+    } else if (law->kind == ENGINE_QUOTIENT) {
+        *by_p = x_slope / y;
+        *by_q = -x * y_slope / (y * y);
+    } else {
+        *by_p = x_slope * y;
+        *by_q = y_slope * x;
+    }
 }
 
 /// Equations for the changes of all values in the next of Newton's iterations.
@@ -702,53 +685,6 @@ static bool approach(const engine_t* const self, const rung_t* rung, const given
     return false;
 }
 
-/// Take the products of a shortest step as constant, at their values at its end, by which loops that are faster than that settle.
-/// Newton's iteration begins at 0: from there it finds the positive root of a root's loop.
-static bool hold(const engine_t* const self, const rung_t* rung, const given_t* held, step_t* step) {
-    const int products = self->products, values = NODES * products, last = NODES - 1;
-    double    left[ENGINE_MAX_PRODUCTS * ENGINE_MAX_PRODUCTS], right[ENGINE_MAX_PRODUCTS];
-    given_t   given = *held;
-    place_t   place = { .moved = 0.0 };
-    memset(step->begun, 0, sizeof step->begun);
-    memset(step->values, 0, sizeof step->values);
-    for (int i = 0; i < HELD_ITERATIONS; i++) {
-        restart(self, rung, held, step, &given);
-        move(self, rung, &given, step, &place);
-        if (i > 0 && place.moved <= SETTLED_V) {
-            return true;
-        }
-        for (int row = 0; row < products; row++) {
-            const law_t* const  law       = &self->circuit->law[row];
-            const double* const feedback  = &rung->feedback[2 * row * NODES * values + last];
-            const double* const arguments = &rung->arguments[2 * row * NODES * self->columns + last];
-            const double        p = place.at[2 * row * NODES + last], q = place.at[(2 * row + 1) * NODES + last];
-            double              by_p, by_q;
-            find_slopes(law, p, q, &by_p, &by_q);
-            right[row] = evaluate(law->factors.x, law->x_degree, p) * evaluate(law->factors.y, law->y_degree, q) +
-                         given.driven[row * NODES + last] - step->begun[row];
-            for (int j = 0; j < products; j++) {
-                const int first = column_of(self, j, 0);
-                double    p_fed = arguments[first * PANEL], q_fed = arguments[(self->columns + first) * PANEL];
-                for (int k = j * NODES; k < (j + 1) * NODES; k++) {
-                    p_fed += feedback[k * PANEL];
-                    q_fed += feedback[(values + k) * PANEL];
-                }
-                left[row * products + j] = (row == j ? 1.0 : 0.0) - by_p * p_fed - by_q * q_fed;
-            }
-        }
-        if (!isfinite(place.moved) || engine_solve(products, 1, left, right) >= 0) {
-            return false;
-        }
-        for (int j = 0; j < values; j++) {
-            step->values[j] = step->begun[j / NODES] + right[j / NODES];
-        }
-        for (int j = 0; j < products; j++) {
-            step->begun[j] += right[j];
-        }
-    }
-    return false;
-}
-
 /// Find the products at the nodes of a step from now. Return false if no iteration converges.
 static bool iterate(engine_t* const self, const rung_t* rung, int64_t ticks, step_t* step) {
     given_t given;
@@ -763,22 +699,7 @@ static bool iterate(engine_t* const self, const rung_t* rung, int64_t ticks, ste
         }
         predict(self, ticks, step);
     }
-    return approach(self, rung, &given, step) || (ticks == 1 && hold(self, rung, &given, step));
-}
-
-/// Largest last Legendre coefficient of the arguments.
-static double find_strain(const engine_t* const self, const rung_t* rung, int64_t ticks, const step_t* step) {
-    const double* const now     = &self->w[self->kinks - 2 * self->products];
-    double              largest = 0.0;
-    given_t             held, given;
-    place_t             place = { .moved = 0.0 };
-    prepare(self, rung, ticks, &held);
-    restart(self, rung, &held, step, &given);
-    move(self, rung, &given, step, &place);
-    for (int i = 0; i < 2 * self->products; i++) {
-        largest = fmax(largest, fabs(last_moment(self, now[i], &place.at[i * NODES])) / LEADING);
-    }
-    return largest;
+    return approach(self, rung, &given, step);
 }
 
 /// Set z to the state at a node.
@@ -835,9 +756,6 @@ static outcome_t attempt(engine_t* const self, const rung_t* rung, int level, st
     }
     fit(self, step);
     *tail = find_tail(self, step);
-    if (self->mode->collocation->is_fast) {
-        *tail = fmax(*tail, WEIGHT * find_strain(self, rung, ticks, step));
-    }
     if (level > 0 && !(*tail <= TAIL_V)) {
         return TOO_LONG;
     }
@@ -864,8 +782,9 @@ static void accept(engine_t* const self, int level, const step_t* step) {
 }
 
 engine_status_t products_advance(engine_t* const self, int64_t tick) {
-    step_t step;
-    double tail = 0.0;
+    const int64_t last = self->counts.steps + MOST_STEPS;
+    step_t        step;
+    double        tail = 0.0;
     while (self->now < tick) {
         const int       level   = choose_level(self, tick);
         const rung_t*   rung    = reach(self, level);
@@ -874,8 +793,8 @@ engine_status_t products_advance(engine_t* const self, int64_t tick) {
             self->look = level - 1;
             continue;
         }
-        if (outcome == FAILED) {
-            return rung == NULL ? ENGINE_NO_MEMORY : ENGINE_NOT_UNIQUE;
+        if (outcome == FAILED || self->counts.steps > last) {
+            return rung == NULL ? ENGINE_NO_MEMORY : ENGINE_NOT_CONVERGED;
         }
         accept(self, level, &step);
         if (level == self->look && level < TOP_LEVEL && tail < GROWING * TAIL_V) {

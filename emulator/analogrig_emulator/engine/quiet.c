@@ -93,6 +93,20 @@ static void restrict_slow_rows(
     }
 }
 
+/// Fill the columns of [u 1] of build_slow_map().
+static void map_constants(const engine_t* const self, const slow_t* slow, const double* f, double* map) {
+    const int n = self->states, columns = self->columns, rank = slow->rank, width = rank + columns - n;
+    for (int i = 0; i < n; i++) {
+        for (int j = n; j < columns; j++) {
+            double sum = f[i * columns + j];
+            for (int k = 0; k < rank; k++) {
+                sum -= map[i * width + k] * f[slow->row[k] * columns + j];
+            }
+            map[i * width + rank + j - n] = sum;
+        }
+    }
+}
+
 /// x over [s u 1], row-major: x = U s + (b - U b_s) [u 1], with e = U e_s and x(h) = e x(0) + b [u 1]. Returns false if
 /// the slow rows are dependent.
 static bool build_slow_map(const engine_t* const self, slow_t* slow, const double* f, double* map) {
@@ -124,14 +138,8 @@ static bool build_slow_map(const engine_t* const self, slow_t* slow, const doubl
         for (int j = 0; j < rank; j++) {
             map[i * (rank + constants) + j] = u[j * n + i];
         }
-        for (int j = 0; j < constants; j++) {
-            double sum = f[i * columns + n + j];
-            for (int k = 0; k < rank; k++) {
-                sum -= u[k * n + i] * f[slow->row[k] * columns + n + j];
-            }
-            map[i * (rank + constants) + rank + j] = sum;
-        }
     }
+    map_constants(self, slow, f, map);
     return true;
 }
 
@@ -300,7 +308,8 @@ static void build_slow_ladder(const engine_t* const self, slow_t* slow, const do
     }
 }
 
-/// Compute rest, energy and reach of the slow states. Return false if s does not provably come to rest.
+/// Compute rest, energy and reach of the slow states; the last two do not depend on constants. Return false if s does not
+/// provably come to rest.
 static bool
 certify_slow(const engine_t* const self, slow_t* slow, const double* map, const double* w, const double* change) {
     const int rank = slow->rank, constants = self->columns - self->states, width = rank + constants;
@@ -312,8 +321,9 @@ certify_slow(const engine_t* const self, slow_t* slow, const double* map, const 
     for (int i = 0; i < rank; i++) {
         memcpy(&rate[i * rank], &flow[i * width], (size_t)rank * sizeof rate[0]);
     }
-    if (!find_rest(rank, constants, change, rest) || !solve_lyapunov(rank, rate, slow->energy) ||
-        !find_reach(rank, width, self->kinks, w, slow->energy, slow->reach)) {
+    if (!find_rest(rank, constants, change, rest) ||
+        (!slow->certain && (!solve_lyapunov(rank, rate, slow->energy) ||
+                            !find_reach(rank, width, self->kinks, w, slow->energy, slow->reach)))) {
         return false;
     }
     for (int k = 0; k < self->kinks; k++) {
@@ -350,21 +360,34 @@ static bool forgets(const engine_t* const self, const slow_t* slow, const double
     return error <= FORGOTTEN * largest;
 }
 
+/// Pack the slow rows after the time of a level over the z before. f: exp([A B c] h) - I over that time.
+static void pack_first(const engine_t* const self, slow_t* slow, const double* f) {
+    const int columns = self->columns;
+    double    rows[ENGINE_MAX_STATES * MAX_COLUMNS];
+    for (int i = 0; i < slow->rank; i++) {
+        memcpy(&rows[i * columns], &f[slow->row[i] * columns], (size_t)columns * sizeof rows[0]);
+        rows[i * columns + slow->row[i]] += 1.0;
+    }
+    panels_pack(slow->rank, columns, columns, rows, slow->first);
+}
+
+/// f = exp([A B c] h) - I over the time of a level.
+static void get_flow(const engine_t* const self, int level, double* f) {
+    const int rung = level - self->mode->base;
+    panels_unpack(self->states, self->columns, self->columns,
+                  &self->mode->ladder[rung * PANEL_ELEMENTS(self->states, self->columns)], f);
+}
+
 /// Find the level of the shortest time up to one sample period after which the state no longer depends on the fast states,
 /// and the slow rows then.
 static void find_first(const engine_t* const self, slow_t* slow, const double* map) {
-    const int n = self->states, columns = self->columns, base = self->mode->base;
-    double    f[ENGINE_MAX_STATES * MAX_COLUMNS], rows[ENGINE_MAX_STATES * MAX_COLUMNS];
-    for (int level = TOP_LEVEL; level >= base; level--) {
-        panels_unpack(n, columns, columns, &self->mode->ladder[(level - base) * PANEL_ELEMENTS(n, columns)], f);
+    double f[ENGINE_MAX_STATES * MAX_COLUMNS];
+    for (int level = TOP_LEVEL; level >= self->mode->base; level--) {
+        get_flow(self, level, f);
         if (level < TOP_LEVEL && !forgets(self, slow, map, f)) {
             return;
         }
-        for (int i = 0; i < slow->rank; i++) {
-            memcpy(&rows[i * columns], &f[slow->row[i] * columns], (size_t)columns * sizeof rows[0]);
-            rows[i * columns + slow->row[i]] += 1.0;
-        }
-        panels_pack(slow->rank, columns, columns, rows, slow->first);
+        pack_first(self, slow, f);
         slow->least_level = level;
     }
 }
@@ -378,22 +401,31 @@ static void double_flow(int n, int columns, double* f) {
     }
 }
 
+static int width_of(const engine_t* const self, const slow_t* slow) {
+    return slow->rank + self->columns - self->states;
+}
+
+/// later = f over 2^doublings times its time.
+static void get_later(const engine_t* const self, const double* f, int doublings, double* later) {
+    memcpy(later, f, (size_t)(self->states * self->columns) * sizeof f[0]);
+    for (int i = 0; i < doublings; i++) {
+        double_flow(self->states, self->columns, later);
+    }
+}
+
 /// Find the states that matter 2^doublings sample periods after an event, x over them, and after how long they alone do. f:
 /// exp([A B c] h) - I over one sample period. Return false if there is no such map.
 static bool choose_slow(const engine_t* const self, slow_t* slow, const double* f, int doublings, double* map) {
-    const int n = self->states, columns = self->columns;
-    double    later[ENGINE_MAX_STATES * MAX_COLUMNS];
-    memcpy(later, f, (size_t)(n * columns) * sizeof f[0]);
-    for (int i = 0; i < doublings; i++) {
-        double_flow(n, columns, later);
-    }
+    double later[ENGINE_MAX_STATES * MAX_COLUMNS];
+    get_later(self, f, doublings, later);
+    slow->doublings = doublings;
     if (!build_slow_map(self, slow, later, map)) {
         return false;
     }
     slow->least_level = TOP_LEVEL;
-    memcpy(later, f, (size_t)(n * columns) * sizeof f[0]);
+    get_later(self, f, 0, later);
     while (slow->least_level < TOP_LEVEL + doublings && !forgets(self, slow, map, later)) {
-        double_flow(n, columns, later);
+        double_flow(self->states, self->columns, later);
         slow->least_level++;
     }
     if (slow->least_level == TOP_LEVEL) {
@@ -402,8 +434,17 @@ static bool choose_slow(const engine_t* const self, slow_t* slow, const double* 
     return true;
 }
 
-static int width_of(const engine_t* const self, const slow_t* slow) {
-    return slow->rank + self->columns - self->states;
+/// choose_slow() with the choice made for other constants.
+static void keep_choice(const engine_t* const self, slow_t* slow, const double* f, double* map) {
+    const int width = width_of(self, slow);
+    double    later[ENGINE_MAX_STATES * MAX_COLUMNS];
+    panels_unpack(self->states, width, width, slow->state, map);
+    get_later(self, f, slow->doublings, later);
+    map_constants(self, slow, later, map);
+    if (slow->least_level <= TOP_LEVEL) {
+        get_flow(self, slow->least_level, later);
+        pack_first(self, slow, later);
+    }
 }
 
 /// Advance slow states by a number of ticks, at most one sample period.
@@ -460,16 +501,23 @@ static void build_slow(engine_t* const self, slow_t* slow) {
     double    f[ENGINE_MAX_STATES * MAX_COLUMNS], map[ENGINE_MAX_STATES * MAX_COLUMNS];
     double    change[ENGINE_MAX_STATES * MAX_COLUMNS];
     double    rows[ENGINE_MAX_KINKS * MAX_COLUMNS], w[ENGINE_MAX_KINKS * MAX_COLUMNS];
-    ladder_reach(self, TOP_LEVEL);
-    const int top = (TOP_LEVEL - self->mode->base) * PANEL_ELEMENTS(n, columns);
-    panels_unpack(n, columns, columns, &self->mode->ladder[top], f);
-    slow->certain = false;
-    bool found    = choose_slow(self, slow, f, 0, map);
-    if (found && slow->rank == n) {
-        found = choose_slow(self, slow, f, LATER_DOUBLINGS, map);
-    }
-    if (!found) {
+    if (slow->is_chosen && !slow->certain) {
         return;
+    }
+    ladder_reach(self, TOP_LEVEL);
+    get_flow(self, TOP_LEVEL, f);
+    if (slow->is_chosen) {
+        keep_choice(self, slow, f, map);
+    } else {
+        slow->is_chosen = true;
+        slow->certain   = false;
+        bool found      = choose_slow(self, slow, f, 0, map);
+        if (found && slow->rank == n) {
+            found = choose_slow(self, slow, f, LATER_DOUBLINGS, map);
+        }
+        if (!found) {
+            return;
+        }
     }
     const int rank = slow->rank, width = rank + columns - n;
     restrict_slow_rows(self, slow, f, columns, map, change);

@@ -176,7 +176,7 @@ void engine_normals(engine_normal_t* normal,
                     const uint64_t*  limit,
                     int64_t          streams,
                     int64_t          count,
-                    const uint64_t*  states,
+                    uint64_t*        states,
                     double*          out) {
     for (int64_t i = 0; i < streams; i++, states += 4) {
         stream_t stream = { join(states[0], states[1]), join(states[2], states[3]) };
@@ -197,5 +197,7 @@ void engine_normals(engine_normal_t* normal,
                 *out = normal(&source);
             }
         }
+        states[0] = (uint64_t)(stream.state >> 64);
+        states[1] = (uint64_t)stream.state;
     }
 }

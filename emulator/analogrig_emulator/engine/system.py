@@ -8,6 +8,7 @@ w.
 
 from __future__ import annotations
 
+import enum
 import functools
 import itertools
 import math
@@ -212,6 +213,14 @@ class Kink(NamedTuple):
         return 2 if math.isfinite(self.upper) else 1
 
 
+class Law(enum.IntEnum):
+    """Laws of a product: X Y, X / Y or sqrt(max(0, X)) Y."""
+
+    PRODUCT = 0
+    QUOTIENT = 1
+    ROOT = 2
+
+
 class Product(NamedTuple):
     """Product of two polynomials, each of one element of w: coefficients x and y in order of powers."""
 
@@ -219,10 +228,15 @@ class Product(NamedTuple):
     y: tuple[float, ...]
     element: str = ""
     """Name of the element that multiplies."""
+    law: Law = Law.PRODUCT
 
     def at(self, p: float, q: float) -> float:
-        """Value at two arguments."""
-        return _polynomial(self.x, p) * _polynomial(self.y, q)
+        """Value at two arguments; that of a division by 0 is infinite or no number."""
+        x, y = np.float64(_polynomial(self.x, p)), _polynomial(self.y, q)
+        if self.law is Law.ROOT:
+            return math.sqrt(max(0.0, x)) * y
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(x / y if self.law is Law.QUOTIENT else x * y)
 
 
 def _polynomial(coefficients: tuple[float, ...], at: float) -> float:
@@ -283,10 +297,12 @@ def _kink_row(lower: float, upper: float, slopes: tuple[float, float, float]) ->
 
 @functools.lru_cache(maxsize=64)
 def _product_table(products: tuple[Product, ...]) -> Matrix:
-    """Rows of engine_product_t: (products, 2 MAX_FACTOR_TERMS)."""
-    table = np.zeros((len(products), 2, library.MAX_FACTOR_TERMS))
+    """Rows of engine_product_t: (products, 2 MAX_FACTOR_TERMS + 1)."""
+    second = library.MAX_FACTOR_TERMS
+    table = np.zeros((len(products), 2 * second + 1))
     for row, product in zip(table, products, strict=True):
-        row[0, : len(product.x)], row[1, : len(product.y)] = product.x, product.y
+        row[: len(product.x)], row[second : second + len(product.y)] = product.x, product.y
+        row[-1] = product.law
     return table
 
 

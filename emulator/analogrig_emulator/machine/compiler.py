@@ -15,11 +15,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import assert_never
 
 from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
+from analogrig_emulator.engine.system import Law
 from analogrig_emulator.errors import PotError, ProgramError
 from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
@@ -58,12 +60,6 @@ _LOOP_FARAD = 47e-12
 
 _BARRED_V = 0.05
 """Voltage beyond zero at which a root's diode conducts: at zero itself it would switch without end at rest."""
-
-_IDEAL_LOOP = 1e-5, 1e-4
-"""Parts of that capacitor and of that voltage with an ideal amplifier, which needs neither.
-
-The loop is late by 5 ps times 10 V over the divisor's voltage.
-"""
 
 _OFF_OHM = 1e12
 _ON_OHM = 1e3
@@ -119,8 +115,8 @@ class PatchedProgram(ProgramCircuit):
     """Program compiled from equations.
 
     patch: computing elements in the order of the diagram; inverters: names of the last amplifiers, by quantity;
-    input_nodes: node by input; reach: range in the trial play by quantity; loops: elements to replace those of the same
-    names if an amplifier is ideal, by amplifier.
+    input_nodes: node by input; reach: range in the trial play by quantity; ideal: by amplifier and name, elements that
+    replace those of the same names if the amplifier is ideal, None for none.
     """
 
     equations: Equations
@@ -131,7 +127,7 @@ class PatchedProgram(ProgramCircuit):
     inverters: Mapping[str, str]
     input_nodes: Mapping[str, str]
     elements: tuple[Element, ...]
-    loops: Mapping[str, Sequence[Element]]
+    ideal: Mapping[str, Mapping[str, Element | None]]
 
     __hash__ = object.__hash__
 
@@ -147,12 +143,16 @@ class PatchedProgram(ProgramCircuit):
         return self.equations.channels
 
     @functools.cached_property
+    def places(self) -> Mapping[str, tuple[str, int]]:
+        """Node and sign there of every quantity."""
+        elements = {each.stage.name: (each.node, each.sign) for each in self.patch}
+        return elements | {name: (node, 1) for name, node in self.input_nodes.items()}
+
+    @functools.cached_property
     def scales(self) -> Scales:
-        places = {each.stage.name: (each.node, each.sign) for each in self.patch}
-        places |= {name: (node, 1) for name, node in self.input_nodes.items()}
         return Scales(
             self.equations.speed,
-            {name: Scale(*places[name], self.fulls[name]) for name in self.equations.quantities},
+            {name: Scale(*self.places[name], self.fulls[name]) for name in self.equations.quantities},
         )
 
     @functools.cached_property
@@ -193,14 +193,15 @@ class PatchedProgram(ProgramCircuit):
 
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
         given = dict(zip((each.name for each in self.elements if isinstance(each, OpAmp)), models, strict=True))
-        ideal = {each.name: each for amp, parts in self.loops.items() if not given[amp].has_state for each in parts}
-        return [
-            replace(each, model=given[each.name]) if isinstance(each, OpAmp) else ideal.get(each.name, each)
-            for each in self.elements
-        ]
+        ideal: dict[str, Element | None] = {}
+        for amp, parts in self.ideal.items():
+            if not given[amp].has_state:
+                ideal |= parts
+        elements = [ideal.get(each.name, each) for each in self.elements]
+        return [replace(each, model=given[each.name]) if isinstance(each, OpAmp) else each for each in elements if each]
 
 
-def wired(equations: Equations) -> ProgramCircuit:
+def circuit_of(equations: Equations) -> ProgramCircuit:
     """Circuit that solves the equations: that of the diagram that the file names, or else their patch.
 
     Raises ProgramError like compile_program(), and for an unknown diagram or one with other parameters and channels.
@@ -219,8 +220,11 @@ def wired(equations: Equations) -> ProgramCircuit:
     return program
 
 
-def load_program(path: str | Path) -> PatchedProgram:
-    """Program of a file, compiled. Raises ProgramError that names the file, the place and the cure."""
+def load_patch(path: str | Path) -> PatchedProgram:
+    """Patch that solves the equations of a program file, also if the file names a diagram.
+
+    Raises ProgramError that names the file, the place and the cure.
+    """
     equations = read_program(path)
     try:
         return compile_program(equations)
@@ -273,8 +277,7 @@ class _Scaling:
         for name, quantity in equations.states.items():
             self.found[name] = self._declared(f"states.{name}", name, quantity.full)
         for stage in self.stages.stages:
-            if stage.kind is not StageKind.INTEGRATOR:
-                self.found[stage.name] = self._full(stage)
+            self.found[stage.name] = self._full(stage)
         return self.found
 
     def _declared(self, place: str, name: str, full: float | None) -> float:
@@ -293,13 +296,19 @@ class _Scaling:
 
     def _full(self, stage: PatchStage) -> float:
         sources = [self.found[cord.source] for cord in stage.cords]
-        if stage.kind in (StageKind.RECTIFIER, StageKind.PRODUCT):
-            return math.prod(sources)
-        if stage.kind is StageKind.ROOT:
-            return math.sqrt(sources[0])
-        declared = self.stages.equations.signals.get(stage.name)
-        full = self._declared(stage.place, stage.name, declared.full if declared else None)
-        return full if declared and declared.full else self._raised(stage, full, sources)
+        match stage.kind:
+            case StageKind.INTEGRATOR:
+                return self.found[stage.name]
+            case StageKind.RECTIFIER | StageKind.PRODUCT:
+                return math.prod(sources)
+            case StageKind.ROOT:
+                return math.sqrt(sources[0])
+            case StageKind.SUMMER | StageKind.QUOTIENT | StageKind.FUNCTION:
+                declared = self.stages.equations.signals.get(stage.name)
+                full = self._declared(stage.place, stage.name, declared.full if declared else None)
+                return full if declared and declared.full else self._raised(stage, full, sources)
+            case _:
+                assert_never(stage.kind)
 
     def _raised(self, stage: PatchStage, full: float, sources: Sequence[float]) -> float:
         """Full scale raised until no coefficient exceeds 10."""
@@ -351,7 +360,7 @@ class _Patcher:
         self._signs = signs_of(rows, self._inputs, self._divisor_signs)
         self._nodes: dict[tuple[str, int], str] = {}
         self._elements: list[Element] = []
-        self._loops: dict[str, Sequence[Element]] = {}
+        self._ideal: dict[str, Mapping[str, Element | None]] = {}
         self._amplifiers: dict[str, int] = {}
         self._inverters: dict[str, int] = {}
         self._uses = self._users(rows)
@@ -381,7 +390,7 @@ class _Patcher:
             inverters={name: f"U{self._inverters[name]}" for name in inverters},
             input_nodes={name: self._nodes[name, 1] for name in self._inputs},
             elements=tuple(self._elements),
-            loops=self._loops,
+            ideal=self._ideal,
         )
 
     # ---- names
@@ -390,17 +399,15 @@ class _Patcher:
         """Give every output its node."""
         for place, name in enumerate(self._inputs):
             self._nodes[name, 1] = "in" if not place else f"in{place + 1}"
-        counts = {StageKind.PRODUCT: 0, StageKind.FUNCTION: 0}
-        amplifiers = itertools.count(1)
+        counts: Counter[str] = Counter()
         for stage in rows:
-            if stage.kind in counts:
-                counts[stage.kind] += 1
-                self._nodes[stage.name, self._signs[stage.name]] = f"{_LETTERS[stage.kind]}{counts[stage.kind]}".lower()
-            else:
-                self._amplifiers[stage.name] = number = next(amplifiers)
-                self._nodes[stage.name, self._signs[stage.name]] = f"u{number}"
-        for name in inverters:
-            self._inverters[name] = number = next(amplifiers)
+            letter = stage.kind.letter
+            counts[letter] += 1
+            self._nodes[stage.name, self._signs[stage.name]] = f"{letter}{counts[letter]}".lower()
+            if stage.kind.has_amplifier:
+                self._amplifiers[stage.name] = counts[letter]
+        for number, name in enumerate(inverters, len(self._amplifiers) + 1):
+            self._inverters[name] = number
             self._nodes[name, -self._signs[name]] = f"u{number}"
 
     def _users(self, rows: Sequence[PatchStage]) -> Counter[str]:
@@ -442,7 +449,10 @@ class _Patcher:
                 return self._summer(stage)
             case StageKind.RECTIFIER:
                 return self._rectifier(stage)
-        return self._loop(stage)
+            case StageKind.QUOTIENT | StageKind.ROOT:
+                return self._loop(stage)
+            case _:
+                assert_never(stage.kind)
 
     def _summer(self, stage: PatchStage) -> PatchedElement:
         cords = [self._cord(stage, place, self._ratio(stage, cord)) for place, cord in enumerate(stage.cords)]
@@ -483,7 +493,10 @@ class _Patcher:
         return self._amplifier(stage, [PatchedCord(cord, node, sign, 1.0, 1, name)])
 
     def _loop(self, stage: PatchStage) -> PatchedElement:
-        """Divider or root: the amplifier settles where its multiplier's product equals the first cord."""
+        """Divider or root: the amplifier settles where its multiplier's product equals the first cord.
+
+        An ideal amplifier is a summer instead, before an element that divides or takes the root by itself.
+        """
         number, dividend = self._amplifiers[stage.name], stage.cords[0]
         sign, junction, out = self._signs[stage.name], f"s{number}", f"u{number}"
         is_root = stage.kind is StageKind.ROOT
@@ -498,22 +511,26 @@ class _Patcher:
         product_sign = -self._source_sign(stage, dividend)
         name, node = f"XU{number}", f"xu{number}"
         scale_v = MACHINE_V * sign * other_sign * product_sign
-        capacitor = Capacitor(f"C{number}", junction, out, _LOOP_FARAD)
+        divisor = self._nodes[other, other_sign]
         self._elements += [
-            Multiplier(name, out, self._nodes[other, other_sign], node, scale_v),
+            Multiplier(name, out, divisor, node, scale_v),
             Resistor(f"R{number}X", node, junction, ohm),
-            capacitor,
+            Capacitor(f"C{number}", junction, out, _LOOP_FARAD),
         ]
-        ideal: list[Element] = [replace(capacitor, farad=_IDEAL_LOOP[0] * _LOOP_FARAD)]
         if is_root:  # The diode bars the other root, where the loop would latch up.
             ends = (junction, out) if sign > 0 else (out, junction)
-            diode = DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM)
-            self._elements.append(diode)
-            ideal.append(replace(diode, threshold_v=_IDEAL_LOOP[1] * _BARRED_V))
+            self._elements.append(DiodeLimiter(f"L{number}", *ends, _BARRED_V, _ON_OHM, _OFF_OHM))
         else:
             self._elements.append(Resistor(f"R{number}FB", junction, out, _OFF_OHM))
-            cords.append(PatchedCord(stage.cords[1], self._nodes[other, other_sign], other_sign, 1.0, 1, name))
-        self._loops[f"U{number}"] = ideal
+            cords.append(PatchedCord(stage.cords[1], divisor, other_sign, 1.0, 1, name))
+        law, y = (Law.ROOT, node) if is_root else (Law.QUOTIENT, divisor)
+        self._ideal[f"U{number}"] = {
+            name: Multiplier(name, node, y, out, scale_v, law=law, sign=sign),
+            f"C{number}": None,
+            f"L{number}": None,
+            f"R{number}FB": None,
+            f"U{number}": OpAmp(f"U{number}", GROUND, junction, node, IDEAL),
+        }
         return self._amplifier(stage, cords)
 
     def _multiplier(self, stage: PatchStage) -> PatchedElement:
@@ -604,9 +621,6 @@ class _Patcher:
             f"delete the term, lower the full scale of {_clipped(stage.name)}, or let it move more in the trial "
             "(speed, period_s)"
         )
-
-
-_LETTERS = {StageKind.PRODUCT: "X", StageKind.FUNCTION: "D"}
 
 
 def _clipped(formula: str) -> str:

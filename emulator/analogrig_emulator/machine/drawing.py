@@ -32,15 +32,6 @@ _STYLE = (
 _POT_X, _BODY_X, _BODY_WIDTH = 34, 92, 64
 _LONGEST = 26
 
-_SYMBOLS = {
-    StageKind.PRODUCT: "×",
-    StageKind.QUOTIENT: "÷",
-    StageKind.ROOT: "√",
-    StageKind.FUNCTION: "f",
-    StageKind.RECTIFIER: "max",
-}
-"""Symbols of the elements that are drawn as squares; amplifiers are triangles."""
-
 
 class _Pin(NamedTuple):
     """Input: its node, its term in words, its pot with the coefficient, and its gain."""
@@ -94,8 +85,8 @@ def _element(element: PatchedElement) -> _Drawn:
         element.name,
         element.node,
         signed(element.sign, element.stage.name),
-        kind.value + (f", {element.farad * 1e9:g} nF" if element.farad else ""),
-        _SYMBOLS.get(kind, ""),
+        kind.title + (f", {element.farad * 1e9:g} nF" if element.farad else ""),
+        kind.symbol,
         kind is StageKind.INTEGRATOR,
         tuple(_pin(element, cord) for cord in element.cords),
     )

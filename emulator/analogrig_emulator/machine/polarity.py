@@ -16,8 +16,6 @@ from analogrig_emulator.machine.stages import REFERENCE, PatchStage, StageKind
 _MOST_TRIED_AT_ONCE = 14
 """Stages up to which all combinations of signs are tried."""
 
-_FREE = (StageKind.PRODUCT, StageKind.FUNCTION)
-
 _Needs = Sequence[tuple[str, str, int]]
 """Rows (stage, source, -1 or 1): the cord needs the source with this times the stage's sign."""
 
@@ -45,7 +43,7 @@ def inverted(stages: Sequence[PatchStage], signs: Mapping[str, int], divisor_sig
 
 def cord_sign(kind: StageKind, number: float, divisor_sign: int) -> int:
     """Sign of the source that a cord needs, relative to that of its stage; 0 if either will do."""
-    if kind in _FREE:
+    if not kind.has_amplifier:
         return 0
     return -(1 if number > 0 else -1) * divisor_sign
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.circuit.circuit import Element, Pot, Resistor
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.errors import PotError
 
@@ -152,6 +152,12 @@ class ProgramCircuit(ABC):
     def pots(self) -> Mapping[str, PotRow]:
         """Pot table by pot."""
         return {row.pot: PotRow(row.load, (name,)) for name, row in self.parameters.items()}
+
+    def pot_ohms(self, elements: Sequence[Element]) -> dict[str, tuple[float, float]]:
+        """Track and load in ohm by pot, in elements with the names of the netlist."""
+        tracks = {each.name: each.track_ohm for each in elements if isinstance(each, Pot)}
+        loads = {each.name: each.ohm for each in elements if isinstance(each, Resistor)}
+        return {pot: (tracks[pot], loads[row.load]) for pot, row in self.pots.items()}
 
     def pot_coefficient(self, pot: str, values: Mapping[str, float]) -> float:
         """Coefficient of a pot under load, for the values of the parameters that turn it.

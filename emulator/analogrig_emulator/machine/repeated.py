@@ -24,7 +24,7 @@ from analogrig_emulator.machine.suspension import SuspensionComputer
 
 
 class Repeat(NamedTuple):
-    """One play: volts of CHANNELS, float64 (samples, 4), and AnalogComputer.lamps."""
+    """One play: volts of the program's channels, float64 (samples, channels), and AnalogComputer.lamps."""
 
     volts: NDArray[np.float64]
     lamps: Mapping[str, int | None]
@@ -75,7 +75,7 @@ class RepeatedPlay:
     def play_all(
         self, excitation: Excitation, phases: NDArray[np.float64], offsets_v: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], list[Mapping[str, int | None]]]:
-        """Volts (plays, samples, 4) and lamps with each of these phases, (plays,), and offsets, (plays, amplifiers).
+        """Volts (plays, samples, channels) and lamps for these phases, (plays,), and offsets, (plays, amplifiers).
 
         Raises ExcitationError and EngineError, whichever play fails.
         """

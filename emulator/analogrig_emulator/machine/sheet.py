@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from analogrig_emulator.circuit.circuit import Pot, Resistor
 from analogrig_emulator.circuit.pot import dial_for
 from analogrig_emulator.machine.compiler import PatchedCord, PatchedElement, PatchedProgram
-from analogrig_emulator.machine.stages import StageKind, is_atom
+from analogrig_emulator.machine.stages import is_atom
 
 
 def scaling_sheet(program: PatchedProgram) -> str:
@@ -30,13 +29,11 @@ def diagram_lines(program: PatchedProgram) -> list[str]:
     return [f"This patch is compiled from the equations; a run plays the diagram {diagram}."] if diagram else []
 
 
-def dials(program: PatchedProgram) -> dict[str, float]:
-    """Dials of nominal pots for the values of the file."""
-    loads_ohm = {each.name: each.ohm for each in program.elements if isinstance(each, Resistor)}
-    tracks_ohm = {each.name: each.track_ohm for each in program.elements if isinstance(each, Pot)}
+def dials(program: PatchedProgram, values: Mapping[str, float]) -> dict[str, float]:
+    """Dials of nominal pots for values of the parameters."""
     return {
-        pot: dial_for(program.pot_coefficient(pot, program.values), tracks_ohm[pot], loads_ohm[row.load], pot)
-        for pot, row in program.pots.items()
+        pot: dial_for(program.pot_coefficient(pot, values), *ohms, pot)
+        for pot, ohms in program.pot_ohms(program.elements).items()
     }
 
 
@@ -53,7 +50,7 @@ def _elements(program: PatchedProgram) -> Iterator[Sequence[str]]:
     yield "element", "kind", "output", "full scale", "input", "from", "pot", "gain", "capacitor"
     for element in program.patch:
         output = signed(element.sign, element.stage.name)
-        head = (element.name, element.stage.kind.value, output, f"{element.full:g}")
+        head = (element.name, element.stage.kind.title, output, f"{element.full:g}")
         farad = f"{element.farad * 1e9:g} nF" if element.farad else ""
         for cord in element.cords:
             yield *head, input_text(element, cord), cord.node, cord.pot, _gain(element, cord), farad
@@ -74,10 +71,8 @@ class Inverter(NamedTuple):
 
 def inverters(program: PatchedProgram) -> Iterator[Inverter]:
     """Inverters of a patch, in the order of their amplifiers."""
-    places = {each.stage.name: (each.node, each.sign) for each in program.patch}
-    places |= {name: (node, 1) for name, node in program.input_nodes.items()}
     for quantity, name in program.inverters.items():
-        yield Inverter(name, quantity, *places[quantity])
+        yield Inverter(name, quantity, *program.places[quantity])
 
 
 def signed(sign: int, quantity: str) -> str:
@@ -87,18 +82,18 @@ def signed(sign: int, quantity: str) -> str:
 
 def input_text(element: PatchedElement, cord: PatchedCord) -> str:
     """Term of an input; for elements without coefficients the source with its sign."""
-    if element.stage.kind in (StageKind.INTEGRATOR, StageKind.SUMMER):
+    if element.stage.kind.adds:
         return cord.cord.text
     return signed(cord.sign, cord.cord.source)
 
 
 def _gain(element: PatchedElement, cord: PatchedCord) -> str:
-    return "" if element.stage.kind in (StageKind.PRODUCT, StageKind.FUNCTION) else str(cord.gain)
+    return str(cord.gain) if element.stage.kind.has_amplifier else ""
 
 
 def _pots(program: PatchedProgram) -> Iterator[Sequence[str]]:
     yield "pot", "coefficient", "dial", "turned by"
-    at = dials(program)
+    at = dials(program, program.values)
     for pot, row in program.pots.items():
         coefficient = program.pot_coefficient(pot, program.values)
         yield pot, f"{coefficient:.4f}", f"{at[pot]:.4f}", ", ".join(row.settings) or "nothing"

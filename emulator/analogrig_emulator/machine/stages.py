@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +42,27 @@ _MOST_TERMS = 64
 
 
 class StageKind(enum.Enum):
-    """Computing element of a stage."""
+    """Computing element of a stage.
 
-    INTEGRATOR = "integrator"
-    SUMMER = "summer"
-    RECTIFIER = "half-wave rectifier"
-    PRODUCT = "multiplier"
-    QUOTIENT = "divider"
-    ROOT = "square root"
-    FUNCTION = "function generator"
+    letter: first of its name in a patch, U for an amplifier; symbol: in a square of a drawing, empty for a triangle;
+    adds: True if its cords have coefficients.
+    """
+
+    INTEGRATOR = "integrator", "U", "", True
+    SUMMER = "summer", "U", "", True
+    RECTIFIER = "half-wave rectifier", "U", "max", False
+    PRODUCT = "multiplier", "X", "×", False
+    QUOTIENT = "divider", "U", "÷", False
+    ROOT = "square root", "U", "√", False
+    FUNCTION = "function generator", "D", "f", False
+
+    def __init__(self, title: str, letter: str, symbol: str, adds: bool) -> None:  # noqa: FBT001
+        self.title, self.letter, self.symbol, self.adds = title, letter, symbol, adds
+
+    @property
+    def has_amplifier(self) -> bool:
+        """True if an amplifier puts out the quantity, inverted; otherwise its sign is free."""
+        return self.letter == "U"
 
 
 @dataclass(frozen=True)
@@ -108,7 +120,7 @@ class Stages:
     @property
     def is_linear(self) -> bool:
         """True if summers and integrators solve the equations."""
-        return all(stage.kind in (StageKind.SUMMER, StageKind.INTEGRATOR) for stage in self.stages)
+        return all(stage.kind.adds for stage in self.stages)
 
     def factor(self, factors: Factors, values: Mapping[str, float]) -> float:
         """Product of factors. Raises ProgramError unless it is finite and positive."""
@@ -158,7 +170,10 @@ class Stages:
                 return np.asarray(np.sqrt(np.maximum(a, 0.0)))
             case StageKind.FUNCTION:
                 return np.asarray(self.equations.functions[stage.function](a))
-        return self.total(stage, quantities, values)
+            case StageKind.SUMMER | StageKind.INTEGRATOR:
+                return self.total(stage, quantities, values)
+            case _:
+                assert_never(stage.kind)
 
 
 def stages_of(equations: Equations) -> Stages:

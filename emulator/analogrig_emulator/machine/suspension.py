@@ -14,18 +14,19 @@ from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.recorded import RecordedExcitation
-from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
+from analogrig_emulator.circuit.circuit import Circuit
 from analogrig_emulator.circuit.components import NOMINAL, Components
+from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
-from analogrig_emulator.engine.system import Edges, is_integer
+from analogrig_emulator.engine.system import Edges, Law, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
 from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 
 PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
-"""Programs wired by hand, by name. Others are compiled from files."""
+"""Circuits wired by hand, by the name of their program. Others are compiled from files."""
 
 BLOCK_SAMPLES = 32768
 """Default block, 1 MB: in smaller blocks the calls cost more than a quiet stretch."""
@@ -34,8 +35,9 @@ BLOCK_SAMPLES = 32768
 class SuspensionComputer:
     """Machine wired with a program.
 
-    program: a name in PROGRAMS or a Program. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
-    components: real components for the program's diagram; Components(given=...) sets single deviations.
+    program: a name in PROGRAMS or a ProgramCircuit. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
+    multiplier: model of every multiplier. components: real components for the program's diagram;
+    Components(given=...) sets single deviations.
     Pots are set to the program's values, with the real load connected.
     rng, offset_v: with an rng, each op-amp has an offset uniform within +-offset_v, drawn from U1 on.
     machine: the AnalogComputer, for operation by hand. The program's integrators (front: U2 and U3, at +velocity and
@@ -48,6 +50,7 @@ class SuspensionComputer:
         program: str | ProgramCircuit = "front",
         *,
         opamp: str | OpAmpModel = "tl07x",
+        multiplier: MultiplierModel = MULTIPLIERS["ideal"],
         components: Components = NOMINAL,
         rng: np.random.Generator | None = None,
         offset_v: float = 3e-3,
@@ -58,12 +61,12 @@ class SuspensionComputer:
         model, count = _model(opamp, offset_v), self.program.amplifiers
         offsets_v = None if rng is None else drawn_offsets_v(model, rng.random(count), offset_v).tolist()
         if components.is_perfect and isinstance(self.program, Hashable):
-            circuit, self._pots = _nominal(self.program, model)
+            circuit, self._pots = _nominal(self.program, model, multiplier)
             if offsets_v is not None:
                 circuit = circuit.with_offsets({f"U{i}": vos_v for i, vos_v in enumerate(offsets_v, 1)})
         else:
             models = [replace(model, vos_v=vos_v) for vos_v in offsets_v or [model.vos_v] * count]
-            circuit, self._pots = _wired(self.program, models, components)
+            circuit, self._pots = _wired(self.program, models, multiplier, components)
         self.machine = AnalogComputer(
             circuit,
             self.program.channel_nodes,
@@ -136,9 +139,10 @@ class SuspensionComputer:
         block_samples: int = BLOCK_SAMPLES,
         ahead_ticks: int = 0,
     ) -> Iterator[NDArray[np.float64]]:
-        """Play from rest; yield the volts of CHANNELS in blocks: float64 (block_samples or, last, fewer; 4).
+        """Play from rest; yield the volts of the channels in blocks: float64 (block_samples or, last, fewer; channels).
 
-        If ahead_ticks is not 0, a row has 8 volts: those of the sample, and those so many ticks later, as for Engine.
+        If ahead_ticks is not 0, a row has twice as many volts: those of the sample, and those so many ticks later, as
+        for Engine.
 
         The excitation's first level or sample applies at sample 0. A change takes effect right after its sample is
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
@@ -307,25 +311,28 @@ _LoadedPots: TypeAlias = dict[str, _LoadedPot]
 
 
 def _wired(
-    program: ProgramCircuit, models: Sequence[OpAmpModel], components: Components
+    program: ProgramCircuit, models: Sequence[OpAmpModel], multiplier: MultiplierModel, components: Components
 ) -> tuple[Circuit, _LoadedPots]:
-    """Circuit of a program with these op-amps and components, and its pots."""
-    circuit = Circuit(components.fit(program.netlist(models)))
+    """Circuit of a program with these op-amps, multipliers and components, and its pots."""
+    netlist = program.netlist(models)
+    fitted = [
+        replace(each, model=multiplier) if isinstance(each, Multiplier) and each.law is Law.PRODUCT else each
+        for each in netlist
+    ]
+    circuit = Circuit(components.fit(fitted))
     return circuit, _pots(program, circuit, components)
 
 
 @functools.lru_cache(maxsize=8)
-def _nominal(program: ProgramCircuit, model: OpAmpModel) -> tuple[Circuit, _LoadedPots]:
+def _nominal(program: ProgramCircuit, model: OpAmpModel, multiplier: MultiplierModel) -> tuple[Circuit, _LoadedPots]:
     """The same with perfect components. Equal machines share their circuit, and with it its equations."""
-    return _wired(program, [model] * program.amplifiers, NOMINAL)
+    return _wired(program, [model] * program.amplifiers, multiplier, NOMINAL)
 
 
 def _pots(program: ProgramCircuit, circuit: Circuit, components: Components) -> _LoadedPots:
-    loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
-    tracks_ohm = {pot.name: pot.track_ohm for pot in circuit.of(Pot)}
     return {
-        pot: _LoadedPot(components.pots.model(tracks_ohm[pot]), pot, loads_ohm[row.load])
-        for pot, row in program.pots.items()
+        pot: _LoadedPot(components.pots.model(track_ohm), pot, load_ohm)
+        for pot, (track_ohm, load_ohm) in program.pot_ohms(circuit.elements).items()
     }
 
 
@@ -333,7 +340,7 @@ def _program(program: str | ProgramCircuit) -> ProgramCircuit:
     if isinstance(program, ProgramCircuit):
         return program
     if program not in PROGRAMS:
-        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_program(file)")
+        raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_patch(file)")
     return PROGRAMS[program]
 
 

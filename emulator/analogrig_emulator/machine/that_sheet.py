@@ -74,7 +74,7 @@ class ThatSheet:
     def __post_init__(self) -> None:
         for each in self.program.patch:
             if each.stage.kind not in _NAMES:
-                raise self._error(f"needs a {each.stage.kind.value}, and {MACHINE} has none")
+                raise self._error(f"needs a {each.stage.kind.title}, and {MACHINE} has none")
         counts = Counter(name.rstrip("0123456789") for name in self.places.values())
         counts["COEF"] = sum(cable.coefficient < 1.0 for cable in self.cables)
         for kind, count in COUNTS.items():

@@ -2,6 +2,23 @@
 
 #include "library.h"
 
+/// With LIBRARY_FLAT this file contains the estimator, and the step becomes part of the loop over samples. A call for each sample
+/// takes a quarter longer.
+#ifdef LIBRARY_FLAT
+#include "est.c"
+#define FLAT __attribute__((flatten))
+#else
+#define FLAT
+#endif
+
+/// A second loop for processors with AVX: it takes a tenth less time, and its results have the same bits.
+#if defined(LIBRARY_FLAT) && !defined(LIBRARY_NARROW) && defined(__x86_64__)
+#define WITH_AVX 1
+#include <cpuid.h>
+#else
+#define WITH_AVX 0
+#endif
+
 size_t library_size(void) { return sizeof(library_t); }
 
 void library_init(library_t* const self) { self->settings = settings_default(); }
@@ -62,18 +79,72 @@ size_t library_run(library_t* const           self,
     return alarms;
 }
 
-size_t library_run_codes(library_t* const           self,
-                         const size_t               n,
-                         const size_t               stride,
-                         const uint16_t* const      u,
-                         const uint16_t* const      y,
-                         const uint8_t* const       valid,
-                         const library_out_t* const out) {
+/// The loop of library_run_codes(), which becomes part of each of its callers.
+static inline size_t enter_codes(library_t* const           self,
+                                 const size_t               n,
+                                 const size_t               stride,
+                                 const uint16_t* const      u,
+                                 const uint16_t* const      y,
+                                 const uint8_t* const       valid,
+                                 const library_out_t* const out) {
     size_t alarms = 0U;
     for (size_t k = 0U; k < n; k++) {
         alarms += enter(self, k, (float)u[k * stride], (float)y[k * stride], valid, out);
     }
     return alarms;
+}
+
+#if WITH_AVX
+#define AVX_STATES 6U  // of the registers that the operating system saves: XMM and YMM
+
+/// True if processor and operating system support AVX: Intel 64 Software Developer's Manual, volume 1, section 14.3.
+static bool ask_for_avx(void) {
+    uint32_t eax;
+    uint32_t ebx;
+    uint32_t ecx;
+    uint32_t edx;
+    if ((__get_cpuid(1U, &eax, &ebx, &ecx, &edx) == 0) || ((ecx & bit_OSXSAVE) == 0U) || ((ecx & bit_AVX) == 0U)) {
+        return false;
+    }
+    __asm__("xgetbv" : "=a"(eax), "=d"(edx) : "c"(0U));
+    return (eax & AVX_STATES) == AVX_STATES;
+}
+
+/// ask_for_avx(), asked once: in a virtual machine the question is slow.
+static bool has_avx(void) {
+    static int known;
+    int        answer = __atomic_load_n(&known, __ATOMIC_RELAXED);
+    if (answer == 0) {
+        answer = ask_for_avx() ? 1 : -1;
+        __atomic_store_n(&known, answer, __ATOMIC_RELAXED);
+    }
+    return answer > 0;
+}
+
+__attribute__((target("avx"))) FLAT static size_t enter_codes_with_avx(library_t* const           self,
+                                                                       const size_t               n,
+                                                                       const size_t               stride,
+                                                                       const uint16_t* const      u,
+                                                                       const uint16_t* const      y,
+                                                                       const uint8_t* const       valid,
+                                                                       const library_out_t* const out) {
+    return enter_codes(self, n, stride, u, y, valid, out);
+}
+#endif
+
+FLAT size_t library_run_codes(library_t* const           self,
+                              const size_t               n,
+                              const size_t               stride,
+                              const uint16_t* const      u,
+                              const uint16_t* const      y,
+                              const uint8_t* const       valid,
+                              const library_out_t* const out) {
+#if WITH_AVX
+    if (has_avx()) {
+        return enter_codes_with_avx(self, n, stride, u, y, valid, out);
+    }
+#endif
+    return enter_codes(self, n, stride, u, y, valid, out);
 }
 
 /// Start of the rows of record r in a result; a null pointer remains one.

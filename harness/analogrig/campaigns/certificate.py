@@ -190,8 +190,8 @@ def certify(
     if question.rare is not None:
         return _certify_rare(question, question.rare, workers)
     most = math.ceil(question.design_n * (MOST_LONGER if question.sequential else 1.0))
-    run_n = _run_n(question, most)
-    work = functools.partial(count_run, question, run_n)
+    scenario = dataclasses.replace(question.scenario, samples=_run_n(question, most))
+    work = functools.partial(count_run, Case(question.rig, question.device, scenario, question.first_seed))
     counts: list[Count] = []
     alarms = samples = 0
     try:
@@ -212,10 +212,9 @@ def certify(
     raise AssertionError("seeds do not end")
 
 
-def count_run(question: Question, run_n: int, seed: int) -> Count:
-    """Alarms and exposure of one run."""
-    scenario = dataclasses.replace(question.scenario, samples=run_n)
-    return count_alarms(Case(question.rig, question.device, scenario, seed))
+def count_run(case: Case, seed: int) -> Count:
+    """Alarms and exposure of the run of a case with another seed. Runs of one scenario share its table."""
+    return count_alarms(dataclasses.replace(case, seed=seed))
 
 
 def _certify_rare(question: Question, count: int, workers: Workers) -> Certificate:

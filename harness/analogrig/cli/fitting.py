@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         Residual,
         Span,
     )
+    from analogrig.program import Program
     from analogrig.run import Run
 
 
@@ -29,12 +30,13 @@ def fit_recording(arguments: argparse.Namespace) -> int:
     """Fit a program to a recording, and keep it as a program file with the fitted values."""
     from analogrig.config import locate
     from analogrig.output import move_aside
+    from analogrig.program import Program
     from analogrig.run import Run
 
     file = locate("programs", arguments.program)
     move_aside(arguments.out, (file, arguments.recording))
     run = Run.load(arguments.recording)
-    plant = _plant(file, run, arguments)
+    plant = _plant(Program.load(str(file)), run, arguments)
     span = plant.span(*_span(arguments, "span", run.samples), _settling_n(arguments))
     check = plant.span(*_span(arguments, "check", run.samples), _settling_n(arguments)) if arguments.check else None
     return _fit(arguments, file, plant, span, (plant, check) if check else None)
@@ -49,26 +51,29 @@ def fit_rig(arguments: argparse.Namespace) -> int:
     from analogrig.program import Program
     from analogrig.rigs.description import open_rig
 
-    file, program = locate("programs", arguments.program), Program.load(arguments.program)
+    file = locate("programs", arguments.program)
+    program = Program.load(str(file))
     move_aside(arguments.out, (file, *files_read(arguments)))
     with open_rig(arguments.rig, allow=trust_of(arguments)) as rig, show_work("recording"):
         fitted, check = (
-            _plant(file, record_program(rig, program, part, arguments.seed), arguments) for part in range(2)
+            _plant(program, record_program(rig, program, part, arguments.seed), arguments) for part in range(2)
         )
     span, check_span = (each.span(0, each.run.samples, _settling_n(arguments)) for each in (fitted, check))
     return _fit(arguments, file, fitted, span, (check, check_span), "held")
 
 
-def _plant(file: Path, run: Run, arguments: argparse.Namespace) -> RecordedPlant:
+def _plant(program: Program, run: Run, arguments: argparse.Namespace) -> RecordedPlant:
     from analogrig.errors import ConfigurationError
     from analogrig.hardware.calibration.recorded import RecordedPlant
-    from analogrig.rigs.emulator import ComputerDescription
-    from analogrig_emulator import load_program
+    from analogrig.rigs.emulator import ComputerDescription, emulator_errors
+    from analogrig_emulator import compile_program
 
     if arguments.pots is not None:
         raise ConfigurationError("--pots is for a rig with front or shock: the pots of this twin are continuous")
     computer = ComputerDescription(op_amp=arguments.op_amp, components=arguments.components or "nominal")
-    return RecordedPlant(load_program(file), run, computer, arguments.seed)
+    with emulator_errors(f"program {program.name}: "):
+        patch = compile_program(program.equations)
+    return RecordedPlant(patch, run, computer, arguments.seed)
 
 
 def _settling_n(arguments: argparse.Namespace) -> int:

@@ -63,7 +63,7 @@ def add(commands: Any) -> None:
         "--clock",
         choices=("plant", "machine"),
         help="clock of --rate and --time: that of the plant, or of a machine that plays it faster; needed with a"
-        " scenario whose program has a speed other than 1",
+        " scenario or program whose speed is not 1",
     )
     command.add_argument("--bits", type=int, metavar="N", help="bits of the converter (default: 16)")
     command.add_argument("--first", type=int, metavar="N", help="first row (default: 0)")

@@ -55,8 +55,7 @@ def _patch(arguments: argparse.Namespace) -> int:
     from analogrig.program import Program
     from analogrig.rigs.emulator import emulator_errors
     from analogrig.storage import replace_file
-    from analogrig_emulator import SuspensionComputer
-    from analogrig_emulator.machine.compiler import load_program
+    from analogrig_emulator import SuspensionComputer, compile_program
     from analogrig_emulator.machine.drawing import patch_drawing
     from analogrig_emulator.machine.sheet import dials, scaling_sheet
     from analogrig_emulator.machine.that_drawing import that_drawing
@@ -66,9 +65,9 @@ def _patch(arguments: argparse.Namespace) -> int:
     file = locate("programs", arguments.program)
     for path in wanted:
         move_aside(path, [file])
-    program = load_program(file)
     loaded = Program.load(str(file))
     with emulator_errors(f"{file}: "):
+        program = compile_program(loaded.equations)
         SuspensionComputer(loaded.circuit)  # refuses what a run would
     that = _that_sheet(program) if arguments.machine == "that" else None
     texts = {}
@@ -84,7 +83,9 @@ def _patch(arguments: argparse.Namespace) -> int:
         files: dict[str, Any] = {"files": [str(path) for path in wanted]}
         if that is not None:
             files |= {"speed": that.speed, "slow": that.slow, "cables": [vars(cable) for cable in that.cables]}
-        show_result({"program": program.name, "full": full, "dials": dials(program), **files}, arguments)
+        show_result(
+            {"program": program.name, "full": full, "dials": dials(program, program.values), **files}, arguments
+        )
     else:
         show_plain((scaling_sheet(program) if that is None else that.text()).rstrip("\n"))
         if that is None:

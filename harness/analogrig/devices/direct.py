@@ -29,7 +29,7 @@ class DirectDevice(Device):
     def __init__(self, description: CatalogueDescription, *, alarms_only: bool = False) -> None:
         """Load and configure the estimator.
 
-        :param alarms_only: omit the estimates, which take a fifth of the time: theta has no columns.
+        :param alarms_only: omit the estimates, which take a twentieth of the time: theta has no columns.
         :raises ConfigurationError: the estimator refuses its configuration.
         :raises LinkError: the library was not built.
         """

@@ -150,7 +150,7 @@ class Estimator:
         :param u: (n,) codes of force.
         :param y: (n,) codes of displacement.
         :param valid: (n,) false where the sample is missing.
-        :param with_theta: False: omit theta, which takes a fifth of the time.
+        :param with_theta: False: omit theta, which takes a tenth of the time.
         :raises ValueError: u, y and valid differ in length.
         """
         u, y = np.asarray(u), np.asarray(y)

@@ -1,4 +1,4 @@
-"""Courses of the displacement with and without each change of a run, from any model of the plant."""
+"""Courses of the output with and without each change of a run, from any model of the plant."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Values = Mapping[str, float]
 
 
 class Trajectory(Protocol):
-    """Displacement from the sample after a moment on."""
+    """Output from the sample after a moment on."""
 
     def advance(self, samples: int) -> NDArray[np.float64]:
-        """Displacement of the next samples in LSB, (samples,)."""
+        """Output of the next samples in LSB, (samples,)."""
 
     def moment(self) -> Any:
         """Moment of the last sample."""
@@ -48,7 +48,7 @@ class PlantChange:
     moment: Any
     """Moment of the model at ``start``."""
     course_lsb: NDArray[np.float64]
-    """Displacement in the samples after ``start``, up to the next change or the end."""
+    """Output in the samples after ``start``, up to the next change or the end."""
 
     @property
     def changed(self) -> tuple[str, ...]:
@@ -83,7 +83,7 @@ def changes_between(
 
 
 def advance(course: Trajectory, samples: int) -> NDArray[np.float64]:
-    """Displacement of the next samples in LSB, computed in chunks."""
+    """Output of the next samples in LSB, computed in chunks."""
     if samples <= CHUNK_SAMPLES:
         return course.advance(samples) if samples else np.empty(0)
     chunks = (min(CHUNK_SAMPLES, samples - first) for first in range(0, samples, CHUNK_SAMPLES))

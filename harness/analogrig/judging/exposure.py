@@ -20,7 +20,7 @@ from analogrig.run import INPUT, LOST, UNARMED, Run, stack
 from analogrig.wording import number_of
 
 EDGE_NOISES = 9.0
-"""Smallest edge, in rms values of the noise of the force. Noise alone makes two samples differ as much once in 5e9
+"""Smallest edge, in rms values of the noise of the input. Noise alone makes two samples differ as much once in 5e9
 pairs."""
 
 _QUANTISATION_LSB = 12.0**-0.5
@@ -36,7 +36,7 @@ class Exposure:
     armed: int
     """Samples in which the trigger was armed."""
     unexcited: int
-    """Samples before the first edge of the force, or more than ``idle_n`` after the last one."""
+    """Samples before the first edge of the input, or more than ``idle_n`` after the last one."""
     non_finite: int
     """Samples without an alarm whose estimate, innovation or statistic was non-finite."""
     datasheet: Datasheet
@@ -60,7 +60,7 @@ class Exposure:
         if 2 * self.unexcited <= self.samples:
             return f"its warm-up takes {sheet.warm_up_n}"
         return (
-            f"in {self.unexcited} it was not excited (no edge of the force of {sheet.edge_codes:g} codes, or none for"
+            f"in {self.unexcited} it was not excited (no edge of the input of {sheet.edge_codes:g} codes, or none for"
             f" {number_of(sheet.idle_n, 'sample')})"
         )
 
@@ -69,7 +69,7 @@ class Exposure:
 class ObservedRecord:
     """Inputs and answers of one gap-free record of n samples."""
 
-    force: NDArray[np.uint16]
+    input: NDArray[np.uint16]
     """(n,) codes."""
     flags: NDArray[np.uint8]
     """(n,) as ``Run.flags``."""
@@ -104,24 +104,24 @@ def exposures(runs: Sequence[Run]) -> list[Exposure]:
 
 
 def record_exposure(record: ObservedRecord, sheet: Datasheet, noise_lsb: float) -> Exposure:
-    """Exposure of one record; ``noise_lsb`` is the noise of the force channel, rms in LSB."""
-    force, flags, are_finite = record.force[None], record.flags[None], record.are_finite[None]
-    counts = _count(force, flags, are_finite, [record.alarms], sheet, noise_lsb)
+    """Exposure of one record; ``noise_lsb`` is the noise of the input's channel, rms in LSB."""
+    driven, flags, are_finite = record.input[None], record.flags[None], record.are_finite[None]
+    counts = _count(driven, flags, are_finite, [record.alarms], sheet, noise_lsb)
     armed, unexcited, non_finite = counts[:, 0].tolist()
-    return Exposure(len(record.force), armed, unexcited, non_finite, sheet)
+    return Exposure(len(record.input), armed, unexcited, non_finite, sheet)
 
 
 def _count(
-    force: NDArray[np.uint16],
+    driven: NDArray[np.uint16],
     flags: NDArray[np.uint8],
     are_finite: NDArray[np.bool_],
     alarms: Sequence[NDArray[np.int64]],
     sheet: Datasheet,
     noise_lsb: float,
 ) -> NDArray[np.int64]:
-    """Armed, unexcited and non-finite samples of each of r records, (3, r); force, flags and are_finite are (r, n)."""
+    """Armed, unexcited and non-finite samples of each of r records, (3, r); driven, flags and are_finite are (r, n)."""
     known = (flags & _NOT_PROCESSED) == 0
-    excited = _excitation_mask(force, known, _least_edge(sheet, noise_lsb), sheet.idle_n)
+    excited = _excitation_mask(driven, known, _least_edge(sheet, noise_lsb), sheet.idle_n)
     excited &= (flags & SteppedFlag.IDLE) == 0
     if sheet.armed:
         watched = known & ((flags & UNARMED) == 0)
@@ -139,17 +139,17 @@ def _count(
 
 
 def _least_edge(sheet: Datasheet, noise_lsb: float) -> float:
-    """Smallest step of the force that counts as an edge, in codes; 0.0 if the trigger needs none."""
+    """Smallest step of the input that counts as an edge, in codes; 0.0 if the trigger needs none."""
     if not sheet.edge_codes:
         return 0.0
     return max(sheet.edge_codes, EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB))
 
 
 def _excitation_mask(
-    force: NDArray[np.uint16], known: NDArray[np.bool_], edge_codes: float, idle_n: int
+    driven: NDArray[np.uint16], known: NDArray[np.bool_], edge_codes: float, idle_n: int
 ) -> NDArray[np.bool_]:
-    """(r, n): the force has had an edge, and the last one is at most ``idle_n`` samples ago."""
-    codes = force.astype(np.int32)
+    """(r, n): the input has had an edge, and the last one is at most ``idle_n`` samples ago."""
+    codes = driven.astype(np.int32)
     are_edges = (np.abs(np.diff(codes)) >= edge_codes) & known[:, 1:] & known[:, :-1]
     excited = np.ones(codes.shape, np.bool_)
     for i, record in enumerate(are_edges):

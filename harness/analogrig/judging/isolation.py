@@ -1,4 +1,4 @@
-"""Isolation bound of one change: samples until the displacement rejects every change of one other parameter."""
+"""Isolation bound of one change: samples until the output rejects every change of one other parameter."""
 
 from __future__ import annotations
 

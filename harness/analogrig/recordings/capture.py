@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,18 +18,16 @@ from analogrig.recordings.captured import CaptureDecoding, CapturedRun
 from analogrig.recordings.decoder import CaptureDecoder, FrameDictionary
 from analogrig.recordings.ecu_decoder import EcuDecoder
 from analogrig.recordings.files import CapturedFrames
+from analogrig.recordings.program_units import scaled_to_program
 from analogrig.rigs.rig import Block
 from analogrig.run import IMPORTED, INPUT, LOST, OUTPUT, Conditions, Run
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
-from analogrig_emulator import ProgramError, parse_unit
 
 if TYPE_CHECKING:
-    from analogrig.rigs.rig import Rig
-    from analogrig_emulator import Equations
+    from analogrig.rigs.rig import Performance, Rig
 
 _MOST_NAMED = 3
-_LEAST_PERIOD_S = 1e-9
 
 
 def import_run(
@@ -44,8 +42,8 @@ def import_run(
 ) -> Run:
     """Run of a CAN log, with the truth of ``scenario`` and the units of ``rig``.
 
-    Samples without codes or without all of their answers are LOST; those without codes are also missing. Velocity and
-    net force are not transmitted: their codes are zero and marked as clipped.
+    Samples without codes or without all of their answers are LOST; those without codes are also missing. Channels
+    other than input and output are not transmitted: their codes are zero and marked as clipped.
 
     :param dbc: DBC of the log, if it differs from the catalogue of this build.
     :param device: device with messages of its own, to which the log belongs.
@@ -56,14 +54,7 @@ def import_run(
     """
     frames = CapturedFrames(path)
     performance = rig.perform(scenario, 0)
-    try:
-        decoder: CaptureDecoding = (
-            CaptureDecoder(FrameDictionary(dbc), frames)
-            if device is None
-            else EcuDecoder(device, performance.of_device, frames, most_n=scenario.samples)
-        )
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    decoder = _decoder(frames, dbc, device, performance, scenario.samples)
     captured = _select_run(decoder, frames, number)
     if captured.extent > scenario.samples:
         raise ConfigurationError(
@@ -94,6 +85,18 @@ def import_run(
             program=scenario.program,
         )
     )
+
+
+def _decoder(
+    frames: CapturedFrames, dbc: Path | None, device: CanDbcDevice | None, performance: Performance, most_n: int
+) -> CaptureDecoding:
+    """Decoder of a log's messages: the catalogue's, or those of a device with messages of its own."""
+    try:
+        if device is None:
+            return CaptureDecoder(FrameDictionary(dbc), frames)
+        return EcuDecoder(device, performance.of_device, frames, most_n=most_n)
+    except RecordingError as error:
+        raise RecordingError(f"{frames.path}: {error}") from error
 
 
 def _plausible_counters(captured: CapturedRun, answers: Answers) -> Mapping[str, int]:
@@ -141,56 +144,6 @@ def replace_scenario(run: Run, scenario: Scenario) -> Run:
         samples_asked=scenario.samples,
     )
     return dataclasses.replace(run, conditions=scaled_to_program(conditions))
-
-
-def scaled_to_program(conditions: Conditions) -> Conditions:
-    """Conditions of imported columns with the speed of their program; those of any other run as they are.
-
-    :raises ConfigurationError: a column is in another unit than its quantity of the program, its clock is not stated,
-        or the machine is too fast.
-    """
-    rig = conditions.rig
-    if rig.get("kind") != IMPORTED or "rig" in rig:  # a play, or data with the units and the rate of a rig
-        return conditions
-    program, clock = conditions.program, rig.get("clock")
-    conditions = in_units(conditions, program.equations, program.measured)
-    speed = program.equations.speed
-    if clock is None and speed != 1.0:
-        raise ConfigurationError(
-            f"program {program.name}: the machine runs at {speed:g} times the speed of the plant: import the recording"
-            " with --clock plant if its rate is in time of the plant, or with --clock machine"
-        )
-    period_s = conditions.sample_period_s if clock == "machine" else conditions.sample_period_problem_s / speed
-    if period_s < _LEAST_PERIOD_S:
-        raise ConfigurationError(
-            f"program {program.name}: the recording has {1.0 / period_s:.3g} samples per second of the machine, more"
-            f" than {1.0 / _LEAST_PERIOD_S:g}: check its rate and --clock"
-        )
-    return dataclasses.replace(conditions, sample_period_s=period_s, time_scale=speed)
-
-
-def in_units(conditions: Conditions, equations: Equations, quantities: Sequence[str]) -> Conditions:
-    """Conditions with the two measured channels in the units of these quantities of a program.
-
-    :raises ConfigurationError: no factor between the units is known; names both, and the options that convert a column.
-    """
-    channels = dict(conditions.channels)
-    for side, name, quantity in zip(("input", "output"), conditions.program.measured, quantities, strict=True):
-        unit, channel = equations.quantities[quantity].unit, channels[name]
-        measured = channel.unit
-        if unit is None or unit.text == measured:
-            continue
-        try:
-            factor = parse_unit(measured).factor_to(unit)
-        except ProgramError:
-            factor = None
-        if factor is None:
-            raise ConfigurationError(
-                f"{quantity} of program {equations.name} is in {unit.text}, {name} of the recording in {measured}:"
-                f" import it with --{side}-unit {unit.text}, and --{side}-scale {unit.text} per number in its column"
-            )
-        channels[name] = dataclasses.replace(channel, unit=unit.text, unit_per_v=channel.unit_per_v * factor)
-    return dataclasses.replace(conditions, channels=channels)
 
 
 def _line_counts(decoder: CaptureDecoding, frames: CapturedFrames) -> dict[str, int]:

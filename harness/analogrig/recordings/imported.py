@@ -17,8 +17,8 @@ from analogrig import config
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import MAX_SAMPLES, Segment
 from analogrig.program import Program
-from analogrig.recordings.capture import scaled_to_program
 from analogrig.recordings.columns import ColumnFile, read_columns
+from analogrig.recordings.program_units import scaled_to_program
 from analogrig.run import IMPORTED, Channel, Conditions, Run
 from analogrig.scenario import DEFAULT_PROGRAM, Scenario
 from analogrig.wording import number_of

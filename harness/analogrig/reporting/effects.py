@@ -40,15 +40,16 @@ def as_json(table: EffectsBySet) -> dict[str, Any]:
 
 def text(table: EffectsBySet) -> str:
     """Effects as a table for the terminal."""
+    width = 2 + max(len(row.name) for rows in table.values() for row in rows)
     lines = [
         f"Largest change of the displacement over {SAMPLES} samples, in LSB of 12 bits over 10 V",
         "(random effects: median over draws)",
         "",
-        f"{'':34}" + "".join(f"{name:>10}" for name in table) + f"{'draws':>8}",
+        f"{'':{width}}" + "".join(f"{name:>10}" for name in table) + f"{'draws':>8}",
     ]
     for rows in zip(*table.values(), strict=True):
         figures = "".join(f"{_format_lsb(row.median_lsb):>10}" for row in rows)
-        lines.append(f"{rows[0].name:34}{figures}{rows[0].draws:>8}")
+        lines.append(f"{rows[0].name:{width}}{figures}{rows[0].draws:>8}")
     return "\n".join(lines)
 
 

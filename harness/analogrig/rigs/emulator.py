@@ -26,6 +26,8 @@ from analogrig_emulator import (
     CARDS,
     COMPONENTS,
     FINE_OP_AMP_GRADES,
+    MULTIPLIER_GRADES,
+    MULTIPLIERS,
     OP_AMP_GRADES,
     Capacitor,
     Card,
@@ -35,6 +37,7 @@ from analogrig_emulator import (
     EmulatorError,
     Excitation,
     NoisySuspension,
+    NormalStream,
     OpAmp,
     OpAmpGrade,
     Pot,
@@ -119,8 +122,11 @@ class ComputerDescription:
     offset_v: float = 0.0
     """Each amplifier's input offset is drawn from the seed, within plus and minus this."""
     components: Literal["nominal", "polyester", "polypropylene"] = "nominal"
-    """Kind of components. Real ones are drawn from the seed, as is the amplifiers' grade: offset, drift, bias,
-    bandwidth."""
+    """Kind of components. Real ones are drawn from the seed, as are the grades of amplifiers (offset, drift, bias,
+    bandwidth) and multipliers (scale error, offsets, non-linearity)."""
+    multiplier: Literal["ideal", "ad633"] | None = None
+    """Bandwidth, slew rate, swing and noise of the multipliers. Default: ``ad633`` with real components, ``ideal`` with
+    nominal ones."""
     specimen: int | None = None
     """Seed from which the machine is drawn, instead of the run's: all runs then use the same machine."""
     pots: Literal["coefficient", "dial"] = "coefficient"
@@ -147,6 +153,11 @@ class ComputerDescription:
     def _grades(self) -> Mapping[str, OpAmpGrade]:
         return FINE_OP_AMP_GRADES if self.fine_effects else OP_AMP_GRADES
 
+    @property
+    def multiplier_name(self) -> str:
+        """Name of the multipliers' model and grade."""
+        return self.multiplier or ("ideal" if self.components == "nominal" else "ad633")
+
     def components_for(self, seed: int) -> Components:
         """Components of the machine: as measured, or drawn from the seed.
 
@@ -159,8 +170,9 @@ class ComputerDescription:
             stock = dataclasses.replace(
                 stock, pots=dataclasses.replace(stock.pots, wiper_noise_ohm=self.wiper_noise_ohm)
             )
-        graded = self.components != "nominal" and self.op_amp in self._grades
-        stock = dataclasses.replace(stock, op_amps=self._grades[self.op_amp]) if graded else stock
+        if self.components != "nominal":
+            op_amps = self._grades.get(self.op_amp, stock.op_amps)
+            stock = dataclasses.replace(stock, op_amps=op_amps, multipliers=MULTIPLIER_GRADES[self.multiplier_name])
         return stock if self.values is None else self.values.put_in(stock)
 
     def machine(self, program: ProgramCircuit, seed: int, sample_rate_hz: float) -> SuspensionComputer:
@@ -174,6 +186,7 @@ class ComputerDescription:
         return SuspensionComputer(
             program,
             opamp=preset(self.op_amp),
+            multiplier=MULTIPLIERS[self.multiplier_name],
             rng=Stream.COMPONENTS.generator(specimen),
             offset_v=self.offset_v,
             components=self.components_for(specimen),
@@ -423,7 +436,7 @@ class EmulatorRig(Rig):
             sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
             channels=_channels(card, computer, scenario.program),
-            blocks=_sample(volts, Sampler(card, Stream.CARD.generator(seed))),
+            blocks=_sample(volts, Sampler(card, NormalStream(seed, Stream.CARD))),
             hindsight=lambda: Hindsight(
                 scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(card))
             ),
@@ -458,7 +471,7 @@ class EmulatorRig(Rig):
             sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
             channels=_channels(card, computer, program),
-            blocks=_sample(map(alter, volts), Sampler(card, Stream.CARD.generator(seed))),
+            blocks=_sample(map(alter, volts), Sampler(card, NormalStream(seed, Stream.CARD))),
             hindsight=lambda: Hindsight((), _lit_lamps(computer.machine.lamps, probes_per_sample(card))),
         )
 

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.calibration.averages import noise_variance
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.recordings.capture import in_units
+from analogrig.recordings.program_units import in_units
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import (
-    MULTIPLIER_GRADES,
+    MULTIPLIERS,
     EngineError,
     PatchedProgram,
     RecordedExcitation,
@@ -190,12 +190,15 @@ class RecordedPlant:
         self.run = dataclasses.replace(run, conditions=conditions)
         stock = computer.components_for(seed)
         components = dataclasses.replace(stock, pots=dataclasses.replace(stock.pots, windings=0))
-        if computer.components != "nominal":
-            components = dataclasses.replace(components, multipliers=MULTIPLIER_GRADES["ad633"])
         period_s = run.conditions.sample_period_problem_s
         rate_hz = equations.speed / period_s
         self._computer = SuspensionComputer(
-            program, opamp=computer.op_amp, components=components, sample_rate_hz=rate_hz, offset_v=0.0
+            program,
+            opamp=computer.op_amp,
+            multiplier=MULTIPLIERS[computer.multiplier_name],
+            components=components,
+            sample_rate_hz=rate_hz,
+            offset_v=0.0,
         )
         self._at = equations.channels.index(self.output)
         self.output_unit = conditions.channels[self._measured[1]].unit
