@@ -43,8 +43,8 @@ LEAST_COMMANDS = 40
 LEAST_BLOCKS = {"toml": 7, "python": 5}
 """Least numbers over all pages, by language."""
 WALKS = 4
-RUN_BY_ANOTHER_TEST = {"serve-the-emulator"}
-"""Pages whose Python needs a server: tests/served/test_page.py."""
+RUN_BY_ANOTHER_TEST = {"serve-the-emulator", "import-measured-data"}
+"""Pages whose Python needs a server, or a recording: tests/served/test_page.py, tests/harness/test_pytest_plugin.py."""
 SET_BY_THE_HARNESS = {"force_zero"}
 """Settings that a device file need not give: the code of zero force follows from the card's range."""
 

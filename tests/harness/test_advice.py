@@ -52,10 +52,15 @@ def test_fault_of_a_channel_that_the_device_diagnosed_is_named() -> None:
 
 
 def test_more_noise_than_the_device_is_set_for_is_named() -> None:
-    run = made_run(
-        LOADED, [(0, FRONT)], noise_lsb=2.0, theta=GOOD_THETA, estimator={**ESTIMATOR, "noise_variance": 1.2}
-    )
+    settings = {**ESTIMATOR, "noise_variance": 1.2, "noise_estimated": False}
+    run = made_run(LOADED, [(0, FRONT)], noise_lsb=2.0, theta=GOOD_THETA, estimator=settings)
     assert "variance of 4.1 codes^2, the device is set for 1.2" in advised(run)
+
+
+def test_noise_that_the_device_follows_needs_no_advice() -> None:
+    settings = {**ESTIMATOR, "noise_variance": 1.2, "noise_estimated": True}
+    run = made_run(LOADED, [(0, FRONT)], noise_lsb=20.0, theta=GOOD_THETA, estimator=settings)
+    assert advised(run) == ""
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,9 @@ from analogrig.judging.courses import first_at_level
 from analogrig.judging.information import change_information
 from analogrig.judging.verdict import UNDETECTABLE, judge
 from analogrig.recordings import column_reader, columns, replace_scenario
+from analogrig.recordings.column_reader import unit_in_name
 from analogrig.recordings.columns import read_columns
-from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns, unit_in_name
+from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
 from analogrig.reporting.measured import mode_of
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
@@ -652,17 +653,100 @@ def test_doubtful_data_are_imported_with_a_caveat(
 @pytest.mark.usefixtures("in_this_process")
 def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [unit_in_name(each) for each in ("x", "x[2]", "x [m/s^2]", "x(mm) ")] == ["", "", "m/s^2", "mm"]
-    (tmp_path / "a.csv").write_text("t [m];F (Nm)\n0;1\n1;2\n2;4\n")
-    named = ["import", str(tmp_path / "a.csv"), "--input", "F (Nm)", "--output", "F (Nm)"]
+    (tmp_path / "a.csv").write_text("t [m];F (Nm);G (Nm)\n0;1;3\n1;2;4\n2;4;5\n")
+    named = ["import", str(tmp_path / "a.csv"), "--input", "F (Nm)", "--output", "G (Nm)"]
     named += ["--input-unit", "N m", "--out", str(tmp_path / "out.npz")]
     assert main([*named, "--time", "t [m]"]) == 2
     assert "column t [m]: must be a time, not in m: pass --rate HZ" in capsys.readouterr().err
     assert main([*named, "--rate", "1000"]) == 0
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")] == [
         "caveat: column F (Nm), in Nm, is imported in N m: pass --input-unit, and --input-scale to convert",
-        "caveat: column F (Nm), in Nm, is imported in V: pass --output-unit, and --output-scale to convert",
-        "caveat: input and output are the same column",
+        "caveat: column G (Nm), in Nm, is imported in V: pass --output-unit, and --output-scale to convert",
     ]
+
+
+def numbers_of(text: str, wanted: list[str], tmp_path: Path, skip_lines: int = 0) -> list[list[float]]:
+    (tmp_path / "a.txt").write_text(text)
+    found = column_reader.read(tmp_path / "a.txt", wanted, skip_lines).columns
+    return [found[name].tolist() for name in wanted]
+
+
+@pytest.mark.parametrize(
+    ("text", "first", "second", "skip_lines"),
+    [
+        ("0,5;1,25;2,5\n1,5;2,25;3,5\n", "0", "1", 0),
+        ("0;0,5\n1;1,5\n", "0", "1", 0),
+        ("U 1,5 kV;y\n0;0,5\n1;1,5\n", "U 1,5 kV", "y", 0),
+        ("t;U;omega\n(s);(mV);(rad/s)\n\n0,5;1,25;2,5\n1,5;2,25;3,5\n", "0", "1", 3),
+        ("0,5 0,0\n1,5 0,1\n", "0", "1", 0),
+        ("0,5\t1,25\n1,5\t2,25\n", "0", "1", 0),
+        ("a b;u;y\n2026-11-23 12:00:00;0,5;1\n2026-11-23 12:00:01;1,5;2\n", "u", "y", 0),
+        ('"u","y, measured"\n"0.5","1.25"\n"1.5","2.25"\n', "u", "y, measured", 0),
+    ],
+)
+def test_the_separator_is_that_of_all_lines(
+    text: str, first: str, second: str, skip_lines: int, tmp_path: Path
+) -> None:
+    found, other = numbers_of(text, [first, second], tmp_path, skip_lines)
+    assert found in ([0.5, 1.5], [0.0, 1.0]) and len(other) == 2
+
+
+def test_a_column_may_be_named_without_its_unit(tmp_path: Path) -> None:
+    text = "U [mV],omega (rad/s),T [K],T [C]\n1,2,3,4\n5,6,7,8\n"
+    assert numbers_of(text, ["U", "omega"], tmp_path) == [[1.0, 5.0], [2.0, 6.0]]
+    assert column_reader.read(tmp_path / "a.txt", ["U", "omega"]).units == {"U": "mV", "omega": "rad/s"}
+    with pytest.raises(column_reader.ColumnError, match="2 columns are called 'T'"):
+        column_reader.read(tmp_path / "a.txt", ["T"])
+
+
+def caveats(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Caveats of the last import."""
+    return [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")]
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_samples_beyond_a_range_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.csv").write_text("U [mV],y\n20000,1\n12,2\n-30,3\n,4\n")
+    named = ["--input", "U", "--output", "y", "--rate", "1000", "--input-range", "-25", "25"]
+    assert main(["import", str(tmp_path / "a.csv"), *named, "--out", str(tmp_path / "out.npz")]) == 0
+    assert caveats(capsys)[-1] == (
+        "caveat: 2 samples of column U at or beyond the ends of its range, -25 to 25 mV: missing"
+    )
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_rows_that_a_scenario_does_not_count_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_csv(tmp_path / "a.csv", *made_signals(2000))
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text("samples = 1500\n[excitation]\nlow_v = 0.0\nhigh_v = 1.0\nfrequency_hz = 10.0\n")
+    named = ["--input", "u", "--output", "y", "--rate", "1000", "--input-unit", "N", "--output-unit", "m"]
+    command = ["import", str(tmp_path / "a.csv"), *named, "--clock", "machine", "--scenario", str(scenario)]
+    assert main([*command, "--samples", "1000", "--first", "200", "--out", str(tmp_path / "out.npz")]) == 0
+    told = "\n".join(caveats(capsys))
+    assert "1000 of the 1500 samples of scenario mine: a replay is INCONCLUSIVE" in told
+    assert "the samples of scenario mine count from row 200" in told
+    assert main([*command, "--samples", "1500", "--out", str(tmp_path / "out.npz")]) == 0
+    assert not any("scenario mine" in each for each in caveats(capsys))
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_another_rate_than_that_of_the_file_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from scipy.io import wavfile
+
+    wavfile.write(tmp_path / "a.wav", 2000, np.arange(40, dtype=np.int16).reshape(20, 2) ** 2)
+    command = ["import", str(tmp_path / "a.wav"), "--input", "0", "--output", "1", "--out", str(tmp_path / "out.npz")]
+    assert main([*command, "--rate", "999"]) == 0
+    assert caveats(capsys) == ["caveat: the file states 2000 Hz, another rate than the one given"]
+    assert main([*command, "--rate", "2000.4"]) == 0 and not caveats(capsys)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_column_of_instants_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mf4(tmp_path / "a.mf4", *made_signals())
+    command = ["import", str(tmp_path / "a.mf4"), "--input", "u", "--output", "y", "--out", str(tmp_path / "out.npz")]
+    assert main(command) == 2
+    proposed = capsys.readouterr().err.rpartition("such as --time ")[2].strip()
+    assert main([*command, "--time", proposed]) == 0
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shlex
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import pytest
 
 import analogrig.reporting  # these two for the runs in this process, which forgets what they import themselves
@@ -26,6 +28,8 @@ from analogrig.testing.statement import Play, judge_statement
 from analogrig_emulator import Excitation
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import LONG_S, ends
+
+ROOT = Path(__file__).parents[2]
 
 SHORT = """\
 samples = 900
@@ -254,6 +258,59 @@ def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
     status = cli.main([*line.split()[5:], "--json", "--out", str(user.path / "again")])
     assert status == 0
     assert f'"theta_hash": "{properties(user)["theta_hash"]}"' in capsys.readouterr().out
+
+
+def imported(*options: str) -> str:
+    """Name of the rig of measured data in the working directory."""
+    rng = np.random.default_rng(1)
+    u, y = np.where(np.arange(900) // 50 % 2, 4.0, 0.0), np.zeros(900)
+    for k in range(2, 900):
+        y[k] = 1.7 * y[k - 1] - 0.75 * y[k - 2] + 0.1 * u[k - 1]
+    np.savez("measured.npz", u=u, y=y + 0.01 * rng.normal(size=900))
+    named = ["--input", "u", "--output", "y", "--rate", "20000", *options]
+    assert cli.main(["import", "measured.npz", *named, "--out", "recording.npz"]) == 0
+    return "recording:recording.npz"
+
+
+def repeat_command(result: pytest.RunResult, start: str) -> list[str]:
+    (line,) = [line for line in result.outlines if line.startswith(f"{start} again with: ")]
+    return shlex.split(line.partition(": ")[2])
+
+
+def test_recording_is_played_without_its_seed_and_a_failure_names_it(
+    user: pytest.Pytester, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(user.path)
+    units = ["--input-unit", "N", "--output-unit", "m", "--clock", "machine"]
+    rig = imported("--scenario", "short.toml", *units)
+    user.makepyfile(PLAYS.format(assertion="print(played.repeat); assert played.detects(within=0.0)"))
+    result = run(user, "--hil-dut", "inproc", "--hil-rig", rig, "--junitxml", "junit.xml")
+    result.assert_outcomes(failed=1)
+    found = properties(user)["theta_hash"]
+    capsys.readouterr()
+    cli.main([*repeat_command(result, "play it")[1:], "--json", "--out", "again"])
+    assert f'"theta_hash": "{found}"' in capsys.readouterr().out
+    result.stdout.fnmatch_lines([f"analogrig run --seed 0 --scenario short.toml --rig {rig} --dut inproc"])
+    judged = run(user, *repeat_command(result, "judge it")[1:], "--junitxml", "judged.xml")
+    judged.assert_outcomes(failed=1)
+    assert properties(user, "judged.xml")["theta_hash"] == found
+
+
+def test_recording_of_an_unknown_plant_is_played_by_the_call_of_the_manual(
+    user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(user.path)
+    rig = imported()
+    page = (ROOT / "harness" / "docs" / "howto" / "import-measured-data.md").read_text(encoding="utf-8")
+    example = page.partition("```python\n")[2].partition("```")[0]
+    user.makepyfile(f"{example}\ndef test_unjudged(hil_play):\n    hil_play()\n")
+    result = run(user, "--hil-dut", "inproc", "--hil-rig", rig)
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(["*UNJUDGED: nothing is known of the plant*"])
+    assert cli.main([*repeat_command(result, "play it")[1:], "--out", "again"]) == 3
+    result = run(user, "--hil-dut", "inproc", "--hil-rig", "emulator")
+    result.assert_outcomes(failed=2)
+    result.stdout.fnmatch_lines(["*plays the scenario of a recording: name another for this rig*"])
 
 
 def test_play_refuses_a_file_that_names_another_rig_or_device_than_plays_it(user: pytest.Pytester) -> None:

@@ -10,7 +10,9 @@ from scipy.signal import cont2discrete
 
 from analogrig.bench import Bench
 from analogrig.devices.opening import open_dut
-from analogrig.judging.response import step_responses
+from analogrig.judging.response import StepResponse, step_responses
+from analogrig.judging.verdict import judge
+from analogrig.reporting import summary
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -81,3 +83,10 @@ def test_program_that_is_not_linear_has_no_response_to_judge() -> None:
     played = Played(play("duffing", "emulator"))
     assert not step_responses(played.run)
     assert "the program is not linear" in played.responds(0.1).why
+
+
+def test_rows_of_long_runs_keep_their_cells_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = play("dc-motor", "emulator-ideal")
+    monkeypatch.setattr(summary, "step_responses", lambda _: (StepResponse(0, 200_000, 0.0001),))
+    lines = summary.summary(run, judge(run)).splitlines()
+    assert "      0-199999 0.01% of the static gain" in lines

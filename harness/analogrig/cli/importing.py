@@ -199,8 +199,26 @@ def _caveats(run: Run) -> list[str]:
                 f"caveat: column {column}, in {header}, is imported in {unit}: pass --{side}-unit, and --{side}-scale"
                 " to convert"
             )
-    if "rig" not in rig and rig["input"]["column"] == rig["output"]["column"]:
-        lines.append("caveat: input and output are the same column")
+    for side, beyond_n in zip(_SIDES, rig.get("beyond_range_n", ()), strict=False):
+        if beyond_n:
+            column, unit, (low, high) = (rig[side][key] for key in ("column", "unit", "range"))
+            lines.append(
+                f"caveat: {number_of(beyond_n, 'sample')} of column {column} at or beyond the ends of its range,"
+                f" {low:g} to {high:g} {unit}: missing"
+            )
+    if stated_hz := rig.get("stated_rate_hz"):
+        lines.append(f"caveat: the file states {stated_hz:g} Hz, another rate than the one given")
+    scenario, first = run.conditions.scenario, rig.get("first", 0)
+    if run.conditions.segments and run.samples < run.conditions.samples_asked:
+        lines.append(
+            f"caveat: {run.samples} of the {run.conditions.samples_asked} samples of scenario {scenario['name']}:"
+            " a replay is INCONCLUSIVE; import all, or set samples in the scenario"
+        )
+    if run.conditions.segments and first:
+        lines.append(
+            f"caveat: the samples of scenario {scenario['name']} count from row {first}: a change at sample 0 is in"
+            " that row"
+        )
     if len(run.conditions.segments) > 1 and not run.conditions.output.noise_lsb:
         lines.append("caveat: no noise of the output is stated: bounds count quantisation alone; pass --output-noise")
     if blank := rig.get("blank_lines"):

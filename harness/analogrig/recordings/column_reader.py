@@ -46,13 +46,18 @@ _MOST_NAME = 120
 _MOST_TEXT_BYTES = 4096
 """Largest array of texts that is read."""
 
+_SAMPLED_LINES = 40
+"""Lines at the start of a text from which its delimiter is found."""
+
+_NAME_AND_UNIT = re.compile(r"(.*?)\s*[\[(]([^\[\]()\d][^\[\]()]*)[\])]")  # x[2] is part of an array
+
 _MOST_FOOTER = 20
 """Lines at the end of a text whose unwanted columns are looked at, too."""
 
 _CHUNK_BYTES = 1 << 20
-_DELIMITERS = (",", ";", "\t")
 _SPACES = " "
 """Delimiter of cells that stand apart by any number of spaces."""
+_DELIMITERS = (";", "\t", ",", _SPACES)
 _NO_TEXT = {
     b"\xff\xfe": "is UTF-16 text: save it as UTF-8",
     b"\xfe\xff": "is UTF-16 text: save it as UTF-8",
@@ -162,7 +167,7 @@ def _number(cell: str, delimiter: str) -> float:
 
 def _is_word(cell: str) -> bool:
     """True unless the cell is a number; an empty one is a word, too."""
-    return not cell.strip() or not _are_numbers([cell], _DELIMITERS[1])
+    return not cell.strip() or not _are_numbers([cell], ";")
 
 
 def _are_numbers(cells: Sequence[str], delimiter: str) -> bool:
@@ -188,8 +193,9 @@ def read_text(path: Path, wanted: Sequence[str], skip_lines: int) -> tuple[list[
         first = next((each for each in rest if each[1].strip()), None)
         if first is None:
             raise ColumnError("holds no line of text")
-        delimiter = max(_DELIMITERS, key=first[1].count)
-        delimiter = delimiter if delimiter in first[1] else _SPACES
+        start = list(islice(rest, _SAMPLED_LINES))
+        rows = chain(start, rest)
+        delimiter = _delimiter(first[1], [line for _, line in start if line.strip()])
         cells = [cell.strip() for cell in _cells(first[1], delimiter)]
         has_header = not _are_numbers(cells, delimiter)
         names = cells if has_header else [str(j) for j in range(len(cells))]
@@ -197,13 +203,11 @@ def read_text(path: Path, wanted: Sequence[str], skip_lines: int) -> tuple[list[
             names.pop()
         if len(names) > MOST_COLUMNS:
             raise ColumnError(f"more than {MOST_COLUMNS} columns")
-        if missing := [name for name in wanted if name not in names]:
-            raise ColumnError(f"{_unknown(missing[0], names)}{_cure_of_names(names)}")
-        places = [_place(name, names) for name in wanted]
+        places = [_place(name, names, _cure_of_names(names)) for name in wanted]
         found: list[array.array[float]] = []
         blank_lines = 0
         if wanted:
-            found, blank_lines = _read_rows(rest if has_header else chain([first], rest), names, places, delimiter)
+            found, blank_lines = _read_rows(rows if has_header else chain([first], rows), names, places, delimiter)
     return names, {name: np.frombuffer(column) for name, column in zip(wanted, found, strict=True)}, blank_lines
 
 
@@ -290,6 +294,22 @@ def _too_many(samples: int) -> str:
     return f"has more than {samples} samples; cut it into files of fewer lines"
 
 
+def _delimiter(first: str, rows: Sequence[str]) -> str:
+    """Delimiter that gives as many cells in each row as in the first line; of several, the one with most numbers.
+
+    If none does, the one with most numbers.
+    """
+
+    def merit(delimiter: str) -> tuple[bool, float]:
+        rows_of_cells = [_cells(row, delimiter) for row in rows]
+        cells = [cell for row in rows_of_cells for cell in row]
+        numbers = sum(_are_numbers([cell], delimiter) for cell in cells) / len(cells) if cells else 0.0
+        return {len(row) for row in rows_of_cells} <= {len(_cells(first, delimiter))}, numbers
+
+    possible = [each for each in _DELIMITERS if len(_cells(first, each)) > 1]
+    return max(possible, key=merit, default=_SPACES)
+
+
 def _cells(line: str, delimiter: str) -> list[str]:
     return line.split() if delimiter == _SPACES else next(csv.reader([line], delimiter=delimiter))
 
@@ -301,18 +321,30 @@ def _cure_of_names(names: Sequence[str]) -> str:
     return "; --skip-lines N leaves out text above the header"
 
 
-def _place(name: str, names: Sequence[str]) -> int:
-    """:raises ColumnError: there is no such name, or more than one."""
-    if names.count(name) != 1:
-        raise ColumnError(_unknown(name, names))
-    return names.index(name)
+def unit_in_name(column: str) -> str:
+    """Unit in brackets at the end of a column's name, such as mm of ``stroke [mm]``; empty without one."""
+    found = _NAME_AND_UNIT.fullmatch(column.strip())
+    return found[2].strip() if found else ""
 
 
-def _unknown(name: str, names: Sequence[str]) -> str:
+def _without_unit(column: str) -> str:
+    found = _NAME_AND_UNIT.fullmatch(column.strip())
+    return found[1] if found and "\ufffd" not in column else column
+
+
+def _place(name: str, names: Sequence[str], cure: str = "") -> int:
+    """Place of a name, which may lack its unit.
+
+    :raises ColumnError: there is no such name, or more than one.
+    """
+    places = [i for i, each in enumerate(names) if each == name]
+    places = places or [i for i, each in enumerate(names) if _without_unit(each) == name]
+    if len(places) == 1:
+        return places[0]
+    if places:
+        raise ColumnError(f"{len(places)} columns are called {name[:_MOST_NAME]!r}")
     shown = ", ".join(each[:_MOST_NAME] for each in names[:20]) + (", ..." if len(names) > 20 else "")
-    if name in names:
-        return f"{names.count(name)} columns are called {name[:_MOST_NAME]!r}"
-    return f"no column is called {name[:_MOST_NAME]!r}; there are {shown or 'none'}"
+    raise ColumnError(f"no column is called {name[:_MOST_NAME]!r}; there are {shown or 'none'}{cure}")
 
 
 def _refusal(refused: Mapping[str, str]) -> str:
@@ -542,15 +574,20 @@ def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
     opening = FORMATS[path.suffix.lower()][1]
     if opening is None:
         names, columns, blank_lines = read_text(path, wanted, skip_lines)
-        return Columns(names, columns, None, blank_lines)
+        full = {name: names[_place(name, names)] for name in wanted}
+        units = {name: unit for name, each in full.items() if (unit := unit_in_name(each))}
+        return Columns(names, columns, None, blank_lines, units)
     table = opening(path)
     names = list(table.columns)
-    for name in wanted:
-        if table.refused and name not in names:
-            raise ColumnError(f"{_unknown(name, names)}; {_refusal(table.refused)}")
-        _place(name, names)
-    units = {name: table.units[name][:_MOST_NAME] for name in wanted if table.units.get(name)}
-    return Columns(names, {name: table.columns[name]() for name in wanted}, table.rate_hz, 0, units, table.channels)
+    refusal = f"; {_refusal(table.refused)}" if table.refused else ""
+    full = {name: names[_place(name, names, refusal)] for name in wanted}
+    units = {name: unit[:_MOST_NAME] for name, each in full.items() if (unit := _unit(table, each))}
+    columns = {name: table.columns[each]() for name, each in full.items()}
+    return Columns(names, columns, table.rate_hz, 0, units, table.channels)
+
+
+def _unit(table: Table, name: str) -> str:
+    return table.units.get(name) or unit_in_name(name)
 
 
 def answer(asked: Mapping[str, Any]) -> dict[str, Any]:

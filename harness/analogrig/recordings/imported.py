@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +42,12 @@ _ASCII = MappingProxyType(
     {"\u00b5": "u", "\u03bc": "u", "\u2126": "ohm", "\u03a9": "ohm", "\u00b7": " ", "\u00b2": "^2", "\u00b3": "^3"}
 )
 """Symbols of headers in the words of a program file."""
+
+_MOST_RATE_ERROR = 0.01
+"""Relative difference of the given rate from the one that a file states, which may be rounded."""
+
+_TIMES = ("t", "time", "timestamp", "timestamps")
+"""Usual names of a column of instants, in lower case and without unit and group."""
 
 _MOST_JITTER = 0.02
 """Largest deviation of a time from the even grid, in sample periods."""
@@ -103,6 +109,8 @@ class ImportDescription:
     description: str = ""
 
     def __post_init__(self) -> None:
+        if self.input.column == self.output.column:
+            raise ValueError(f"input and output are the same column, {self.input.column[:40]}: name two")
         if self.rate_hz is not None and not 1e-6 <= self.rate_hz <= 1e9:
             raise ValueError(f"rate_hz must be 1e-6 to 1e9, not {self.rate_hz:g}")
         if self.rate_hz is not None and self.time:
@@ -120,23 +128,12 @@ class ImportDescription:
         return tuple(dict.fromkeys(name for name in (self.input.column, self.output.column, self.time) if name))
 
 
-def unit_in_name(column: str) -> str:
-    """Unit in brackets at the end of a column's name, such as mm of ``stroke [mm]``; empty without one."""
-    found = re.search(r"[\[(]([^\[\]()\d][^\[\]()]*)[\])]$", column.strip())  # x[2] is part of an array
-    return found[1].strip() if found else ""
-
-
 def known_unit(text: str) -> Unit | None:
     """Unit of a text in a file's header; None if no program file could write it."""
     try:
         return parse_unit("".join(_ASCII.get(each, each) for each in text)) if 0 < len(text) <= _MOST_UNIT else None
     except ProgramError:
         return None
-
-
-def _header_unit(column: str, found: ColumnFile) -> str:
-    """Unit that the file states for a column, as it writes it; empty if it states none."""
-    return found.units.get(column) or unit_in_name(column)
 
 
 def _in_unit(described: ImportedColumn, header: str) -> ImportedColumn:
@@ -167,7 +164,7 @@ def import_columns(
     :raises ConfigurationError: the recording is longer than the scenario, or in other units than its program.
     """
     found = read_columns(path, described.columns, described.skip_lines)
-    headers = [_header_unit(each.column, found) for each in (described.input, described.output)]
+    headers = [found.units.get(each.column, "") for each in (described.input, described.output)]
     described = dataclasses.replace(
         described, input=_in_unit(described.input, headers[0]), output=_in_unit(described.output, headers[1])
     )
@@ -187,15 +184,19 @@ def import_columns(
     program = scenario.program if scenario else program or Program.load(DEFAULT_PROGRAM)
     shape, channels = (samples, len(program.channels)), {}
     codes, clipped = np.zeros(shape, np.uint16), np.ones(shape, np.bool_)
+    beyond_n = []
     for at, (name, each) in enumerate(zip(program.measured, (described.input, described.output), strict=True)):
         values = columns[each.column] * each.scale + each.offset
         channels[name] = _channel(path, each, described.bits, values)
         codes[:, at], clipped[:, at] = _converted(values, channels[name], is_ranged=each.range is not None)
         if clipped[:, at].all():
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range: give a wider range")
+        beyond_n.append(int((clipped[:, at] & np.isfinite(values)).sum()))
     rate_hz = _rate_hz(path, described, columns, found)
     rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
-    rig |= {"blank_lines": found.blank_lines, "header_units": headers}
+    rig |= {"blank_lines": found.blank_lines, "header_units": headers, "beyond_range_n": beyond_n}
+    if found.rate_hz is not None and abs(rate_hz / found.rate_hz - 1.0) > _MOST_RATE_ERROR:
+        rig["stated_rate_hz"] = found.rate_hz
     truth = _truth(path, samples, 1.0 / rate_hz, scenario, program)
     run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
     return dataclasses.replace(run, conditions=scaled_to_program(run.conditions)) if is_known else run
@@ -273,13 +274,19 @@ def _channel(path: Path, described: ImportedColumn, bits: int, values: NDArray[n
 def _converted(
     values: NDArray[np.float64], channel: Channel, *, is_ranged: bool
 ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-    """Codes and clipping of values. With a known range an end code says only that the value was beyond it."""
+    """Codes and clipping of values. With a known range an end code says only that the value was beyond it.
+
+    Without a number the code before is repeated, as clipped.
+    """
+    finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         at = np.rint((values - channel.low_v) / channel.lsb_v)
         last = channel.codes - 1
-        beyond = ~np.isfinite(values) | (at < 0) | (at > last) | (is_ranged & ((at == 0) | (at == last)))
-        codes = np.clip(np.nan_to_num(at, nan=0.0), 0, last).astype(np.uint16)
-    return codes, beyond
+        beyond = ~finite | (at < 0) | (at > last) | (is_ranged & ((at == 0) | (at == last)))
+        codes = np.clip(np.where(finite, at, 0.0), 0, last).astype(np.uint16)
+    before = np.maximum.accumulate(np.where(finite, np.arange(len(values)), -1))
+    held = np.where(before < 0, last // 2, codes[before])
+    return np.where(finite, codes, np.clip(held, 1, last - 1)).astype(np.uint16), beyond
 
 
 def _rate_hz(
@@ -290,9 +297,11 @@ def _rate_hz(
         return described.rate_hz
     if not described.time:
         if found.rate_hz is None:
-            raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN")
+            times = [name for name in found.names if name.partition("@")[0].partition(" ")[0].lower() in _TIMES]
+            such = f", such as --time {shlex.quote(times[0])}" if times else ""
+            raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN{such}")
         return found.rate_hz
-    unit = _header_unit(described.time, found) or "s"
+    unit = found.units.get(described.time) or "s"
     in_s = None if (known := known_unit(unit)) is None else known.factor_to(parse_unit("s"))
     if in_s is None:
         raise RecordingError(f"{path}: column {described.time}: must be a time, not in {unit}: pass --rate HZ")

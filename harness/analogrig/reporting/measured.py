@@ -29,6 +29,12 @@ _SEGMENT_N = 1024
 _COHERENT = 0.8
 """Least coherence of a point of the measured frequency response."""
 
+_EXCITED_DB = 40.0
+"""Depth below the input's largest density at which a point is left out: noise and leakage, not excitation."""
+
+_MOST_BRIDGED_N = 16
+"""Longest gap that a spectrum bridges; a longer one ends its stretch."""
+
 _WIDTH, _HEIGHT, _LEFT, _TOP, _BELOW = 640, 200, 64, 12, 42
 
 
@@ -88,37 +94,65 @@ def _polynomials(theta: NDArray[np.float32], model: ModelOrders) -> tuple[NDArra
 
 
 def fits(run: Run) -> tuple[StretchFit, ...]:
-    """Fit of each stretch between alarms that is long enough; empty if the device reports no estimates of a model."""
+    """Fit of each stretch between alarms with enough samples; empty if the device reports no estimates of a model."""
     if run.datasheet.model is None or not run.theta.shape[1] or not run.samples:
         return ()
     starts = sorted({start for start, _ in run.records} | {index + 1 for index in run.alarm_index.tolist()})
     spans = [span for span in itertools.pairwise([*starts, run.samples]) if span[1] - span[0] >= _LEAST_N]
+    spans = [span for span in spans if _scored(run, *span).sum() >= _SETTLING_N]
     return tuple(_fit(run, *span) for span in spans[-_MOST_ROWS:])
 
 
+def _first_scored(start: int, end: int) -> int:
+    """First sample of a stretch in its fit: the estimate converges in the first half."""
+    return start + (end - start) // 2
+
+
+def _scored(run: Run, start: int, end: int) -> NDArray[np.bool_]:
+    """Samples of the second half of a stretch in which input and output were measured."""
+    return ~run.missing[_first_scored(start, end) : end]
+
+
 def _fit(run: Run, start: int, end: int) -> StretchFit:
-    first = start + (end - start) // 2  # the estimate converges in the first half
+    first, seen = _first_scored(start, end), _scored(run, start, end)
     theta = run.theta[end - 1]
     y = run.codes[first:end, OUTPUT].astype(np.float64)
-    errors = run.innovation[first:end].astype(np.float64)
-    spread = float(y.std()) or 1.0
-    simulated = _simulate(run, theta, first, end)
-    left = None if simulated is None else float(np.sqrt(np.mean((y - simulated)[_SETTLING_N:] ** 2)))
+    errors = run.innovation[first:end].astype(np.float64)[seen]
+    spread = float(y[seen].std()) or 1.0
+    simulated, settled = _simulate(run, theta, first, end), seen.copy()
+    settled[:_SETTLING_N] = False
+    left = None if simulated is None else _rms((y - simulated)[settled])
     centred = errors - errors.mean()
     power = float(centred @ centred) or 1.0
     return StretchFit(
         start=start,
         end=end,
         mode=mode_of(run, theta),
-        innovation_codes=float(np.sqrt(np.mean(errors**2))),
-        predicted=1.0 - float(np.sqrt(np.mean(errors**2))) / spread,
+        innovation_codes=_rms(errors),
+        predicted=1.0 - _rms(errors) / spread,
         simulated=None if left is None or not math.isfinite(left) else 1.0 - left / spread,
         neighbours=float(centred[1:] @ centred[:-1]) / power,
     )
 
 
+def _rms(values: NDArray[np.float64]) -> float:
+    """Root mean square; NaN without a value."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def _bridged(values: NDArray[np.float64], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Values with straight lines over the missing ones; held at the ends."""
+    if missing.all():
+        return values
+    at = np.arange(len(values))
+    return np.interp(at, at[~missing], values[~missing])
+
+
 def _simulate(run: Run, theta: NDArray[np.float32], first: int, end: int) -> NDArray[np.float64] | None:
-    """Output in codes of the model with this estimate, from the input and the first outputs; None if it is unstable."""
+    """Output in codes of the model with this estimate, from the input and the first outputs; None if it is unstable.
+
+    It runs on over missing outputs; missing inputs are bridged.
+    """
     from scipy.signal import lfilter, lfiltic
 
     model = run.datasheet.model
@@ -127,7 +161,7 @@ def _simulate(run: Run, theta: NDArray[np.float32], first: int, end: int) -> NDA
     denominator, numerator = _polynomials(theta, model)
     if (np.abs(np.roots(denominator)) >= 1.0).any():
         return None
-    u, y = (run.codes[first:end, at].astype(np.float64) for at in (INPUT, OUTPUT))
+    u, y = (_bridged(run.codes[first:end, at].astype(np.float64), run.clipped[first:end, at]) for at in (INPUT, OUTPUT))
     offset = float(theta[-1]) if model.offset else 0.0
     level = (offset + numerator.sum() * u[0]) / denominator.sum()
     state = lfiltic(numerator, denominator, np.full(model.na, y[0] - level), np.zeros(len(numerator)))
@@ -180,7 +214,7 @@ def _fit_table(run: Run) -> str:
     note = (
         "<p>Each row is the estimate after the last sample of a stretch between alarms. Its fit is that in the second"
         " half of the stretch: the share of the output's standard deviation that it predicts one sample ahead, and"
-        " simulates from the input alone.</p>"
+        " simulates from the input alone. Missing samples do not count; a simulation bridges those of the input.</p>"
     )
     gain = f"Gain [{_gain_unit(run)}]"
     numbers = ("Resonance [Hz]", "Damping ratio", gain, "Predicted", "Simulated", "Error [codes]", "Its correlation")
@@ -206,8 +240,12 @@ def _gain_unit(run: Run) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Averaged spectra of a run: frequencies (f,) in Hz of the plant, and at each of them the figures below."""
+    """Averaged spectra of samples ``start`` <= k < ``end``: frequencies (f,) in Hz of the plant, figures at each."""
 
+    start: int
+    end: int
+    bridged_n: int
+    """Missing samples among them, over which straight lines were drawn."""
     frequency_hz: NDArray[np.float64]
     input_density: NDArray[np.float64]
     """Units squared per Hz."""
@@ -218,19 +256,43 @@ class Spectrum:
 
 
 def spectrum(run: Run) -> Spectrum | None:
-    """Spectra of input and output by Welch's method; None if the run is too short."""
+    """Spectra of input and output by Welch's method in the longest stretch without a long gap; None if too short."""
     from scipy import signal
 
-    values = [run.channel(name) for name in run.conditions.program.measured]
-    length = min(_SEGMENT_N, 1 << (run.samples // 2).bit_length() - 1) if run.samples >= 4 else 0
+    start, end = _longest_stretch(run.missing)
+    length = min(_SEGMENT_N, 1 << ((end - start) // 2).bit_length() - 1) if end - start >= 4 else 0
     if length < 32:
         return None
-    u, y = (each - each.mean() for each in values)
+    program = run.conditions.program
+    u, y = (
+        _bridged(run.channel(name)[start:end], run.clipped[start:end, at])
+        for name, at in zip(program.measured, (INPUT, OUTPUT), strict=True)
+    )
     settings = {"fs": 1.0 / run.conditions.sample_period_problem_s, "nperseg": length}
+    u, y = u - u.mean(), y - y.mean()
     frequency, uu = signal.welch(u, **settings)
     yy, uy = signal.welch(y, **settings)[1], signal.csd(u, y, **settings)[1]
     with np.errstate(all="ignore"):
-        return Spectrum(frequency, uu, yy, uy / uu, np.abs(uy) ** 2 / (uu * yy))
+        figures = (frequency, uu, yy, uy / uu, np.abs(uy) ** 2 / (uu * yy))
+    return Spectrum(start, end, int(run.missing[start:end].sum()), *figures)
+
+
+def _longest_stretch(missing: NDArray[np.bool_]) -> tuple[int, int]:
+    """Longest stretch start <= k < end that begins and ends with a measured sample and has short gaps only."""
+    seen = np.flatnonzero(~missing)
+    if not len(seen):
+        return 0, 0
+    after = np.flatnonzero(np.diff(seen) > _MOST_BRIDGED_N + 1) + 1
+    firsts, lasts = seen[np.append(0, after)], seen[np.append(after - 1, len(seen) - 1)]
+    longest = int((lasts - firsts).argmax())
+    return int(firsts[longest]), int(lasts[longest]) + 1
+
+
+def measured_response(found: Spectrum) -> NDArray[np.float64]:
+    """Magnitude (f,) of output over input; NaN where they are not coherent, or the input has hardly any power."""
+    least = found.input_density[1:].max() * 10.0 ** (-_EXCITED_DB / 10.0)
+    shown = (found.coherence >= _COHERENT) & (found.input_density >= least)
+    return np.where(shown, np.abs(found.response), np.nan)
 
 
 def _model_response(run: Run, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -254,16 +316,29 @@ def _spectrum(run: Run) -> str:
         f"input [dB of {units[0]}²/Hz]": (_decibels(found.input_density, 10.0), "line"),
         f"output [dB of {units[1]}²/Hz]": (_decibels(found.output_density, 10.0), "dashed"),
     }
-    coherent = np.where(found.coherence >= _COHERENT, np.abs(found.response), np.nan)
-    curves = {"output over input": (_decibels(coherent, 20.0), "dots")}
+    curves = {"output over input": (_decibels(measured_response(found), 20.0), "dots")}
     model = _model_response(run, found.frequency_hz)
     if model is not None:
         curves["the device's last estimate"] = (_decibels(model, 20.0), "line")
-    gain = f"Frequency response in dB of {_gain_unit(run)}, where the coherence is at least {_COHERENT:g}"
-    return "".join(
+    gain = (
+        f"Frequency response in dB of {_gain_unit(run)}, where the coherence is at least {_COHERENT:g} and the input"
+        f" within {_EXCITED_DB:g} dB of its largest density"
+    )
+    return _gap_note(run, found) + "".join(
         _plot(found.frequency_hz[1:], {name: (values[1:], style) for name, (values, style) in each.items()}, caption)
         for caption, each in (("Power spectral density", densities), (gain, curves))
     )
+
+
+def _gap_note(run: Run, found: Spectrum) -> str:
+    """Paragraph about the missing samples of a spectrum; empty without any."""
+    notes = []
+    if found.end - found.start < run.samples:
+        gap = f"more than {_MOST_BRIDGED_N} samples"
+        notes.append(f"The spectra are those of samples {found.start} to {found.end - 1}, without a gap of {gap}.")
+    if found.bridged_n:
+        notes.append(f"Straight lines bridge {number_of(found.bridged_n, 'missing sample', form=',')} in the spectra.")
+    return f"<p>{' '.join(notes)}</p>" if notes else ""
 
 
 def _decibels(values: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
@@ -315,7 +390,7 @@ def _level_lines(low: float, high: float) -> Iterator[str]:
 def _frequency_words(most_hz: float) -> Iterator[str]:
     for i in range(5):
         x = _LEFT + (_WIDTH - _LEFT - 10) * i / 4
-        yield _words(x, _TOP + _HEIGHT + 16, f"{most_hz * i / 4:.4g}", "middle" if i else "start")
+        yield _words(x, _TOP + _HEIGHT + 16, f"{most_hz * i / 4:.4g}", ("start", *["middle"] * 3, "end")[i])
 
 
 def _words(x: float, y: float, words: str, anchor: str) -> str:

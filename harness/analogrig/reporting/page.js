@@ -156,10 +156,21 @@
 
   // Plots
 
+  function bitOf(name) {
+    return 1 << run.columns.findIndex((c) => c.name === name);
+  }
+
+  // Values of a channel; null where an imported column has none: a clipped one would lie at an end of the range.
+  function seen(signals, name) {
+    const { raw, values, last } = signals[name];
+    const isGap = (k) => signals.clipped.raw[k] & bitOf(name) && raw[k] !== 0 && raw[k] !== last;
+    return last === undefined ? values : values.map((v, k) => (isGap(k) ? null : v));
+  }
+
   // Circles around the values at which the channel's bit of `clipped` is set.
-  function circled(clipped, channel, ink, colour) {
+  function circled(clipped, name, values, ink, colour) {
     const indices = [];
-    clipped.forEach((bits, k) => bits & (1 << channel) && indices.push(k));
+    clipped.forEach((bits, k) => bits & bitOf(name) && values[k] !== null && indices.push(k));
     return {
       show: indices.length > 0,
       filter: () => indices.filter((k) => places[k] >= view.min && places[k] <= view.max),
@@ -195,9 +206,10 @@
     const words = (name) => name.replaceAll("_", " ");
     const label = (name) => `${words(name)} [${signals[name].unit}]`;
     const curveOf = (name, scale, colour) => {
-      const points = circled(signals.clipped.raw, run.columns.findIndex((c) => c.name === name), ink, colour);
+      const of = seen(signals, name);
+      const points = circled(signals.clipped.raw, name, of, ink, colour);
       const paths = name === run.channels[0] ? stepped : undefined;
-      return { of: signals[name].values, label: words(name), colour, unit: signals[name].unit, scale, points, paths };
+      return { of, label: words(name), colour, unit: signals[name].unit, scale, points, paths };
     };
     const curves = [curveOf(left, "left", "first")], axes = [axis("left", label(left), 3, ink, "first")];
     if (right === undefined) return plotOf(ink, words(left), curves, plainRange, axes);

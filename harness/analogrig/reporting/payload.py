@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from analogrig.judging.verdict import ChangeVerdict, Verdict, trajectory
 from analogrig.plant import Plant, estimated_response
-from analogrig.run import CHUNK_SAMPLES, Run, missing_samples
+from analogrig.run import CHUNK_SAMPLES, IMPORTED, Run, missing_samples
 
 MOST_POINTS = 100_000
 """Longest run that is shown sample by sample."""
@@ -266,10 +266,16 @@ def _estimates(run: Run, part: slice) -> tuple[Sequence[str], NDArray[np.float64
 
 
 def _units(run: Run, name: str) -> dict[str, Any]:
-    """Scale, offset and unit of a signal; the page shows ``offset + scale * values``."""
-    if name not in run.conditions.channels:
+    """Scale, offset and unit of a signal; the page shows ``offset + scale * values``.
+
+    Clipped codes of imported columns between 0 and ``last`` stand for no value.
+    """
+    conditions = run.conditions
+    if name not in conditions.channels:
         return {"scale": 1.0, "offset": 0.0, "unit": ""}
-    channel = run.conditions.channels[name]
+    channel = conditions.channels[name]
     unit, factor = _DISPLAY_UNITS.get(channel.unit, (channel.unit, 1.0))
     per_volt = channel.unit_per_v * factor
-    return {"scale": channel.lsb_v * per_volt, "offset": channel.low_v * per_volt, "unit": unit}
+    return {"scale": channel.lsb_v * per_volt, "offset": channel.low_v * per_volt, "unit": unit} | (
+        {"last": channel.codes - 1} if conditions.rig.get("kind") == IMPORTED and "rig" not in conditions.rig else {}
+    )

@@ -118,6 +118,19 @@ const plotting = (() => {
     return { label, stroke, width: 1.5, points: { show: false }, value, ...more };
   }
 
+  // Labels of ticks with enough digits for their distance; uPlot's own have three decimals at most.
+  function tickLabels(u, splits, _axis, _space, step) {
+    const high = Math.max(...splits.map(Math.abs));
+    const place = Math.floor(Math.log10(step) + 1e-9); // of the first digit that differs
+    const whole = splits.map((v) => (Math.abs(v) < step / 2 ? 0 : v));
+    if (high > 1e-3 && high <= 1e7) {
+      const format = new Intl.NumberFormat("en", { maximumFractionDigits: Math.min(9, Math.max(0, 1 - place)) });
+      return whole.map((v) => format.format(v));
+    }
+    const digits = Math.min(9, Math.max(0, Math.floor(Math.log10(high)) - place + 1));
+    return whole.map((v) => (v === 0 ? "0" : v.toExponential(digits).replace(/\.?0*e/, "e")));
+  }
+
   function axis(scale, label, side, ink, more) {
     const line = { stroke: ink("line"), width: 1 };
     return {
@@ -125,6 +138,7 @@ const plotting = (() => {
       side,
       label,
       labelGap: 0,
+      values: tickLabels,
       font: FONT,
       labelFont: FONT,
       stroke: ink("muted"),

@@ -65,7 +65,7 @@ def summary(run: Run, verdict: Verdict) -> str:
         lines += [_segment_line(segment) for segment in verdict.estimates]
     if verdict.knows_truth and not conditions.program.estimates and (found := step_responses(run)):
         lines += ["", "  samples     step response of the estimate, against the circuit's"]
-        lines += [f"  {each.start:5}-{each.end - 1:<6}{response_text(each)}" for each in found]
+        lines += [f"  {_span(each.start, each.end)} {response_text(each)}" for each in found]
     digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  {digest}"]
     return "\n".join(lines)
@@ -157,4 +157,9 @@ def _segment_line(segment: SegmentEstimate) -> str:
         f"{'-' if segment.estimate is None else format(segment.estimate[name], '.5g'):>12}  {segment.truth[name]:<9.5g}"
         for name in segment.truth
     ]
-    return f"  {segment.start:5}-{segment.end - 1:<6}" + "  ".join(cells)
+    return f"  {_span(segment.start, segment.end)} " + "  ".join(cells)
+
+
+def _span(start: int, end: int) -> str:
+    """Samples ``start`` <= k < ``end``, as wide as the head of their column."""
+    return f"{f'{start:5}-{end - 1}':11}"

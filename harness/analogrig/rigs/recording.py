@@ -17,6 +17,9 @@ from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.trust import FiledName
 
+RECORDING = "recording:"
+"""Start of the name of such a rig, before its file."""
+
 WRONG_SAMPLES = "wrong samples: "
 """Start of the fault of a run whose samples are wrong. A replay of them has this fault too."""
 
@@ -37,14 +40,14 @@ class RecordingDescription(RigDescription):
 
 
 class RecordingRig(Rig):
-    """Recorded run as a rig; it plays only its own scenario."""
+    """Recorded run as a rig; it plays only its own scenario, which another file may name with other equipment."""
 
     capabilities: frozenset[str] = frozenset()
 
     def __init__(self, run: Run, path: Path) -> None:
         self.run = run
         self.path = path
-        self._name = f"recording:{path}"
+        self._name = f"{RECORDING}{path}"
 
     @classmethod
     def open(cls, path: Path) -> RecordingRig:
@@ -73,10 +76,10 @@ class RecordingRig(Rig):
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         conditions = self.run.conditions
-        if scenario != self.scenario():
+        if _samples_of(scenario) != _samples_of(self.scenario()):
             raise ConfigurationError(f"{self._name}: holds the scenario {self.scenario().name!r} and can play no other")
         if seed != conditions.seed:
-            raise ConfigurationError(f"{self._name}: was recorded with seed {conditions.seed}, not {seed}")
+            raise ConfigurationError(f"{self._name}: was recorded with seed {conditions.seed}, not {seed}: name none")
         return Performance(
             conditions.sample_period_s,
             conditions.time_scale,
@@ -102,3 +105,8 @@ class RecordingRig(Rig):
         unmeasured = np.full(len(codes), np.nan)
         volts = [channels[name].volts(codes[:, i]) if name in channels else unmeasured for i, name in enumerate(names)]
         return np.stack(volts, axis=1)
+
+
+def _samples_of(scenario: Scenario) -> Scenario:
+    """Scenario without what leaves its samples as they are: names, equipment, and the statement that it repeats."""
+    return dataclasses.replace(scenario, name="", description="", seed=None, rig="", dut="", statement=None)

@@ -18,6 +18,7 @@ from analogrig import config
 from analogrig.devices.registry import describe, recorded
 from analogrig.errors import AnalogrigError
 from analogrig.rigs import description as rigs
+from analogrig.rigs.recording import RECORDING
 from analogrig.run import Run
 from analogrig.scenario import Scenario, Statement
 from analogrig.trust import Thing
@@ -115,7 +116,9 @@ class Counterexample:
         if not is_name:
             tables[DEVICE_FILE] = {key: value for key, value in _settings(conditions.dut).items() if key != "name"}
         name = str(conditions.rig["name"])
-        if name in config.names("rigs") and _is_rig(name, self.run):
+        if name.startswith(RECORDING):
+            scenario["rig"] = f"{RECORDING}{RUN_FILE}"
+        elif name in config.names("rigs") and _is_rig(name, self.run):
             scenario["rig"] = name
         elif conditions.rig.get("kind") in rigs.KINDS:
             scenario["rig"] = RIG_FILE
@@ -139,7 +142,7 @@ def _names_relative_path(device: str) -> bool:
 def _rig_things(run: Run) -> tuple[Thing, ...]:
     """Things that the rig of a run stated."""
     table = run.conditions.rig
-    if table.get("kind") not in rigs.KINDS:
+    if table.get("kind") not in rigs.KINDS or str(table["name"]).startswith(RECORDING):
         return ()
     plain = tomllib.loads(config.to_toml(table))  # as a file has it: lists for tuples, and nothing that is None
     return rigs.from_table(plain, "the recorded rig").things
@@ -157,6 +160,8 @@ def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> st
         ("--dut", dut, run.conditions.dut, _is_device),
     ):
         name = next((name for name in (given, str(table["name"])) if name and is_it(name, run)), None)
+        if name is None and flag == "--scenario" and str(run.conditions.rig["name"]).startswith(RECORDING):
+            continue  # a recording plays its own
         if name is None:
             return ""
         words += [flag, name]

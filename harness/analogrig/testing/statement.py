@@ -56,9 +56,9 @@ class Play(Protocol):
     def bench(self) -> Bench: ...
 
     def __call__(
-        self, scenario: str | Scenario, seed: int | None = None, *, allow_inconclusive: bool = False
+        self, scenario: str | Scenario | None = None, seed: int | None = None, *, allow_inconclusive: bool = False
     ) -> Played:
-        """Play a scenario, by default with the seed that it has."""
+        """Play a scenario, by default that of the recording and with its seed, or with the seed that it has."""
 
     def on(self, rig: Rig, dut: Device) -> Play:
         """Return the same fixture for another rig or device."""

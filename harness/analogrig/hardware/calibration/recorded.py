@@ -253,7 +253,7 @@ class RecordedPlant:
         changes = [start for start, _, _ in self.run.segments if start <= first]
         at = self.run.conditions.program.channels.index(self._measured[0])
         lacking = np.flatnonzero(self.run.clipped[:first, at]) + 1
-        return max(0, *changes, *(int(each) for each in lacking[-1:]))
+        return max([0, *changes, *(int(each) for each in lacking[-1:])])
 
     def simulate(
         self, values: Mapping[str, float], span: Span, reconstruction: Reconstruction = "band-limited"

@@ -158,6 +158,7 @@ def hil_bench(request: pytest.FixtureRequest, hil_rig: Rig, hil_dut: Device) -> 
 def hil_play(request: pytest.FixtureRequest, hil_bench: Bench) -> Play:
     """``hil_play(scenario, seed=None) -> Played``: a name, a .toml file or a Scenario; by default the seed that it has.
 
+    On the rig ``recording:FILE`` ``hil_play()`` plays the scenario of the recording, by default with its seed.
     A play that is INCONCLUSIVE fails the test with its reason; ``allow_inconclusive=True`` hands it on.
     """
     return player.Player(request.node, hil_bench, is_default=True)

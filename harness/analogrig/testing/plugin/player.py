@@ -88,7 +88,11 @@ class Player:
         self._is_default = is_default
 
     def __call__(
-        self, scenario: str | Path | Scenario, seed: int | None = None, *, allow_inconclusive: bool = False
+        self,
+        scenario: str | Path | Scenario | None = None,
+        seed: int | None = None,
+        *,
+        allow_inconclusive: bool = False,
     ) -> Played:
         from analogrig.bench import raise_if_interrupted
         from analogrig.errors import AnalogrigError
@@ -97,15 +101,19 @@ class Player:
         from analogrig.testing.played import Played
 
         with in_one_line():
-            chosen = scenario if isinstance(scenario, Scenario) else Scenario.load(str(scenario))
+            recorded, recorded_seed = self.bench.rig.recorded or (None, None)
+            if scenario is None and recorded is None:
+                pytest.fail("hil_play() plays the scenario of a recording: name another for this rig", pytrace=False)
+            chosen = scenario or recorded
+            chosen = chosen if isinstance(chosen, Scenario) else Scenario.load(str(chosen))
             self._check_equipment(chosen)
-            drawn = seed if seed is not None else DEFAULT_SEED if chosen.seed is None else chosen.seed
+            drawn = next(each for each in (seed, recorded_seed, chosen.seed, DEFAULT_SEED) if each is not None)
             run = self.bench.play(chosen, drawn)
         run = run.with_identity(junit.session_identity(self.item.config, self.bench.dut.files()))
         if run.conditions.faults:  # nothing of it may reach the next play of this test
             with contextlib.suppress(AnalogrigError):
                 self.bench.dut.recover()
-        name = "" if isinstance(scenario, Scenario) else str(scenario)
+        name = "" if scenario is None or isinstance(scenario, Scenario) else str(scenario)
         repeat = command_of(run, name, RIG.of(self.item).value, DUT.of(self.item).value)
         played = Played(run, repeat, functools.partial(self.note, seed=drawn))
         record_of(self.item).plays.append(played)
