@@ -10,7 +10,7 @@ from tests.benchmarks.bench_two_mass import delays, device, false_alarms
 
 
 def test_changes_of_the_suspension_are_detected_within_the_bound_of_the_benchmark() -> None:
-    """The page states 400 changes and a mean ratio of 1.1; eight of each have a ratio below 1.6 with certainty."""
+    """The page states 400 changes and a mean ratio of 1.2; eight of each have a ratio below 1.6 with certainty."""
     made = device()
     for parameter in ("M2", "B2", "K2", "K1"):
         found = delays(made, parameter, 8)
