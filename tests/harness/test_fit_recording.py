@@ -337,3 +337,37 @@ def test_the_help_states_the_settling_time(capsys: pytest.CaptureFixture[str]) -
     with pytest.raises(SystemExit):
         main(["calibrate", "--help"])
     assert f"not compared (default: {SETTLING_N})" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_fit_begun_at_the_ends_of_the_ranges_finds_the_machine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside a bound scipy's steps hardly move."""
+    text = """
+name = "reaction"
+speed = 500
+channels = ["u", "y"]
+equations = '''
+x' = a*u - x
+y' = x/(0.3 + x*x) - e*y
+'''
+[inputs]
+u = { full = 1.0, trial = [-1.0, 1.0] }
+[states]
+x = { full = 3.0 }
+y = { full = 3.0 }
+[parameters]
+a = { value = 0.5, range = [0.5, 1.5] }
+e = { value = 2.0, range = [0.5, 2.0] }
+"""
+    path = tmp_path / "reaction.toml"
+    path.write_text(text)
+    computer = SuspensionComputer(load_patch(path), opamp="ideal")
+    computer.set(a=0.7, e=1.4)
+    volts = np.concatenate(list(computer.play(RecordedExcitation(multisine() * 8.0), SAMPLES)))
+    np.save(tmp_path / "measured.npy", volts / [10.0, 10.0 / 3.0])
+    columns = ["--input", "0", "--output", "1", "--rate", "40", "--bits", "16"]
+    measured = str(tmp_path / "measured.npz")
+    assert main(["import", str(tmp_path / "measured.npy"), *columns, "--out", measured]) == 0
+    told = fit(Path(measured), str(path), capsys)
+    assert {row["name"]: row["value"] for row in told["parameters"]} == pytest.approx({"a": 0.7, "e": 1.4}, rel=0.01)

@@ -43,6 +43,9 @@ Reconstruction = Literal["band-limited", "held"]
 RECONSTRUCTIONS: tuple[Reconstruction, ...] = ("band-limited", "held")
 """Courses of the input between its samples: that before an anti-alias filter, and that after a converter."""
 
+_INSIDE = 0.1
+"""Part of a range by which a start is away from its ends: beside a bound scipy's reflecting steps hardly move."""
+
 _STEP = 1e-3
 """Relative step of the numerical derivatives."""
 _LEAST_SINGULAR = 5e-5
@@ -337,8 +340,8 @@ class _ProgramFit:
         self._y = span.y[span.valid]
         self._scale = float(self._y.std()) or 1.0
         low, high = self._bounds
-        outside = 1e-9  # least_squares wants the start strictly within
-        self.start = np.clip(np.zeros(len(names)), low + outside, high - outside)
+        inside = _INSIDE * (high - low)
+        self.start = np.clip(np.zeros(len(names)), low + inside, high - inside)
 
     def minimum(self, start: NDArray[np.float64], reconstruction: Reconstruction) -> Any:
         """Result of scipy's least_squares."""
