@@ -159,6 +159,29 @@ def test_wav_states_its_rate_and_scales_whole_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_this_process")
+def test_wav_of_no_samples_a_second_states_no_rate(tmp_path: Path) -> None:
+    from scipy.io import wavfile
+
+    wavfile.write(tmp_path / "a.wav", 8000, np.ones((100, 2), np.int16))
+    header = bytearray((tmp_path / "a.wav").read_bytes())
+    header[24:32] = bytes(8)  # samples and bytes a second
+    (tmp_path / "a.wav").write_bytes(header)
+    assert read_columns(tmp_path / "a.wav", ["0"]).rate_hz is None
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_columns_of_one_name_are_refused_if_it_is_asked_for(tmp_path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    arrays = [pa.array(np.full(9, float(i))) for i in range(3)]
+    parquet.write_table(pa.Table.from_arrays(arrays, names=["u", "u", "y"]), tmp_path / "a.parquet")
+    assert read_columns(tmp_path / "a.parquet", ["y"]).columns["y"][0] == 2.0
+    with pytest.raises(RecordingError, match="several columns are called 'u'; give each a name of its own"):
+        read_columns(tmp_path / "a.parquet", ["u"])
+
+
+@pytest.mark.usefixtures("in_this_process")
 def test_instants_give_the_rate(tmp_path: Path) -> None:
     write_parquet(tmp_path / "a.parquet", *made_signals())
     run = import_columns(tmp_path / "a.parquet", description(rate_hz=None, time="t"), None)

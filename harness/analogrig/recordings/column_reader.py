@@ -117,7 +117,7 @@ class Table:
     def _put(self, name: str, load: Callable[[], Column]) -> None:
         if len(self.columns) == MOST_COLUMNS:
             raise ColumnError(f"more than {MOST_COLUMNS} columns")
-        self.columns[name] = load
+        self.columns[name] = load if name not in self.columns else partial(_refuse_namesakes, name)
 
 
 def _field_of(load: Callable[[], Any], name: str) -> Any:
@@ -128,6 +128,10 @@ def _refuse_objects(name: str) -> Any:
     raise ColumnError(
         f"{name[:_MOST_NAME] or 'the array'} holds Python objects, which are not loaded; save numbers, as float64"
     )
+
+
+def _refuse_namesakes(name: str) -> Any:
+    raise ColumnError(f"several columns are called {name[:_MOST_NAME]!r}; give each a name of its own")
 
 
 def _row_of(name: str, load: Callable[[], Any], j: int) -> Column:
@@ -529,7 +533,7 @@ def open_wav(path: Path) -> Table:
         scaled = (scaled - 128.0) / 128.0
     elif scaled.dtype.kind == "i":
         scaled = scaled / -float(np.iinfo(scaled.dtype).min)
-    table = Table(rate_hz=float(rate_hz))
+    table = Table(rate_hz=float(rate_hz) or None)
     for j, channel in enumerate(np.atleast_2d(scaled.T)[:MOST_COLUMNS]):
         table.add(str(j), channel.shape, partial(np.asarray, channel))
     return table
