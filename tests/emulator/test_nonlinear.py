@@ -315,7 +315,7 @@ def test_ideal_elements_divide_and_take_roots_as_in_ngspice(ngspice: NgSpice) ->
 
 def test_division_by_a_voltage_that_reaches_zero_is_refused() -> None:
     divider = Multiplier("D", "x", "y", "o", law=Law.QUOTIENT)
-    with pytest.raises(EngineError, match="a loop of ideal elements|a divisor reached zero"):
+    with pytest.raises(EngineError, match="a loop of ideal elements, or a division by 0"):
         outputs(divider, x=3.0, y=0.0)
 
 

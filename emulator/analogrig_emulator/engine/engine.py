@@ -30,7 +30,7 @@ _REASONS = {
     "or a drive begins after it",
     6: "no circuit was set, or the last one was refused",
     7: "limiters, amplifiers and multipliers feed one another so that there is no unique solution: "
-    "is there positive feedback, or a loop of ideal elements?",
+    "is there positive feedback, a loop of ideal elements, or a division by 0?",
     8: "the products of multipliers cannot be followed: they grow without bound, or a divisor reached zero, "
     "or a radicand is negative",
 }
