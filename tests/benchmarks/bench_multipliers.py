@@ -66,8 +66,8 @@ SETTINGS = tuple(
     )
 )
 """The searched grid."""
-ACCURACIES_LSB = (TOLERATED_LSB, 0.05)
-"""Largest errors of ngspice: that of bench_engine, and what the emulator promises."""
+ACCURACIES_LSB = (TOLERATED_LSB, 0.1)
+"""Largest errors of ngspice: that of bench_engine, and half of it. With edges on samples its best leaves 0.07."""
 WARM_PLAYS, COLD_PLAYS = 10, 20
 
 _LIMITS = """\
@@ -80,8 +80,8 @@ _LINEAR_STATE = "Gstate 0 state inner state {1e-10 * rate}\n"
 NOTE = f"""\
 A square wave between the levels of the trial play, nominal TL07x and AD633. The grid has {len(SETTINGS)}
 settings of method, time points, reltol, trtol and longest step, searched with {SAMPLES} samples. Its
-{FINALISTS} fastest settings within an error at the output play {LONG:,} samples too: {TOLERATED_LSB:g} LSB as in the
-table of the linear trial, and {ACCURACIES_LSB[-1]:g} LSB, within which the emulator itself keeps. Exported decks are
+{FINALISTS} fastest settings within an error at the output run again: {TOLERATED_LSB:g} LSB as in the table of the
+linear trial, and {ACCURACIES_LSB[-1]:g} LSB; those within {TOLERATED_LSB:g} LSB play {LONG:,} samples too. Exported decks are
 those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers, for none leaves
 its range. Ratios are times of ngspice over those of the emulator.
 
@@ -150,6 +150,8 @@ def figures() -> Iterator[Figure]:
             for what, spent_s in (*emulated.items(), ("again", _warm_s(played))):
                 yield Figure(f"emulator, {label}, {what}", 1e3 * spent_s, "ms")
             for (op_amps, accuracy_lsb), settings in finalists.items():
+                if played.samples == LONG and accuracy_lsb < TOLERATED_LSB:
+                    continue
                 setting, run = _best(played, settings, accuracy_lsb)
                 for what, spent_s in emulated.items():
                     deck = f"ngspice, {label}, within {accuracy_lsb:g} LSB: {op_amps} op-amps, emulator {what}"
