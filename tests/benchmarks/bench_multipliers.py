@@ -82,8 +82,8 @@ A square wave between the levels of the trial play, nominal TL07x and AD633. The
 settings of method, time points, reltol, trtol and longest step, searched with {SAMPLES} samples. Its
 {FINALISTS} fastest settings within an error at the output run again: {TOLERATED_LSB:g} LSB as in the
 table of the linear trial, and {ACCURACIES_LSB[-1]:g} LSB. The first also play {LONG:,} samples.
-Exported decks are those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers, for none leaves
-its range. Ratios are times of ngspice over those of the emulator.
+Exported decks are those of `analogrig netlist`. Knowing ones limit neither op-amps nor multipliers,
+for none leaves its range. Ratios are times of ngspice over those of the emulator.
 
 The emulator, cold: the first play in a new process, machine and all matrices included, the best of
 {COLD_PLAYS} processes. Own offsets: each machine has op-amps of its own. Again: the same machine as
