@@ -11,6 +11,7 @@ from analogrig.scenario import Scenario
 from analogrig.testing.properties.conversed import PORTS, converses_as_catalogued
 from analogrig.testing.properties.described import computes_what_it_describes
 from analogrig.testing.reference.cases import CASES
+from analogrig.testing.reference.drawn import drawn
 from analogrig.testing.reference.scripts import SCRIPTS, is_for
 from analogrig.testing.statement import Play
 
@@ -18,11 +19,20 @@ SEED = 1
 TRIES = 40
 """Most seeds of a case. One play in two or more is judged: 40 seeds fail with a probability of 1e-12."""
 
+DRAWN_N = 160
+"""Drawn cases, the first ones of an endless series."""
+
 
 @pytest.mark.hil_needs("tweak", "excite")
 @pytest.mark.parametrize("case", CASES)
 def test_device_computes_what_it_describes(hil_play: Play, case: str) -> None:
     assert computes_what_it_describes(hil_play, CASES[case].scenario, SEED, case=case, tries=TRIES)
+
+
+@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.parametrize("number", range(DRAWN_N))
+def test_device_computes_what_it_describes_in_drawn_cases(hil_play: Play, number: int) -> None:
+    assert computes_what_it_describes(hil_play, drawn(number).scenario, SEED, case=str(number), tries=1)
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,11 @@ class Covariance:
         roots = np.sqrt(np.array(self.d) / self.weight)
         return [float(each) for each in np.square(np.array(forms) @ np.array(self.u) * roots).sum(axis=1)]
 
+    @property
+    def exceeds_prior(self) -> bool:
+        """True if ``inflate`` would limit P."""
+        return any(d > p * self.weight for d, p in zip(self.d, self.prior, strict=True))
+
     def inflate(self, factor: float) -> None:
         """Multiply P by this factor, up to the prior."""
         self.d = [min(d * factor / self.weight, p) for d, p in zip(self.d, self.prior, strict=True)]
