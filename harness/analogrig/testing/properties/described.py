@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from analogrig.catalogue import Cause
 from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator
 from analogrig.devices.device import Device
 from analogrig.devices.estimator import Estimator
@@ -19,9 +20,10 @@ from analogrig.errors import DeviceRefused
 from analogrig.run import Run, missing_samples
 from analogrig.scenario import Scenario
 from analogrig.testing.properties.experiments import device_description
-from analogrig.testing.reference.cases import CASES, ReferenceCase, SpoiledRig, U, Y
+from analogrig.testing.reference.cases import CASES, HUM, ReferenceCase, SpoiledRig, U, Y, hum
 from analogrig.testing.reference.comparison import Expected, expected_of
 from analogrig.testing.reference.drawn import drawn
+from analogrig.testing.reference.fit import SETTLING_N, STATED_N, hum_in_second_block
 from analogrig.testing.statement import Finding, Inconclusive, Play, experiment
 
 ROUNDING = 0.1
@@ -36,6 +38,13 @@ STATISTIC_ROUNDING = 0.2
 
 EXTENT_ROUNDING = 0.05
 """The same of the extent of a change, in its own standard deviations."""
+
+
+FREQUENCY_UNITS, STRENGTH_UNITS = 65_536, 256
+"""Units of a Misfit."""
+
+MISFIT_ROUNDING = 1e-3
+"""Largest deviation of the strength of a misfit, relative to it."""
 
 
 @experiment
@@ -59,6 +68,25 @@ def computes_what_it_describes(play: Play, scenario: Scenario, seed: int, case: 
                 judged = f"{expected.sure_n} of {run.samples} samples as described"
                 return Finding(not wrong, f"{case}: {wrong or judged}", run=run)
     raise Inconclusive(f"{case}: rounding may decide a threshold in each of {tries} plays")
+
+
+@experiment
+def states_hum(play: Play, scenario: Scenario, seed: int) -> Finding:
+    """Finding: the device states a hum once, with the frequency and the strength that its innovations have."""
+    description = described_estimator(play)
+    with _configured(play, description, HUM) as device:
+        run = play.on(SpoiledRig(play.bench.rig, hum), device)(scenario, seed, allow_inconclusive=True).run
+    if run.flags[SETTLING_N:].any() or len(run.alarm_index) or run.conditions.faults:
+        raise Inconclusive("the device raised an alarm, or left out samples")
+    expected = hum_in_second_block(run.innovation.astype(np.float64), HUM.settings["noise_variance"])
+    stated = list(zip(run.misfit_index.tolist(), run.misfit_cause.tolist(), strict=True))
+    frequency, strength = run.misfit_frequency.tolist(), run.misfit_strength.tolist()
+    is_right = (
+        stated == [(STATED_N, Cause.HUM)]
+        and abs(frequency[0] - expected.frequency) < 1.0 / FREQUENCY_UNITS
+        and abs(strength[0] - expected.strength) < MISFIT_ROUNDING * expected.strength + 1.0 / STRENGTH_UNITS
+    )
+    return Finding(is_right, f"stated {stated} {frequency} {strength}, expected {STATED_N} {expected}", run=run)
 
 
 def described_estimator(play: Play) -> CatalogueDescription:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import INPUT, OUTPUT
 from analogrig.scenario import PotChange, Scenario
+from analogrig.testing.reference.fit import STATED_N
 from analogrig_emulator import Excitation
 
 U, Y = INPUT, OUTPUT
@@ -119,6 +120,18 @@ def leave_out_near_edges(codes: Codes, missing: NDArray[np.bool_]) -> None:
         missing[edge + (1, 0, 2, 5, 9, 11, 12, 3)[number % 8]] = True
 
 
+def _jump(at: int, then: int | None = None, gap: slice = slice(0)) -> Spoil:
+    """A displacement that jumps once or twice, so far that it is noticed at once, and samples that are missing."""
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
+        codes[at:, Y] += 90
+        if then is not None:
+            codes[then:, Y] -= 40
+        missing[gap] = True
+
+    return spoil
+
+
 def leave_out_later(codes: Codes, missing: NDArray[np.bool_]) -> None:
     """Few samples shortly before a change."""
     missing[[edges_of(codes)[-3] - 9]] = True
@@ -150,6 +163,12 @@ def hold(codes: Codes, missing: NDArray[np.bool_]) -> None:
     codes[edges[4] - 2 : edges[4] + 8, Y] = codes[edges[4] - 2, Y]
     codes[edges[6] - 30 : edges[6] + 60, Y] = codes[edges[6] - 30, Y]
     missing[edges[6] + 20] = True
+
+
+def hum(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """Two codes of hum on the displacement, with a period of 440 samples."""
+    disturbance = 2.0 * np.sin(2.0 * np.pi * np.arange(len(codes)) / 440.0)
+    codes[:, Y] = np.round(codes[:, Y] + disturbance)
 
 
 FAULT_AT = 420
@@ -197,6 +216,14 @@ _TWO_B = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked"}
 _ONE_CLOCK = {**_FIXED, **_ARMED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995}
 """Settings without a slip, which a late force would be taken for."""
 
+HUM = ReferenceCase(
+    _scenario("hum", _SQUARE, STATED_N + 1),
+    {**_ONE_CLOCK, "noise_estimated": False, "noise_variance": 2.0, "ceiling": 1e4, "misfit": True},
+    hum,
+    is_optional=True,
+)
+"""Disturbance that the watch of the fit names."""
+
 CASES: Mapping[str, ReferenceCase] = {
     "default": ReferenceCase(SOFTER_LATER),
     "default in blocks": ReferenceCase(SOFTER, _ARMED, exchange="block"),
@@ -233,6 +260,11 @@ CASES: Mapping[str, ReferenceCase] = {
     "extended by one": ReferenceCase(
         SOFTER, {**_TWO_B, "nc": 1, "c": (-0.5,), "refresh_n": 0, "trigger": "none"}, is_optional=True
     ),
+    "extended with an offset": ReferenceCase(
+        SOFTER,
+        {**_ARMED, **_TWO_B, "nc": 1, "offset": True, "c": (-0.5,), "refresh_n": 0, "p0": 1e-4, "forgetting": 0.97},
+        is_optional=True,
+    ),
     "first order": ReferenceCase(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
     "longest": ReferenceCase(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
     "prediction error": ReferenceCase(
@@ -267,6 +299,16 @@ CASES: Mapping[str, ReferenceCase] = {
     ),
     "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), _ARMED, leave_out_later),
     **{name: ReferenceCase(FAULTY, _ONE_CLOCK if "late" in name else _ARMED, spoil) for name, spoil in FAULTS.items()},
+    **{
+        f"fault {n} samples after a gap": ReferenceCase(
+            HEALTHY, {**_FIXED, **_ARMED}, _jump(312 + n, gap=slice(300, 312))
+        )
+        for n in range(5, 11)
+    },
+    **{
+        f"fault {n} samples after another": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump(280, 280 + n))
+        for n in range(99, 105)
+    },
     "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -46,7 +47,14 @@ def expected_of(
     config: EstimatorConfig, u: NDArray[np.uint16], y: NDArray[np.uint16], valid: NDArray[np.bool_]
 ) -> Expected:
     """Answers of the reference, which is run once for the same samples."""
-    return _expected(config, u.tobytes(), y.tobytes(), valid.tobytes())
+    return _expected(_in_single_precision(config), u.tobytes(), y.tobytes(), valid.tobytes())
+
+
+def _in_single_precision(config: EstimatorConfig) -> EstimatorConfig:
+    """The configuration with the values that a device holds."""
+    real = {key: value for key, value in dataclasses.asdict(config).items() if type(value) is float}
+    rounded = {key: float(np.float32(value)) for key, value in real.items()}
+    return dataclasses.replace(config, **rounded, c=tuple(float(np.float32(c)) for c in config.c))
 
 
 @functools.lru_cache(maxsize=1024)

@@ -11,16 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.scenario import PotChange, Scenario
-from analogrig.testing.reference.cases import Codes, ReferenceCase, U, Y, edges_of
+from analogrig.testing.reference.cases import Codes, ReferenceCase, Spoil, U, Y, edges_of
 from analogrig_emulator import Excitation
 
-PLANT_M, PLANT_K, PLANT_DAMPING = (30.0, 60.0), (17_000.0, 28_500.0), (0.45, 1.5)
+PLANT_M, PLANT_K, PLANT_DAMPING = (30.0, 60.0), (17_000.0, 28_500.0), (0.3, 1.5)
 """Drawn plants: fast ones, whose prefilter amplifies rounding little."""
 
 MOST_SAMPLES = 2600
 
 USUAL_HZ, ODD_HZ = (40.0, 100.0, 200.0, 250.0, 400.0), (90.0, 310.0)
 """Frequencies whose period is a whole number of samples, and limits of others."""
+
+
+SHAPES = ("square", "square", "square", "square", "prbs", "pulse", "sine")
 
 
 class Draw:
@@ -56,22 +59,22 @@ class Draw:
 def drawn(number: int) -> ReferenceCase:
     """Case with this number. Every second is about a single change after a quiet start."""
     draw = Draw(number)
-    is_long = number % 8 == 7
+    is_long = number % 6 == 5
     samples = draw.whole(1500, MOST_SAMPLES) if is_long else draw.whole(430, 700)
-    change_at = draw.whole(samples - 160, samples - 100) if number % 2 else draw.whole(300, samples - 60)
+    first = draw.whole(300, samples - 100)
     plant = _plant(draw)
-    spoils: list[Callable[[Codes, NDArray[np.bool_]], None]] = []
+    spoils: list[Spoil] = []
     tweaks: list[PotChange] = []
-    if draw.chance(0.5):
-        tweaks.append(PotChange(change_at, _changed(draw, plant), draw.one(0, 0, 0, 15)))
-    else:
-        spoils.append(_fault(draw, change_at))
-    if draw.chance(0.25) or is_long:
-        tweaks.extend(PotChange(at, _changed(draw, plant)) for at in _instants(draw, change_at, samples))
+    instants = [first, *(_instants(draw, samples) if is_long or draw.chance(0.4) else [])]
+    for at in instants:
+        if draw.chance(0.5):
+            tweaks.append(PotChange(at, _changed(draw, plant), draw.one(0, 0, 0, 15)))
+        else:
+            spoils.append(_fault(draw, at, draw.one(samples, at + draw.whole(30, 200))))
     if draw.chance(0.2):
-        spoils.append(_gaps(draw, change_at))
-    if draw.chance(0.1):
-        spoils.append(_bursts(draw))
+        spoils.append(_gaps(draw, first))
+    if draw.chance(0.5 if is_long else 0.1):
+        spoils.append(_bursts(draw, samples))
     scenario = Scenario(
         samples=samples, excitation=_excitation(draw), set=plant, tweaks=_ordered(tweaks), name=f"drawn {number}"
     )
@@ -79,7 +82,7 @@ def drawn(number: int) -> ReferenceCase:
 
 
 def _plant(draw: Draw) -> dict[str, float]:
-    mass, stiffness, damping = draw.real(*PLANT_M), draw.real(*PLANT_K), draw.real(*PLANT_DAMPING)
+    mass, stiffness, damping = draw.real(*PLANT_M), draw.real(*PLANT_K), draw.size(*PLANT_DAMPING)
     return {
         "M": round(mass, 1),
         "B": round(min(2.0 * damping * math.sqrt(mass * stiffness), 4400.0), 1),
@@ -95,8 +98,8 @@ def _changed(draw: Draw, plant: dict[str, float]) -> dict[str, float]:
     return {name: round(min(max(plant[name] * factors[name], limits[name][0]), limits[name][1]), 1) for name in names}
 
 
-def _instants(draw: Draw, first: int, samples: int) -> list[int]:
-    return [at for at in range(first - 600, samples - 20, draw.whole(90, 400)) if at > 200 and at != first]
+def _instants(draw: Draw, samples: int) -> list[int]:
+    return list(range(draw.whole(200, 400), samples - 20, draw.whole(100, 400)))
 
 
 def _ordered(tweaks: Sequence[PotChange]) -> tuple[PotChange, ...]:
@@ -109,10 +112,11 @@ def _ordered(tweaks: Sequence[PotChange]) -> tuple[PotChange, ...]:
 
 
 def _excitation(draw: Draw) -> Excitation:
-    clock = draw.one("free", "free", "card")
+    clock, shape = draw.one("free", "free", "card"), draw.one(*SHAPES)
     is_odd = draw.chance(0.15)
     return Excitation(
-        shape=draw.one("square", "square", "square", "square", "prbs", "sine"),
+        shape=shape,
+        duty=draw.one(0.04, 0.05, 0.06, 0.07, 0.3) if shape == "pulse" else 0.5,
         low_v=0.1,
         high_v=draw.real(1.5, 3.2),
         frequency_hz=round(draw.real(*ODD_HZ), 1) if is_odd else draw.one(*USUAL_HZ, 200.0, 200.0, 200.0),
@@ -155,15 +159,15 @@ def _settings(draw: Draw) -> dict[str, Any]:
     return out
 
 
-def _fault(draw: Draw, at: int) -> Callable[[Codes, NDArray[np.bool_]], None]:
-    """Fault of a channel from a sample on."""
+def _fault(draw: Draw, at: int, end: int) -> Spoil:
+    """Fault of a channel in the samples from ``at`` to ``end``."""
     channel, kind = draw.one(U, Y), draw.one("offset", "gain", "delay", "stuck", "noise")
     sizes = {U: (20.0, 150.0, 8.0, 80.0), Y: (4.0, 30.0, 2.0, 12.0)}[channel]
     offset, part = draw.size(*sizes[:2]) * draw.one(-1, 1), draw.size(0.05, 0.3) * draw.one(-1, 1)
     noise = draw.normal(draw.size(*sizes[2:]), MOST_SAMPLES)
 
     def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
-        true = codes[at - 1 :, channel].astype(np.float64)
+        true = codes[at - 1 : end, channel].astype(np.float64)
         now, before = true[1:], true[:-1]
         wrong = {
             "offset": now + offset,
@@ -172,12 +176,12 @@ def _fault(draw: Draw, at: int) -> Callable[[Codes, NDArray[np.bool_]], None]:
             "stuck": np.full(len(now), now[0]),
             "noise": now + noise[: len(now)],
         }[kind]
-        codes[at:, channel] = np.clip(np.round(wrong), 0.0, 4095.0)
+        codes[at:end, channel] = np.clip(np.round(wrong), 0.0, 4095.0)
 
     return spoil
 
 
-def _gaps(draw: Draw, near: int) -> Callable[[Codes, NDArray[np.bool_]], None]:
+def _gaps(draw: Draw, near: int) -> Spoil:
     """Missing samples, alone and in rows, anywhere, near edges, and near a change."""
     single, first, long = draw.wholes(6, 420), draw.whole(0, 300), draw.whole(2, 12)
     after, offsets = draw.one(-9, 3, 7, 15, 60), draw.wholes(8, 13)
@@ -192,9 +196,9 @@ def _gaps(draw: Draw, near: int) -> Callable[[Codes, NDArray[np.bool_]], None]:
     return spoil
 
 
-def _bursts(draw: Draw) -> Callable[[Codes, NDArray[np.bool_]], None]:
+def _bursts(draw: Draw, samples: int) -> Spoil:
     """Disturbances of the displacement that come and go, and that no model explains."""
-    starts, deviation = draw.wholes(6, 1500), draw.size(3.0, 30.0)
+    starts, deviation = draw.wholes(6, samples), draw.size(3.0, 30.0)
     noise = draw.normal(deviation, 40)
 
     def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
@@ -205,7 +209,7 @@ def _bursts(draw: Draw) -> Callable[[Codes, NDArray[np.bool_]], None]:
     return spoil
 
 
-def _all_of(spoils: Sequence[Callable[[Codes, NDArray[np.bool_]], None]]) -> Callable[[Codes, NDArray[np.bool_]], None]:
+def _all_of(spoils: Sequence[Spoil]) -> Spoil:
     def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
         for each in spoils:
             each(codes, missing)

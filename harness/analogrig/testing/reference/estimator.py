@@ -56,8 +56,8 @@ BRIDGED_MAX, BRIDGE_PRECISION = 8, 0.6
 NEAR = 0.03
 """Relative distance from a threshold at which rounding may decide that A has moved."""
 
-NEAR_SETTLED = 0.12
-"""The same of the excess of the noise variance over 1, to which each equation since the whitening began adds."""
+NEAR_SETTLED, NEAR_LIMITED = 0.5, 0.1
+"""The same of the excess of the noise variance over 1, when the whitening may begin anew, and when P is limited."""
 
 NEAR_SUM = 0.01
 """The same of the evidence that edges are displaced."""
@@ -408,9 +408,9 @@ class ReferenceEstimator:
             self.trigger.find_hidden_change(is_doubted=self.doubt is not None)
 
     @property
-    def _is_nearly_settled(self) -> bool:
-        """True if rounding may have decided whether the whitening has settled."""
-        return abs((self.variance - 1.0) / (SETTLED - 1.0) - 1.0) < NEAR_SETTLED
+    def _from_settling(self) -> float:
+        """Distance from where the whitening counts as settled, relative to the excess of the noise variance."""
+        return abs((self.variance - 1.0) / (SETTLED - 1.0) - 1.0)
 
     @property
     def _considers_c(self) -> bool:
@@ -421,7 +421,7 @@ class ReferenceEstimator:
         """Limit the d's to the prior once the weight is low, preferably in a step with little other work."""
         long = not self.settled or self.doubt is not None or self._considers_c
         if self.covariance.weight < WEIGHT_DUE and self.covariance.exceeds_prior:
-            self._is_doubtful |= self._is_nearly_settled
+            self._is_doubtful |= self._from_settling < NEAR_LIMITED
         if self.covariance.weight < (WEIGHT_OVERDUE if long else WEIGHT_DUE):
             self.covariance.inflate(1.0)
 
@@ -495,7 +495,7 @@ class ReferenceEstimator:
         if step <= REFRESH_STEP:
             self.equations = -1
             return
-        self._is_doubtful |= step <= REFRESH_STRIDE and self._is_nearly_settled
+        self._is_doubtful |= step <= REFRESH_STRIDE and self._from_settling < NEAR_SETTLED
         self.refresh = Refresh.TAKES
         if step > REFRESH_STRIDE or not self.settled:  # the whitening restarts with the new C
             self.pending = 1
