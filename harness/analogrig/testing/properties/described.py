@@ -72,20 +72,24 @@ def computes_what_it_describes(play: Play, scenario: Scenario, seed: int, case: 
 
 @experiment
 def states_hum(play: Play, scenario: Scenario, seed: int) -> Finding:
-    """Finding: the device states a hum once, with the frequency and the strength that its innovations have."""
+    """Finding: in two runs the device states a hum once, with the frequency and the strength in its innovations."""
     description = described_estimator(play)
     with _configured(play, description, HUM) as device:
-        run = play.on(SpoiledRig(play.bench.rig, hum), device)(scenario, seed, allow_inconclusive=True).run
-    if run.flags[SETTLING_N:].any() or len(run.alarm_index) or run.conditions.faults:
-        raise Inconclusive("the device raised an alarm, or left out samples")
-    expected = hum_in_second_block(run.innovation.astype(np.float64), HUM.settings["noise_variance"])
-    stated = list(zip(run.misfit_index.tolist(), run.misfit_cause.tolist(), strict=True))
-    frequency, strength = run.misfit_frequency.tolist(), run.misfit_strength.tolist()
-    is_right = (
-        stated == [(STATED_N, Cause.HUM)]
-        and abs(frequency[0] - expected.frequency) < 1.0 / FREQUENCY_UNITS
-        and abs(strength[0] - expected.strength) < MISFIT_ROUNDING * expected.strength + 1.0 / STRENGTH_UNITS
-    )
+        player = play.on(SpoiledRig(play.bench.rig, hum), device)
+        runs = [player(scenario, seed + number, allow_inconclusive=True).run for number in range(2)]
+    for run in runs:
+        if run.flags[SETTLING_N:].any() or len(run.alarm_index) or run.conditions.faults:
+            raise Inconclusive("the device raised an alarm, or left out samples")
+        expected = hum_in_second_block(run.innovation.astype(np.float64), HUM.settings["noise_variance"])
+        stated = list(zip(run.misfit_index.tolist(), run.misfit_cause.tolist(), strict=True))
+        frequency, strength = run.misfit_frequency.tolist(), run.misfit_strength.tolist()
+        is_right = (
+            stated == [(STATED_N, Cause.HUM)]
+            and abs(frequency[0] - expected.frequency) < 1.0 / FREQUENCY_UNITS
+            and abs(strength[0] - expected.strength) < MISFIT_ROUNDING * expected.strength + 1.0 / STRENGTH_UNITS
+        )
+        if not is_right:
+            break
     return Finding(is_right, f"stated {stated} {frequency} {strength}, expected {STATED_N} {expected}", run=run)
 
 

@@ -120,14 +120,12 @@ def leave_out_near_edges(codes: Codes, missing: NDArray[np.bool_]) -> None:
         missing[edge + (1, 0, 2, 5, 9, 11, 12, 3)[number % 8]] = True
 
 
-def _jump(at: int, then: int | None = None, gap: slice = slice(0)) -> Spoil:
-    """A displacement that jumps once or twice, so far that it is noticed at once, and samples that are missing."""
+def _jump_after_gap(samples: int) -> Spoil:
+    """A displacement that jumps so far that it is noticed at once, so many samples after a gap."""
 
     def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
-        codes[at:, Y] += 90
-        if then is not None:
-            codes[then:, Y] -= 40
-        missing[gap] = True
+        missing[300:312] = True
+        codes[312 + samples :, Y] += 90
 
     return spoil
 
@@ -186,6 +184,11 @@ def _fails(channel: int, wrong: Callable[[NDArray[np.float64]], NDArray[np.float
 
 def _noise(deviation: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     return lambda codes: codes[1:] + np.random.default_rng(1995).normal(0.0, deviation, len(codes) - 1)
+
+
+def _noisy_force(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """A noise of the force that ends long before a change."""
+    codes[360:420, U] = np.round(_noise(40.0)(codes[359:420, U].astype(np.float64)))
 
 
 FAULTS: Mapping[str, Spoil] = {
@@ -300,15 +303,10 @@ CASES: Mapping[str, ReferenceCase] = {
     "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), _ARMED, leave_out_later),
     **{name: ReferenceCase(FAULTY, _ONE_CLOCK if "late" in name else _ARMED, spoil) for name, spoil in FAULTS.items()},
     **{
-        f"fault {n} samples after a gap": ReferenceCase(
-            HEALTHY, {**_FIXED, **_ARMED}, _jump(312 + n, gap=slice(300, 312))
-        )
-        for n in range(5, 11)
+        f"fault {n} samples after a gap": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump_after_gap(n))
+        for n in range(5, 9)
     },
-    **{
-        f"fault {n} samples after another": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump(280, 280 + n))
-        for n in range(99, 105)
-    },
+    "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
     "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analogrig.catalogue import SteppedFlag
 from analogrig.estimator_config import EstimatorConfig
@@ -155,6 +156,8 @@ class ReferenceEstimator:
         self.bridged_n = 0  # samples before this one that were predicted
         self.slipped: Vector | None = None  # delta after a slip, valid from the next sample on
         self._is_doubtful = False
+        self._forms: tuple[tuple[float, float], NDArray[np.float64]] | None = None
+        """Reference, and theta as linear forms in delta."""
         self.deviation = 0.0  # predicted standard deviation of the last innovation, in codes
 
     @property
@@ -186,8 +189,10 @@ class ReferenceEstimator:
     @property
     def deviations(self) -> Vector:
         """Standard deviations of theta."""
-        columns = [self._plain(unit, 0.0) for unit in np.eye(self.config.parameters).tolist()]
-        variances = self.covariance.variances(np.transpose(columns).tolist())
+        if self._forms is None or self._forms[0] != self.reference:
+            columns = [self._plain(unit, 0.0) for unit in np.eye(self.config.parameters).tolist()]
+            self._forms = (self.reference, np.transpose(columns))
+        variances = self.covariance.variances(self._forms[1])
         return [math.sqrt(each * self.trigger.noise_variance) for each in variances]
 
     @property
