@@ -35,7 +35,7 @@ def test_device_computes_what_it_describes(hil_play: Play, case: str) -> None:
 
 @pytest.mark.hil_needs("tweak", "excite")
 @pytest.mark.parametrize("number", DRAWN)
-def test_device_computes_what_it_describes_in_drawn_cases(hil_play: Play, number: int) -> None:
+def test_drawn_cases_are_computed_as_described(hil_play: Play, number: int) -> None:
     assert computes_what_it_describes(hil_play, drawn(number).scenario, SEED, case=str(number), tries=1)
 
 
