@@ -114,7 +114,7 @@ def settings(numbers: Numbered, build: ReferenceSettings) -> Script:
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 100.0, Key.EDGE_CODES: 101.0},
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 100.0, Key.EDGE_CODES: 100.0},
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.5},
-        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 3.5},
+        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.0},
     ):
         yield from (numbers.configure(key, value) for key, value in default.items())
         yield from (numbers.configure(key, value) for key, value in unfit.items())
