@@ -55,6 +55,7 @@ HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
 FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
+DISPLACED = _scenario("displaced edges", dataclasses.replace(_FREE, frequency_hz=211.3), 600)
 RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
 
 
@@ -236,6 +237,8 @@ CASES: Mapping[str, ReferenceCase] = {
     "edges become early": ReferenceCase(EARLY, _RESTLESS),
     "edges become late, delayed": ReferenceCase(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
     "edges become early, delayed": ReferenceCase(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
+    "edges anywhere": ReferenceCase(DISPLACED, _FIXED),
+    "edges anywhere, known noise": ReferenceCase(DISPLACED, {**_FIXED, "noise_estimated": False}),
     "missing while in doubt": ReferenceCase(
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
     ),

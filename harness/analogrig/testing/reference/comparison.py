@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,7 @@ def expected_of(
 def _in_single_precision(config: EstimatorConfig) -> EstimatorConfig:
     """The configuration with the values that a device holds."""
     real = {key: value for key, value in dataclasses.asdict(config).items() if type(value) is float}
-    rounded = {key: float(np.float32(value)) for key, value in real.items()}
+    rounded: dict[str, Any] = {key: float(np.float32(value)) for key, value in real.items()}
     return dataclasses.replace(config, **rounded, c=tuple(float(np.float32(c)) for c in config.c))
 
 

@@ -22,7 +22,6 @@ MOST_SAMPLES = 2600
 USUAL_HZ, ODD_HZ = (40.0, 100.0, 200.0, 250.0, 400.0), (90.0, 310.0)
 """Frequencies whose period is a whole number of samples, and limits of others."""
 
-
 SHAPES = ("square", "square", "square", "square", "prbs", "pulse", "sine")
 
 
@@ -57,7 +56,7 @@ class Draw:
 
 @functools.lru_cache(maxsize=1024)
 def drawn(number: int) -> ReferenceCase:
-    """Case with this number. Every second is about a single change after a quiet start."""
+    """Case with this number. Every sixth is long."""
     draw = Draw(number)
     is_long = number % 6 == 5
     samples = draw.whole(1500, MOST_SAMPLES) if is_long else draw.whole(430, 700)
