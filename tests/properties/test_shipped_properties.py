@@ -24,7 +24,10 @@ from analogrig.scenario import Scenario
 from analogrig.testing.properties.test_detection import SINGLY
 from tests.harness.firmware import needs_firmware
 
-LONG = "rarer_than or of_all_kinds or stay_rare or rightly_named or faults_of_the_line or converses or computes_what"
+LONG = (
+    "rarer_than or of_all_kinds or stay_rare or rightly_named or faults_of_the_line or converses or computes_what"
+    " or as_described"
+)
 """Properties for which a line is too slow; its faults and messages are tried apart, with short time-outs."""
 
 FIRMWARE = "found_once or come_to_the_truth or warm_up or answers_with_numbers"

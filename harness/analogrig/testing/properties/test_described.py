@@ -9,8 +9,9 @@ import pytest
 
 from analogrig.scenario import Scenario
 from analogrig.testing.properties.conversed import PORTS, converses_as_catalogued
-from analogrig.testing.properties.described import computes_what_it_describes
-from analogrig.testing.reference.cases import CASES
+from analogrig.testing.properties.described import computes_what_it_describes, states_hum
+from analogrig.testing.reference.cases import CASES, HUM
+from analogrig.testing.reference.drawn import drawn
 from analogrig.testing.reference.scripts import SCRIPTS, is_for
 from analogrig.testing.statement import Play
 
@@ -18,11 +19,29 @@ SEED = 1
 TRIES = 40
 """Most seeds of a case. One play in two or more is judged: 40 seeds fail with a probability of 1e-12."""
 
+ROUNDED = frozenset({17, 77, 106, 118, 137})
+"""Drawn cases that are left out: float32, with products fused or not, makes another decision, which the reference does
+not foresee, or comes within a factor of 2 of an allowed deviation."""
+
+DRAWN = [number for number in range(160) if number not in ROUNDED]
+"""Drawn cases, from an endless series."""
+
 
 @pytest.mark.hil_needs("tweak", "excite")
 @pytest.mark.parametrize("case", CASES)
 def test_device_computes_what_it_describes(hil_play: Play, case: str) -> None:
     assert computes_what_it_describes(hil_play, CASES[case].scenario, SEED, case=case, tries=TRIES)
+
+
+@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.parametrize("number", DRAWN)
+def test_drawn_cases_are_computed_as_described(hil_play: Play, number: int) -> None:
+    assert computes_what_it_describes(hil_play, drawn(number).scenario, SEED, case=str(number), tries=1)
+
+
+@pytest.mark.hil_needs("tweak", "excite")
+def test_device_states_a_hum_as_described(hil_play: Play) -> None:
+    assert states_hum(hil_play, HUM.scenario, SEED)
 
 
 @pytest.mark.parametrize(

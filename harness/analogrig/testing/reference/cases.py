@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import INPUT, OUTPUT
 from analogrig.scenario import PotChange, Scenario
+from analogrig.testing.reference.fit import STATED_N
 from analogrig_emulator import Excitation
 
 U, Y = INPUT, OUTPUT
@@ -54,6 +55,7 @@ HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
 FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
+DISPLACED = _scenario("displaced edges", dataclasses.replace(_FREE, frequency_hz=211.3), 600)
 RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
 
 
@@ -119,6 +121,16 @@ def leave_out_near_edges(codes: Codes, missing: NDArray[np.bool_]) -> None:
         missing[edge + (1, 0, 2, 5, 9, 11, 12, 3)[number % 8]] = True
 
 
+def _jump_after_gap(samples: int) -> Spoil:
+    """A displacement that jumps so far that it is noticed at once, so many samples after a gap."""
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
+        missing[300:312] = True
+        codes[312 + samples :, Y] += 90
+
+    return spoil
+
+
 def leave_out_later(codes: Codes, missing: NDArray[np.bool_]) -> None:
     """Few samples shortly before a change."""
     missing[[edges_of(codes)[-3] - 9]] = True
@@ -152,6 +164,12 @@ def hold(codes: Codes, missing: NDArray[np.bool_]) -> None:
     missing[edges[6] + 20] = True
 
 
+def hum(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """Two codes of hum on the displacement, with a period of 440 samples."""
+    disturbance = 2.0 * np.sin(2.0 * np.pi * np.arange(len(codes)) / 440.0)
+    codes[:, Y] = np.round(codes[:, Y] + disturbance)
+
+
 FAULT_AT = 420
 """First sample of a faulty channel."""
 
@@ -167,6 +185,11 @@ def _fails(channel: int, wrong: Callable[[NDArray[np.float64]], NDArray[np.float
 
 def _noise(deviation: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     return lambda codes: codes[1:] + np.random.default_rng(1995).normal(0.0, deviation, len(codes) - 1)
+
+
+def _noisy_force(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """A noise of the force that ends long before a change."""
+    codes[360:420, U] = np.round(_noise(40.0)(codes[359:420, U].astype(np.float64)))
 
 
 FAULTS: Mapping[str, Spoil] = {
@@ -197,6 +220,14 @@ _TWO_B = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked"}
 _ONE_CLOCK = {**_FIXED, **_ARMED, "nb": 2, "nk": 1, "edge_instants": "locked", "forgetting": 0.995}
 """Settings without a slip, which a late force would be taken for."""
 
+HUM = ReferenceCase(
+    _scenario("hum", _SQUARE, STATED_N + 1),
+    {**_ONE_CLOCK, "noise_estimated": False, "noise_variance": 2.0, "ceiling": 1e4, "misfit": True},
+    hum,
+    is_optional=True,
+)
+"""Disturbance that the watch of the fit names."""
+
 CASES: Mapping[str, ReferenceCase] = {
     "default": ReferenceCase(SOFTER_LATER),
     "default in blocks": ReferenceCase(SOFTER, _ARMED, exchange="block"),
@@ -206,6 +237,8 @@ CASES: Mapping[str, ReferenceCase] = {
     "edges become early": ReferenceCase(EARLY, _RESTLESS),
     "edges become late, delayed": ReferenceCase(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
     "edges become early, delayed": ReferenceCase(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
+    "edges anywhere": ReferenceCase(DISPLACED, _FIXED),
+    "edges anywhere, known noise": ReferenceCase(DISPLACED, {**_FIXED, "noise_estimated": False}),
     "missing while in doubt": ReferenceCase(
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
     ),
@@ -232,6 +265,11 @@ CASES: Mapping[str, ReferenceCase] = {
     ),
     "extended by one": ReferenceCase(
         SOFTER, {**_TWO_B, "nc": 1, "c": (-0.5,), "refresh_n": 0, "trigger": "none"}, is_optional=True
+    ),
+    "extended with an offset": ReferenceCase(
+        SOFTER,
+        {**_ARMED, **_TWO_B, "nc": 1, "offset": True, "c": (-0.5,), "refresh_n": 0, "p0": 1e-4, "forgetting": 0.97},
+        is_optional=True,
     ),
     "first order": ReferenceCase(SOFTER, {"na": 1, "nb": 1, "nk": 1, "c": (-0.7,), "trigger": "none", "refresh_n": 0}),
     "longest": ReferenceCase(SOFTER, {**_RESTLESS, "nk": 1, "c": (-1.2, 0.4), "p0": 0.5, "p0_offset": 1e4}),
@@ -267,6 +305,11 @@ CASES: Mapping[str, ReferenceCase] = {
     ),
     "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), _ARMED, leave_out_later),
     **{name: ReferenceCase(FAULTY, _ONE_CLOCK if "late" in name else _ARMED, spoil) for name, spoil in FAULTS.items()},
+    **{
+        f"fault {n} samples after a gap": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump_after_gap(n))
+        for n in range(5, 9)
+    },
+    "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
     "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,25 +30,39 @@ class Expected:
     statistic: NDArray[np.float64]
     flags: NDArray[np.uint8]
     alarms: tuple[int, ...]
-    diagnoses: tuple[tuple[int, int, int, float], ...]
-    """Sample after which each was sent, change, onset and extent."""
+    diagnoses: tuple[tuple[int, int, int, float, float], ...]
+    """Sample after which each was sent, change, onset, extent and its standard deviation."""
     counters: Mapping[str, int]
-    is_doubtful: bool
-    """True if rounding may decide a threshold: the answers of a sound device may differ."""
+    sure_n: int
+    """Samples before rounding may decide a threshold. From then on the answers of a sound device may differ."""
+    sure_diagnoses_n: int
+    """The same for diagnoses."""
+
+    @property
+    def is_doubtful(self) -> bool:
+        """True if rounding may decide a threshold."""
+        return self.sure_diagnoses_n < len(self.flags)
 
 
 def expected_of(
     config: EstimatorConfig, u: NDArray[np.uint16], y: NDArray[np.uint16], valid: NDArray[np.bool_]
 ) -> Expected:
     """Answers of the reference, which is run once for the same samples."""
-    return _expected(config, u.tobytes(), y.tobytes(), valid.tobytes())
+    return _expected(_in_single_precision(config), u.tobytes(), y.tobytes(), valid.tobytes())
 
 
-@functools.lru_cache(maxsize=256)
+def _in_single_precision(config: EstimatorConfig) -> EstimatorConfig:
+    """The configuration with the values that a device holds."""
+    real = {key: value for key, value in dataclasses.asdict(config).items() if type(value) is float}
+    rounded: dict[str, Any] = {key: float(np.float32(value)) for key, value in real.items()}
+    return dataclasses.replace(config, **rounded, c=tuple(float(np.float32(c)) for c in config.c))
+
+
+@functools.lru_cache(maxsize=1024)
 def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expected:
     reference = ReferenceEstimator(config)
     isolation = ReferenceIsolation(reference)
-    diagnoses, alarm = [], 0
+    diagnoses, alarm, sure_n, sure_diagnoses_n = [], 0, 0, 0
     force, displacement = (np.frombuffer(codes, np.uint16).tolist() for codes in (u, y))
     theta, spread, deviation, steps = [], [], [], []
     samples = zip(force, displacement, np.frombuffer(valid, np.bool_).tolist(), strict=True)
@@ -54,7 +70,9 @@ def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expe
         steps.append(reference.step(at_u, at_y, valid=is_valid))
         alarm = index if steps[-1].alarm else alarm
         if found := isolation.enter(at_u, at_y, steps[-1]):
-            diagnoses.append((index, int(found.change), alarm - found.onset_n, found.extent))
+            diagnoses.append((index, int(found.change), alarm - found.onset_n, found.extent, found.deviation))
+        sure_n += not reference.is_doubtful
+        sure_diagnoses_n += not (reference.is_doubtful or isolation.is_doubtful)
         theta.append(reference.theta)
         spread.append(reference.deviations)
         deviation.append(reference.deviation)
@@ -68,5 +86,6 @@ def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expe
         alarms=tuple(k for k, step in enumerate(steps) if step.alarm),
         diagnoses=tuple(diagnoses),
         counters=reference.counters,
-        is_doubtful=reference.is_doubtful or reference.trigger.is_doubtful or isolation.is_doubtful,
+        sure_n=sure_n,
+        sure_diagnoses_n=sure_diagnoses_n,
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analogrig.catalogue import SteppedFlag
 from analogrig.estimator_config import EstimatorConfig
@@ -53,8 +54,11 @@ SLOPE_N = 5
 BRIDGED_MAX, BRIDGE_PRECISION = 8, 0.6
 """Longest gap that is bridged, and smallest precision of the whitening at which it is."""
 
-NEAR = 0.1
+NEAR = 0.03
 """Relative distance from a threshold at which rounding may decide that A has moved."""
+
+NEAR_SETTLED, NEAR_LIMITED = 0.5, 0.1
+"""The same of the excess of the noise variance over 1, when the whitening may begin anew, and when P is limited."""
 
 NEAR_SUM = 0.01
 """The same of the evidence that edges are displaced."""
@@ -140,6 +144,7 @@ class ReferenceEstimator:
         self.residuals = [0.0] * config.nc
         self.pending = self._past_n
         self.settled = False  # the gains of the whitening have converged to C
+        self.variance = 1.0  # of the noise of the last equation, in variances of e
         self.equations = 0  # since C was last considered
         self.refresh = Refresh.WAITS
         self.since_n = 0  # samples since an edge of u
@@ -150,7 +155,9 @@ class ReferenceEstimator:
         self.edges_vary = False
         self.bridged_n = 0  # samples before this one that were predicted
         self.slipped: Vector | None = None  # delta after a slip, valid from the next sample on
-        self.is_doubtful = False  # rounding may have decided whether C was to follow A
+        self._is_doubtful = False
+        self._forms: tuple[tuple[float, float], NDArray[np.float64]] | None = None
+        """Reference, and theta as linear forms in delta."""
         self.deviation = 0.0  # predicted standard deviation of the last innovation, in codes
 
     @property
@@ -182,9 +189,16 @@ class ReferenceEstimator:
     @property
     def deviations(self) -> Vector:
         """Standard deviations of theta."""
-        columns = [self._plain(unit, 0.0) for unit in np.eye(self.config.parameters).tolist()]
-        variances = self.covariance.variances(np.transpose(columns).tolist())
+        if self._forms is None or self._forms[0] != self.reference:
+            columns = [self._plain(unit, 0.0) for unit in np.eye(self.config.parameters).tolist()]
+            self._forms = (self.reference, np.transpose(columns))
+        variances = self.covariance.variances(self._forms[1])
         return [math.sqrt(each * self.trigger.noise_variance) for each in variances]
+
+    @property
+    def is_doubtful(self) -> bool:
+        """True if rounding may have decided a threshold: of A and C, of the edges, of the trigger or its scale."""
+        return self._is_doubtful or self.trigger.is_doubtful or self.trigger.scale.is_doubtful
 
     @property
     def slips(self) -> int:
@@ -399,6 +413,11 @@ class ReferenceEstimator:
             self.trigger.find_hidden_change(is_doubted=self.doubt is not None)
 
     @property
+    def _from_settling(self) -> float:
+        """Distance from where the whitening counts as settled, relative to the excess of the noise variance."""
+        return abs((self.variance - 1.0) / (SETTLED - 1.0) - 1.0)
+
+    @property
     def _considers_c(self) -> bool:
         """True if this equation includes a step of a refresh of C."""
         return bool(self.config.refresh_n) and self.equations + 1 >= self.config.refresh_n
@@ -406,6 +425,8 @@ class ReferenceEstimator:
     def _limit(self) -> None:
         """Limit the d's to the prior once the weight is low, preferably in a step with little other work."""
         long = not self.settled or self.doubt is not None or self._considers_c
+        if self.covariance.weight < WEIGHT_DUE and self.covariance.exceeds_prior:
+            self._is_doubtful |= self._from_settling < NEAR_LIMITED
         if self.covariance.weight < (WEIGHT_OVERDUE if long else WEIGHT_DUE):
             self.covariance.inflate(1.0)
 
@@ -435,7 +456,7 @@ class ReferenceEstimator:
     def _watch_edges(self) -> None:
         """Take edges for coming anywhere once every edge is displaced by another part of an interval."""
         self.misfit = max(0.0, self.misfit + self.displacement.part - DISPLACED)
-        self.is_doubtful |= abs(self.misfit / DISPLACED_SUM - 1.0) < NEAR_SUM
+        self._is_doubtful |= abs(self.misfit / DISPLACED_SUM - 1.0) < NEAR_SUM
         if self.misfit > DISPLACED_SUM:
             self.edges_vary = True
             self.trigger.scale.forgive()
@@ -475,10 +496,11 @@ class ReferenceEstimator:
 
     def _compare_c(self) -> None:
         step = sum((new - old) ** 2 for new, old in zip(self._contracted, self.whitener.c, strict=True))
-        self.is_doubtful |= any(abs(step / limit - 1.0) < NEAR for limit in (REFRESH_STEP, REFRESH_STRIDE))
+        self._is_doubtful |= any(abs(step / limit - 1.0) < NEAR for limit in (REFRESH_STEP, REFRESH_STRIDE))
         if step <= REFRESH_STEP:
             self.equations = -1
             return
+        self._is_doubtful |= step <= REFRESH_STRIDE and self._from_settling < NEAR_SETTLED
         self.refresh = Refresh.TAKES
         if step > REFRESH_STRIDE or not self.settled:  # the whitening restarts with the new C
             self.pending = 1

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,11 +48,18 @@ PRIOR = 0.5
 SIZES = 20.0
 VARIANCE_KNOWN = 0.25
 
+SUM_CURVE, SUM_WIDTH = 0.0866, 2.83
+"""Parabola that takes the place of ln(1 + exp(-x)), and where it ends."""
+
 HABITS_N, UNUSUAL, CLIP = 128, 4.0, 25.0
 """Samples on which the habits of the channels are based, and limits of a noisy force in usual variances."""
 
-NEAR = 0.12
-"""Distance from a limit at which rounding, or the sum of likelihoods to 0.03, may decide [nats]."""
+NEAR, NEAR_SHARE, NEAR_MOST = 0.03, 1e-5, 300_000.0
+"""Distance from a limit at which rounding may decide [nats], its increase with the evidence, and the evidence beyond
+which rounding may decide anything: float32 loses as much as it adds."""
+
+NEAR_KNOWN = 2e-3
+"""The same of the accuracy of an extent, relative to it."""
 
 PARAMETERS = (Change.MASS, Change.DAMPING, Change.STIFFNESS)
 FAULTS = tuple(change for change in Change if change > Change.SEVERAL)
@@ -78,6 +85,8 @@ class ReferenceDiagnosis:
     onset_n: int
     """Samples from the onset to the last alarm."""
     extent: float
+    deviation: float
+    """Standard deviation of the extent."""
 
 
 class ReferencePlant:
@@ -407,6 +416,15 @@ def _linear(gain: Array, known: Array, vector: Array) -> list[Hypothesis]:
     return [Hypothesis(gain + vector[:, i] * change[:, i], change[:, i], known[:, i]) for i in range(vector.shape[1])]
 
 
+def sum_of_likelihoods(logarithms: Iterable[float]) -> float:
+    """Logarithm of 1 and these likelihoods added one after another, each time to 0.03 by a parabola."""
+    out = 0.0
+    for each in logarithms:
+        most, least = max(out, each), min(out, each)
+        out = most + SUM_CURVE * max(SUM_WIDTH - (most - least), 0.0) ** 2
+    return out
+
+
 class Fit:
     """Likelihoods of all hypotheses: one change, or two changed parameters, at each onset."""
 
@@ -421,7 +439,7 @@ class Fit:
     ) -> None:
         """``matrix`` and ``vector``: normal equations of M, B and K."""
         gains = np.array([single.gain for single in singles])
-        self.any_alone = np.logaddexp.reduce(gains, axis=1, initial=0.0)
+        self.any_alone = np.array([sum_of_likelihoods(each) for each in gains.tolist()])
         self._gains, self._onsets_n, self._samples_n = gains, onsets_n, samples_n
         best = gains.argmax(axis=1)
         is_likely = gains.max(axis=1) > 0.0
@@ -436,7 +454,7 @@ class Fit:
             inverse = np.linalg.inv(matrix[part])
             x = np.einsum("nij,nj->ni", inverse, vector[:, (i, j)])
             both = gain + np.einsum("ni,ni->n", x, vector[:, (i, j)])
-            self._any_pair[frozenset((i, j))] = float(np.logaddexp.reduce(both, initial=0.0))
+            self._any_pair[frozenset((i, j))] = sum_of_likelihoods(both.tolist())
             lack = np.maximum(WORTH_TELLING - np.abs(x), 0.0)
             relevant = both[:, np.newaxis] - lack**2 / np.einsum("nii->ni", inverse)
             self._beside[i] = max(self._beside[i], relevant[:, 1].max())
@@ -446,7 +464,11 @@ class Fit:
     def is_doubtful(self) -> bool:
         """True if rounding may decide what is named, or its onset."""
         low, high = self.named(-1.0), self.named(1.0)
-        return low != high or (high in SINGLE and len(self._likely_onsets(SINGLE.index(high))) > 1)
+        return (
+            self.any_alone.max() > NEAR_MOST
+            or low != high
+            or (high in SINGLE and len(self._likely_onsets(SINGLE.index(high))) > 1)
+        )
 
     def _likely_onsets(self, one: int) -> NDArray[np.int64]:
         """Onsets of a change any of which may be the best one."""
@@ -454,7 +476,7 @@ class Fit:
         return np.unique(self._onsets_n[gains >= gains.max() - self._near(one)])
 
     def _near(self, one: int) -> float:
-        return NEAR + 0.5 * ROUNDING * max(float(self.any_alone[one]), 0.0)
+        return NEAR + NEAR_SHARE * max(float(self.any_alone[one]), 0.0)
 
     def named(self, nears: float = 0.0) -> Change | None:
         """The change that is sure, if one is; with so much more evidence as rounding may add, ``nears`` times."""
@@ -465,7 +487,7 @@ class Fit:
             return Change.SEVERAL
         if one in range(3):
             penalty = self._penalty(one)
-            is_known = self._known[one] > EXTENT_KNOWN * (1.0 - 0.1 * NEAR * nears)
+            is_known = self._known[one] > EXTENT_KNOWN * (1.0 - NEAR_KNOWN * nears)
             is_sure = is_known and self._stands_alone(one, penalty, more)
             lead = SURE + penalty
         else:
@@ -490,12 +512,14 @@ class Fit:
     def diagnosis(self, change: Change, repeated_n: int) -> ReferenceDiagnosis:
         """Onset and extent of a change that was named, ``repeated_n`` samples before the last alarm."""
         if change not in SINGLE:
-            return ReferenceDiagnosis(change, 0, 1.0)
+            return ReferenceDiagnosis(change, 0, 1.0, 0.0)
         one = SINGLE.index(change)
-        has_extent = change in PARAMETERS or change in GAINS
-        return ReferenceDiagnosis(
-            change, int(self._onset_n[one]) + repeated_n, self._extent(one) if has_extent else 1.0
-        )
+        onset_n = int(self._onset_n[one]) + repeated_n
+        if change not in (*PARAMETERS, *GAINS):
+            return ReferenceDiagnosis(change, onset_n, 1.0, 0.0)
+        extent, deviation = self._extent(one), math.sqrt(0.5 / float(self._known[one]))
+        inverted = SINGLE[one] not in (Change.DAMPING, Change.STIFFNESS)
+        return ReferenceDiagnosis(change, onset_n, extent, deviation * (extent**2 if inverted else 1.0))
 
     def _extent(self, one: int) -> float:
         """New value over old one, from 1 - old/new for M and gains, and new/old - 1 for B and K."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 Vector = list[float]
 
@@ -100,10 +101,15 @@ class Covariance:
         self.d, self.weight = list(self.prior), 1.0
         self.u = [[float(i == j) for j in range(n)] for i in range(n)]
 
-    def variances(self, forms: Sequence[Sequence[float]]) -> Vector:
-        """Variances of linear forms in the parameters."""
-        roots = np.sqrt(np.array(self.d) / self.weight)
-        return [float(each) for each in np.square(np.array(forms) @ np.array(self.u) * roots).sum(axis=1)]
+    def variances(self, forms: NDArray[np.float64]) -> Vector:
+        """Variances of linear forms in the parameters, (forms, parameters)."""
+        shares: Vector = (np.square(forms @ np.array(self.u)) @ np.array(self.d) / self.weight).tolist()
+        return shares
+
+    @property
+    def exceeds_prior(self) -> bool:
+        """True if ``inflate`` would limit P."""
+        return any(d > p * self.weight for d, p in zip(self.d, self.prior, strict=True))
 
     def inflate(self, factor: float) -> None:
         """Multiply P by this factor, up to the prior."""

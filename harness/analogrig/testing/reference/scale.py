@@ -23,7 +23,7 @@ PLAIN = 64.0 * (TRIAL_N - TRIAL_BEGIN_N)
 NOISE_LEAST = 0.07
 """Smallest noise variance that is followed, in configured ones."""
 
-NEAR = 0.01
+NEAR = 0.003
 """Relative distance from a threshold at which rounding may decide."""
 
 

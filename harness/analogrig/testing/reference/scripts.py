@@ -114,7 +114,7 @@ def settings(numbers: Numbered, build: ReferenceSettings) -> Script:
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 100.0, Key.EDGE_CODES: 101.0},
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 100.0, Key.EDGE_CODES: 100.0},
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.5},
-        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 3.5},
+        {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.0},
     ):
         yield from (numbers.configure(key, value) for key, value in default.items())
         yield from (numbers.configure(key, value) for key, value in unfit.items())
@@ -185,6 +185,7 @@ def control(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG
     yield numbers.control(Command.START, 7)
     yield numbers.block(0, run=7)
     yield numbers.control(Command.STOP)
+    yield numbers.control(Command.REPORT_INTERVAL, 4)
     yield numbers.control(Command.START, 7)
     yield numbers.block(0, run=7)
     yield Identify(numbers.next())
@@ -273,7 +274,7 @@ def damage(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG0
         *((good[:cut] + b"\0", 1) for cut in range(2, len(good) - 1)),
         *((good[:at] + bytes([good[at] ^ 0x40]) + good[at + 1 :], 1) for at in range(1, len(good) - 1)),
         *((full[:at] + bytes([full[at] ^ 0x81]) + full[at + 1 :], 1) for at in range(2, len(full) - 1, 5)),
-        (frame.encode(bytes([0x7F]) + bytes(8)), 1),
+        *((frame.encode(bytes([0x7F]) + bytes(length)), 1) for length in (0, 8)),
         *((frame.encode(bytes([layout.id]) + bytes(layout.length + more)), 1)
           for layout in LAYOUTS.values() for more in (-1, 1)),
         (frame.encode(pack(Control(0, 0, 0)), CATALOGUE_HASH ^ 1), 1),

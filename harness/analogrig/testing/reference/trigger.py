@@ -10,10 +10,10 @@ from analogrig.testing.reference.scale import HIGH_LIMIT, ReferenceScale
 GAIN, DRIFT = 0.4945, 1.1305
 """Terms of the sum: GAIN z^2 - DRIFT, a multiple of the log-likelihood ratio of a variance 7.1 times as large."""
 
-NEAR = 0.01
+NEAR = 0.003
 """Distance from the ceiling at which rounding may decide, relative to the ceiling and 1."""
 
-RIVAL_NEAR = 1e-3
+RIVAL_NEAR = 3e-4
 """The same of the distance between two readings of an edge, which share most of their rounding."""
 
 

@@ -1,0 +1,216 @@
+"""Cases drawn at random: settings, plants, changes, faults of the channels, and missing samples, of every kind."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.scenario import PotChange, Scenario
+from analogrig.testing.reference.cases import Codes, ReferenceCase, Spoil, U, Y, edges_of
+from analogrig_emulator import Excitation
+
+PLANT_M, PLANT_K, PLANT_DAMPING = (30.0, 60.0), (17_000.0, 28_500.0), (0.3, 1.5)
+"""Drawn plants: fast ones, whose prefilter amplifies rounding little."""
+
+MOST_SAMPLES = 2600
+
+USUAL_HZ, ODD_HZ = (40.0, 100.0, 200.0, 250.0, 400.0), (90.0, 310.0)
+"""Frequencies whose period is a whole number of samples, and limits of others."""
+
+SHAPES = ("square", "square", "square", "square", "prbs", "pulse", "sine")
+
+
+class Draw:
+    """Random numbers of one case."""
+
+    def __init__(self, number: int) -> None:
+        self._rng = np.random.default_rng((1995, number))
+
+    def chance(self, probability: float) -> bool:
+        return bool(self._rng.random() < probability)
+
+    def one(self, *values: Any) -> Any:
+        return values[int(self._rng.integers(len(values)))]
+
+    def whole(self, low: int, high: int) -> int:
+        return int(self._rng.integers(low, high + 1))
+
+    def real(self, low: float, high: float) -> float:
+        return float(self._rng.uniform(low, high))
+
+    def size(self, low: float, high: float) -> float:
+        """Number whose logarithm is drawn evenly."""
+        return math.exp(self.real(math.log(low), math.log(high)))
+
+    def normal(self, deviation: float, n: int) -> NDArray[np.float64]:
+        return self._rng.normal(0.0, deviation, n)
+
+    def wholes(self, n: int, most: int) -> Sequence[int]:
+        return [int(each) for each in self._rng.integers(0, most, n)]
+
+
+@functools.lru_cache(maxsize=1024)
+def drawn(number: int) -> ReferenceCase:
+    """Case with this number. Every sixth is long."""
+    draw = Draw(number)
+    is_long = number % 6 == 5
+    samples = draw.whole(1500, MOST_SAMPLES) if is_long else draw.whole(430, 700)
+    first = draw.whole(300, samples - 100)
+    plant = _plant(draw)
+    spoils: list[Spoil] = []
+    tweaks: list[PotChange] = []
+    instants = [first, *(_instants(draw, samples) if is_long or draw.chance(0.4) else [])]
+    for at in instants:
+        if draw.chance(0.5):
+            tweaks.append(PotChange(at, _changed(draw, plant), draw.one(0, 0, 0, 15)))
+        else:
+            spoils.append(_fault(draw, at, draw.one(samples, at + draw.whole(30, 200))))
+    if draw.chance(0.2):
+        spoils.append(_gaps(draw, first))
+    if draw.chance(0.5 if is_long else 0.1):
+        spoils.append(_bursts(draw, samples))
+    scenario = Scenario(
+        samples=samples, excitation=_excitation(draw), set=plant, tweaks=_ordered(tweaks), name=f"drawn {number}"
+    )
+    return ReferenceCase(scenario, _settings(draw), _all_of(spoils) if spoils else None)
+
+
+def _plant(draw: Draw) -> dict[str, float]:
+    mass, stiffness, damping = draw.real(*PLANT_M), draw.real(*PLANT_K), draw.size(*PLANT_DAMPING)
+    return {
+        "M": round(mass, 1),
+        "B": round(min(2.0 * damping * math.sqrt(mass * stiffness), 4400.0), 1),
+        "K": round(stiffness, 1),
+    }
+
+
+def _changed(draw: Draw, plant: dict[str, float]) -> dict[str, float]:
+    """One or two parameters, by a few per cent to a factor of two."""
+    names = draw.one(("M",), ("M",), ("B",), ("B",), ("K",), ("K",), ("M", "K"), ("B", "K"), ("M", "B"))
+    factors = {name: draw.size(1.04, 1.5) ** draw.one(-1, 1) for name in names}
+    limits = {"M": (29.5, 110.0), "B": (500.0, 4400.0), "K": (14_000.0, 29_000.0)}
+    return {name: round(min(max(plant[name] * factors[name], limits[name][0]), limits[name][1]), 1) for name in names}
+
+
+def _instants(draw: Draw, samples: int) -> list[int]:
+    return list(range(draw.whole(200, 400), samples - 20, draw.whole(100, 400)))
+
+
+def _ordered(tweaks: Sequence[PotChange]) -> tuple[PotChange, ...]:
+    """Changes in order, none before the ramp of the one before has ended."""
+    out: list[PotChange] = []
+    for tweak in sorted(tweaks, key=lambda each: each.sample):
+        if not out or tweak.sample > out[-1].sample + out[-1].ramp_n:
+            out.append(tweak)
+    return tuple(out)
+
+
+def _excitation(draw: Draw) -> Excitation:
+    clock, shape = draw.one("free", "free", "card"), draw.one(*SHAPES)
+    is_odd = draw.chance(0.15)
+    return Excitation(
+        shape=shape,
+        duty=draw.one(0.04, 0.05, 0.06, 0.07, 0.3) if shape == "pulse" else 0.5,
+        low_v=0.1,
+        high_v=draw.real(1.5, 3.2),
+        frequency_hz=round(draw.real(*ODD_HZ), 1) if is_odd else draw.one(*USUAL_HZ, 200.0, 200.0, 200.0),
+        phase=round(draw.real(0.0, 0.999), 4),
+        clock=clock,
+        drift_ppm=draw.one(0.0, 0.0, 20.0, -20.0) if clock == "free" else 0.0,
+    )
+
+
+def _settings(draw: Draw) -> dict[str, Any]:
+    """Settings of the estimator. All are inside the limits, some are far from the defaults."""
+    out: dict[str, Any] = {
+        "warm_up_n": draw.whole(60, 250),
+        "forgetting": draw.one(0.97, 0.98, 0.99, 0.995, 0.995, 0.998),
+        "refresh_n": draw.one(0, 0, 0, 18, 40, 40),
+        "noise_estimated": draw.chance(0.7),
+        "noise_variance": draw.size(0.4, 3.0),
+        "edge_instants": draw.one("locked", "may-slip", "may-slip", "may-slip"),
+    }
+    if draw.chance(0.3):
+        out |= draw.one({"nb": 2, "nk": 1}, {"nb": 2, "nk": 1, "offset": False}, {"nb": 2}, {"nb": 1, "nk": 1})
+    if draw.chance(0.4):
+        zero = draw.real(0.5, 0.85)
+        out["c"] = draw.one((-2.0 * zero, zero**2), (-zero,), (-1.45, 0.51))
+    rare: dict[str, Callable[[], dict[str, Any]]] = {
+        "arl0": lambda: {"arl0": draw.size(30.0, 1e6)},
+        "hold-off": lambda: {"hold_off_n": draw.whole(1, 60)},
+        "edges": lambda: {"edge_codes": draw.size(20.0, 400.0)},
+        "walk": lambda: {"random_walk": draw.size(1e-7, 1e-4), "forgetting": 1.0},
+        "prior": lambda: {"p0": draw.size(1e-3, 100.0), "p0_offset": draw.size(1.0, 1e6)},
+        "reset": lambda: {"reset": "all"},
+        "stuck": lambda: {"stuck_n": draw.whole(2, 30)},
+        "idle": lambda: {"idle_n": draw.whole(20, 120)},
+        "range": lambda: {"code_low": draw.real(300.0, 420.0), "code_high": draw.real(1000.0, 1400.0)},
+        "anywhere": lambda: {"edge_instants": "anywhere"},
+    }
+    for settings in rare.values():
+        if draw.chance(0.07):
+            out |= settings()
+    return out
+
+
+def _fault(draw: Draw, at: int, end: int) -> Spoil:
+    """Fault of a channel in the samples from ``at`` to ``end``."""
+    channel, kind = draw.one(U, Y), draw.one("offset", "gain", "delay", "stuck", "noise")
+    sizes = {U: (20.0, 150.0, 8.0, 80.0), Y: (4.0, 30.0, 2.0, 12.0)}[channel]
+    offset, part = draw.size(*sizes[:2]) * draw.one(-1, 1), draw.size(0.05, 0.3) * draw.one(-1, 1)
+    noise = draw.normal(draw.size(*sizes[2:]), MOST_SAMPLES)
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+        true = codes[at - 1 : end, channel].astype(np.float64)
+        now, before = true[1:], true[:-1]
+        wrong = {
+            "offset": now + offset,
+            "gain": 400.0 + (1.0 + part) * (now - 400.0),
+            "delay": before,
+            "stuck": np.full(len(now), now[0]),
+            "noise": now + noise[: len(now)],
+        }[kind]
+        codes[at:end, channel] = np.clip(np.round(wrong), 0.0, 4095.0)
+
+    return spoil
+
+
+def _gaps(draw: Draw, near: int) -> Spoil:
+    """Missing samples, alone and in rows, anywhere, near edges, and near a change."""
+    single, first, long = draw.wholes(6, 420), draw.whole(0, 300), draw.whole(2, 12)
+    after, offsets = draw.one(-9, 3, 7, 15, 60), draw.wholes(8, 13)
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
+        missing[single] = True
+        missing[first : first + long] = True
+        missing[min(near + after, len(missing) - 1)] = True
+        for edge, offset in zip(edges_of(codes).tolist(), offsets, strict=False):
+            missing[min(edge + offset, len(missing) - 1)] = True
+
+    return spoil
+
+
+def _bursts(draw: Draw, samples: int) -> Spoil:
+    """Disturbances of the displacement that come and go, and that no model explains."""
+    starts, deviation = draw.wholes(6, samples), draw.size(3.0, 30.0)
+    noise = draw.normal(deviation, 40)
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+        for start in starts:
+            now = codes[start : start + len(noise), Y]
+            now[:] = np.clip(np.round(now + noise[: len(now)]), 0.0, 4095.0)
+
+    return spoil
+
+
+def _all_of(spoils: Sequence[Spoil]) -> Spoil:
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
+        for each in spoils:
+            each(codes, missing)
+
+    return spoil
