@@ -16,6 +16,7 @@ from analogrig_emulator import (
     Deck,
     Engine,
     Excitation,
+    Mode,
     OpAmp,
     PotError,
     PotTurn,
@@ -136,6 +137,10 @@ z' = -z + y/(0.05 + x*x)""",
     "a divisor with a root": """x' = -2*x + u/(0.1 + sqrt(abs(y)))
 y' = -y + x/(0.2 + abs(x))
 z' = -z + 0.05*y*y/(0.03 + sqrt(0.01 + x*x))""",
+    "a divisor that is a root": """r = sqrt(0.02 + x*x + y*y)
+x' = -x + u - 0.3*y/r
+y' = -y + 0.5*x/r
+z' = -z - 0.5*sqrt(0.05 + x*x)/sqrt(0.3 + abs(y))""",
 }
 
 
@@ -197,7 +202,7 @@ def test_dividers_and_roots_play_the_equations_at_any_rate(name: str, sample_rat
 
 @pytest.mark.parametrize("sample_rate_hz", [100.0, 500.0])
 @pytest.mark.parametrize("name", [*DIVIDING, "two-tanks"])
-def test_offsets_of_ideal_amplifiers_leave_loops_a_solution(name: str, sample_rate_hz: float) -> None:
+def test_offsets_of_ideal_amplifiers_leave_dividers_a_solution(name: str, sample_rate_hz: float) -> None:
     program = compiled(DIVIDING[name]) if name in DIVIDING else program_of(name)
     low_v, high_v = levels_v(program)
     excitation = Excitation(low_v=low_v, high_v=high_v, frequency_hz=sample_rate_hz / 100.0)
@@ -208,6 +213,21 @@ def test_offsets_of_ideal_amplifiers_leave_loops_a_solution(name: str, sample_ra
     volts = np.concatenate(list(exact.play(excitation, 150)))
     for other in others:
         assert np.sqrt(np.mean((np.concatenate(list(other.play(excitation, 150))) - volts) ** 2)) < 0.5
+
+
+def test_dividers_stand_idle_in_pot_set() -> None:
+    machine = SuspensionComputer(compiled(DIVIDING["a divisor near zero"]), opamp="ideal").machine
+    machine.switch(Mode.POT_SET)
+    pot = next(iter(machine.dials))
+    machine.set_coefficient(pot, 0.3)
+    assert machine.coefficient(pot) == pytest.approx(0.3)
+    assert not np.abs(machine.run(5)).any()
+
+
+def test_a_rest_waits_for_a_divisor_that_is_a_root() -> None:
+    circuit = SuspensionComputer(compiled(DIVIDING["a divisor that is a root"]), opamp="ideal").circuit
+    rest = piecewise_linear(circuit).rest(np.zeros(1))
+    assert np.isfinite(list(rest.volts.values())).all()
 
 
 def test_a_loop_costs_steps_where_it_moves_and_not_all_the_time() -> None:

@@ -28,6 +28,7 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.machine.noise import BOLTZMANN_J_PER_K
+from tests.emulator.programs import circuit_of
 
 KT_J = BOLTZMANN_J_PER_K * (25.0 + 273.15)
 LSB_V = 10.0 / 4096
@@ -118,6 +119,13 @@ def test_without_sources_there_is_no_noise() -> None:
     assert not cold.volts(10, np.random.default_rng(1)).any()
     warm = CircuitNoise(circuit, NODES, op_amps=replace(TL07X, noise_v_per_rthz=0.0))
     assert warm.volts(10, np.random.default_rng(1))[1:, 1].all()
+
+
+@pytest.mark.parametrize("name", ["two-tanks", "van-der-pol"])
+def test_noise_without_bound_is_refused(name: str) -> None:
+    machine = NoisySuspension(SuspensionComputer(circuit_of(name)), np.random.default_rng(1), op_amps=TL07X)
+    with pytest.raises(CircuitError, match="play it without noise and hum"):
+        list(machine.play(Excitation(), 10))
 
 
 def test_a_node_that_is_not_there_is_refused() -> None:

@@ -20,6 +20,7 @@ from analogrig_emulator import (
     Excitation,
     ExcitationError,
     Mode,
+    Multiplier,
     RecordedExcitation,
     Resistor,
     SuspensionComputer,
@@ -170,3 +171,10 @@ def square_levels(square: Excitation, rate_hz: float) -> Volts:
     edges = square.edges(0, 400 * TICKS_PER_SAMPLE, rate_hz)
     samples = np.arange(400, dtype=np.int64) * TICKS_PER_SAMPLE
     return np.asarray(edges.levels_v[np.searchsorted(edges.ticks, samples, "right") - 1])
+
+
+def test_more_multipliers_and_drives_than_the_engine_takes_are_counted() -> None:
+    chain = [Multiplier(f"M{i}", "in", "in", f"m{i}") for i in range(16)]
+    system = piecewise_linear(Circuit([VoltageSource("IN", "in"), *chain]))
+    with pytest.raises(EngineError, match="16 multipliers and 1 inputs that move all the time; .* at most 16 together"):
+        Engine(system, ["m0"], RATE_HZ, drives={"IN": Drive.band_limited(np.zeros(3))})

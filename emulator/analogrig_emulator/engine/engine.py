@@ -31,8 +31,7 @@ _REASONS = {
     6: "no circuit was set, or the last one was refused",
     7: "limiters, amplifiers and multipliers feed one another so that there is no unique solution: "
     "is there positive feedback, a loop of ideal elements, or a division by 0?",
-    8: "the products of multipliers cannot be followed: they grow without bound, or a divisor reached zero, "
-    "or a radicand is negative",
+    8: "the products of multipliers cannot be followed: they grow without bound, or a divisor reached zero",
 }
 
 
@@ -93,6 +92,11 @@ class Engine:
                 f"{len(self._outputs)} nodes are to be recorded; the engine takes at most {library.MAX_OUTPUTS}"
             )
         inputs, products = len(system.inputs) + len(system.products), len(system.products)
+        if products > library.MAX_PRODUCTS:
+            raise EngineError(
+                f"{products - len(drives)} multipliers and {len(drives)} inputs that move all the time; "
+                f"the engine takes at most {library.MAX_PRODUCTS} together"
+            )
         sizes = (len(system.states), inputs, products, len(system.kinks), len(self._outputs))
         kind = (self._library, (*sizes, 1.0 / sample_rate_hz, events_per_sample))
         self._handle = _take(kind)

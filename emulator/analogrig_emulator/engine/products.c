@@ -400,10 +400,9 @@ engine_status_t products_solve(engine_t* const self) {
         multiply_out(self, &self->w[self->kinks - 2 * self->products], values);
         for (int i = 0; i < self->products; i++) {
             settled = settled && fabs(values[i] - held[i]) <= SETTLED * fabs(held[i]);
-            if (!isfinite(values[i])) {
-                return ENGINE_NOT_UNIQUE;  // they feed one another without bound: all w were finite
+            if (isfinite(values[i])) {  // a quotient waits for a divisor that is itself a product
+                held[i] = values[i];
             }
-            held[i] = values[i];
         }
         if (settled) {
             return ENGINE_OK;

@@ -407,9 +407,10 @@ class PiecewiseLinear:
         for _ in range(_REST_PASSES):
             rest, w = self._rest_with(np.concatenate((levels_v, values)))
             arguments = w[len(w) - 2 * values.size :].reshape(-1, 2)
-            before, values = values, np.array([f.at(*pair) for f, pair in zip(self.products, arguments, strict=True)])
-            if not (np.abs(values - before) > _REST_V).any():
+            found = np.array([f.at(*pair) for f, pair in zip(self.products, arguments, strict=True)])
+            if (np.abs(found - values) <= _REST_V).all():
                 return rest
+            values = np.where(np.isfinite(found), found, values)  # a quotient waits for a divisor that is a product
         names = ", ".join(dict.fromkeys(product.element for product in self.products))
         raise CircuitError(f"nothing brings {names} to rest: the products do not settle")
 

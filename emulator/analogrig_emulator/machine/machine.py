@@ -38,10 +38,11 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
 from analogrig_emulator.circuit.nodal import Nodal, analyse
+from analogrig_emulator.circuit.nonlinear import Multiplier
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Kink, PiecewiseLinear
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Kink, Law, PiecewiseLinear
 from analogrig_emulator.errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
 from analogrig_emulator.machine.patching import Patch, patches
 
@@ -553,6 +554,8 @@ class AnalogComputer:
         elements = list(self._patched.elements)
         for amplifier in lifted:
             elements = [_lift_inputs(element, self._patches[amplifier]) for element in elements]
+        if mode is Mode.POT_SET:  # every input is at ground, and 0 / 0 has no value: dividers stand idle as multipliers
+            elements = [replace(each, law=Law.PRODUCT) if isinstance(each, Multiplier) else each for each in elements]
         if mode is not Mode.HOLD:
             elements += [part for name in self._initial_v for part in self._charging_circuit(self._patches[name])]
         return Circuit(elements)

@@ -53,6 +53,9 @@ _FLICKER_HZ = (1.0, 10.0, 100.0, 1000.0)
 
 _KEPT_PROPAGATIONS = 16
 
+_MOST_GROWTH_PER_S = 1.0
+"""Rate of growth, in 1/s, beyond which a circuit with its products held is unstable; rounding makes up to 0.1."""
+
 Matrix = NDArray[np.float64]
 
 
@@ -142,6 +145,11 @@ class _Sources:
     def _propagate(self, conditions: _Conditions, dials: Mapping[str, float]) -> Propagation:
         system = self._nodal.at(dials)
         circuit = _linear_matrix(system)
+        if system.products and np.linalg.eigvals(circuit).real.max() > _MOST_GROWTH_PER_S:
+            raise CircuitError(
+                "noise and hum of this program cannot be computed: products are held in them, and without its products "
+                "the plant is unstable, or a divider or root of real amplifiers is; play it without noise and hum"
+            )
         response = self._nodal.disturbances(dials)
         drives = self._drives(conditions, dials, response)
         a, inputs = self._with_shapers(conditions, circuit, response)
