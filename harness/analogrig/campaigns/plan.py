@@ -150,7 +150,7 @@ class Plan:
             raise ConfigurationError(f"{where} ({differences}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
-        """Cells in the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
+        """Cells in the order of the results: rigs, devices, then the axes by name, the last one fastest."""
         axes = self.spec.grid
         combinations = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
         return [

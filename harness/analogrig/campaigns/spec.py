@@ -65,7 +65,7 @@ class CampaignSpec:
     change_at: int = 1000
     """Sample at which the factors take effect."""
     grid: Axes = field(default_factory=dict)
-    """Table ``[grid]``: every combination of these values is a cell."""
+    """Table ``[grid]``: every combination of these values is a cell. Axes are in order of their names."""
     draw: Axes = field(default_factory=dict)
     """Table ``[draw]``: values drawn for each trial from its seed, uniformly between the ends (low, high)."""
     stop: Stop | None = None
@@ -87,6 +87,9 @@ class CampaignSpec:
         if not 0 <= self.first_seed < 2**62:
             raise ValueError(f"first_seed must be 0 to 2^62, not {self.first_seed}")
         _check_axes(self.grid, self.draw)
+        # The numbers of cells and of draws follow the order of the axes, which must survive a plan's text.
+        for name in ("grid", "draw"):
+            object.__setattr__(self, name, dict(sorted(getattr(self, name).items())))
 
     @classmethod
     def load(cls, name: str) -> CampaignSpec:
