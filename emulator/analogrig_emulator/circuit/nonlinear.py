@@ -110,7 +110,7 @@ class Multiplier(CircuitPart):
     node at both inputs makes a squarer. In the feedback of an op-amp it divides.
 
     law: that of a multiplier; or of an ideal divider, v(out) = scale_v v(x) / v(y), or an ideal root,
-    v(out) = sign sqrt(max(0, scale_v v(x))), whose input y does nothing.
+    v(out) = sign sqrt(max(0, scale_v v(x))), whose input y does nothing and may be its x.
     """
 
     finite: ClassVar[tuple[str, ...]] = ("scale_v",)

@@ -450,7 +450,7 @@ class _Patcher:
             case StageKind.RECTIFIER:
                 return self._rectifier(stage)
             case StageKind.QUOTIENT | StageKind.ROOT:
-                return self._loop(stage)
+                return self._divider_or_root(stage)
             case _:
                 assert_never(stage.kind)
 
@@ -492,10 +492,10 @@ class _Patcher:
         self._elements.append(Resistor(f"R{number}FB", junction, f"u{number}", INPUT_OHM))
         return self._amplifier(stage, [PatchedCord(cord, node, sign, 1.0, 1, name)])
 
-    def _loop(self, stage: PatchStage) -> PatchedElement:
+    def _divider_or_root(self, stage: PatchStage) -> PatchedElement:
         """Divider or root: the amplifier settles where its multiplier's product equals the first cord.
 
-        An ideal amplifier is a summer instead, before an element that divides or takes the root by itself.
+        An amplifier without a pole is a summer instead, before an element that divides or takes the root by itself.
         """
         number, dividend = self._amplifiers[stage.name], stage.cords[0]
         sign, junction, out = self._signs[stage.name], f"s{number}", f"u{number}"
