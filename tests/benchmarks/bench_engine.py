@@ -95,7 +95,7 @@ class Setting:
 
     @property
     def accuracy(self) -> Accuracy:
-        """What the deck writer enters of it."""
+        """Tolerances, longest step and method, as the deck writer takes them."""
         return Accuracy(
             reltol=self.reltol, vntol_v=1e-6, trtol=self.trtol, max_step_s=self.max_step_s, method=self.method
         )

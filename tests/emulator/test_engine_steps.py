@@ -38,9 +38,9 @@ LOUD = Excitation(shape="prbs", low_v=-12.0, high_v=12.0, frequency_hz=9e3, cloc
 FREE = Excitation(clock="free", phase=0.137, drift_ppm=20.0, frequency_hz=333.0)
 
 
-def played(program: str, opamp: str, excitation: Excitation, samples: int) -> Volts:
+def played(program: str, opamp: str, excitation: Excitation, samples: int, ahead_ticks: int = 0) -> Volts:
     computer = SuspensionComputer(circuit_of(program), opamp=opamp, rng=np.random.default_rng(3))
-    return np.concatenate(list(computer.play(excitation, samples)))
+    return np.concatenate(list(computer.play(excitation, samples, ahead_ticks=ahead_ticks)))
 
 
 @pytest.mark.parametrize("program", ["front", "shock", "two-mass"])
@@ -122,7 +122,15 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., CDLL]:
     return compile_with
 
 
-@pytest.mark.parametrize("options", [("-O1", "-DENGINE_NARROW"), ("-O3", "-march=native")], ids=" ".join)
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("-O1", "-DENGINE_NARROW"),
+        ("-O3", "-march=native"),
+        ("-O1", "-fsanitize=undefined", "-fsanitize-undefined-trap-on-error"),  # undefined behaviour ends the process
+    ],
+    ids=" ".join,
+)
 def test_bits_do_not_depend_on_the_width_of_registers_or_the_compilers_options(
     options: tuple[str, ...], compiled: Callable[..., CDLL], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,15 +139,17 @@ def test_bits_do_not_depend_on_the_width_of_registers_or_the_compilers_options(
         ("shock", "opa627", FREE),
         ("two-mass", "741", OVERLOAD),
         ("van-der-pol", "tl07x", FREE),
+        ("two-tanks", "ideal", FREE),
     )
     volts, normals = 8.0 * np.random.default_rng(1).standard_normal((2, 3, 51, 4))
     cards = [Card(noise_lsb=(0.3,) * 4, stuck_high=1), Card(bits=16, ranges_v=((0.0, 10.0),), noise_lsb=(0.3,))]
 
-    def sampled() -> list[bytes]:
+    def all_bits() -> list[bytes]:
+        plays = [played(*case, 200, ahead_ticks) for case in cases for ahead_ticks in (0, 1000)]
         codes = [sample_plays(card, volts[..., : card.channels], normals[..., : card.channels]) for card in cards]
-        return [array.tobytes() for arrays in codes for array in arrays]
+        return [array.tobytes() for arrays in (plays, *codes) for array in arrays]
 
-    usual = [played(*case, 200).tobytes() for case in cases], sampled()
+    usual = all_bits()
     other = compiled(*options)
     monkeypatch.setattr(library, "load", lambda: other)
-    assert ([played(*case, 200).tobytes() for case in cases], sampled()) == usual
+    assert all_bits() == usual
