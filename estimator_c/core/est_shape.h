@@ -40,7 +40,7 @@
 #endif
 
 /// Loops over the parameters and over small constants. A build for size keeps them as loops.
-#if (defined(__clang__) || (defined(__GNUC__) && (__GNUC__ >= 8))) && (defined(EST_FIXED_NA) || !EST_FOR_SIZE)
+#if (defined(__clang__) || (defined(__GNUC__) && (__GNUC__ >= 8))) && !EST_FOR_SIZE
 #define EST_UNROLL _Pragma("GCC unroll 8")
 #else
 #define EST_UNROLL
