@@ -53,8 +53,6 @@ EST_SHARED void increment_long(uint32_t* const counter) { *counter += (*counter 
 
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
-EST_SHARED bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
-
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
 EST_INLINE bool same_shape(const est_shape_t a, const est_shape_t b) {
@@ -176,10 +174,10 @@ EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float
 }
 
 EST_SHARED void refresh_prefilter(est_t* const self, const uint_fast8_t na) {
-    float a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
+    float a[EST_NA_MAX + 1U];
     contract_a(self, na, a);
     self->refresh_in = self->config->refresh_n;
-    if (est_whitener_accepts(&a[1], EST_NA_MAX)) {
+    if (est_whitener_accepts(&a[1], na)) {
         est_whitener_set(&self->whitener, &a[1], na);
         increment(&self->counters.refreshes);
     }
@@ -227,12 +225,10 @@ static void gather(est_t* const self) {
 
 /// Declare the samples so far unknown: the next equation must not use them.
 EST_SHARED void forget_samples(est_t* const self) {
-    if (self->known) {
-        self->known     = false;
-        self->pending_n = count_past(self->config);
-        if (EST_WITH_EDGES) {
-            self->doubt_n = 0U;
-        }
+    self->known     = false;
+    self->pending_n = count_past(self->config);
+    if (EST_WITH_EDGES) {
+        self->doubt_n = 0U;
     }
 }
 
@@ -266,7 +262,7 @@ EST_INLINE void subtract_reference(est_t* const self, float* const u, float* con
 }
 
 /// True iff the code is finite and within +-EST_CODE_LIMIT.
-static bool is_plausible(const float code) { return within(code, -EST_CODE_LIMIT, EST_CODE_LIMIT); }
+static bool is_plausible(const float code) { return est_magnitude(code) <= EST_CODE_LIMIT; }
 
 /// True iff the code is within the range of the converter. False for NaN and the infinities.
 static bool in_range(const est_config_t* const config, const float code) {
@@ -382,7 +378,7 @@ static void enter_edge(est_t* const self) {
 /// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
 static bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) && (self->same_n == 0U) &&
+    return (((uint32_t)self->pending_n + self->trigger.quiet_n + self->same_n) == 0U) &&
            (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
            (est_shape_of(self->config).nc == 0U);
 #else
@@ -828,7 +824,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);
-    self->pending_n = count_past(config);
+    forget_samples(self);
     est_factors_reset(&self->factors, config);
     est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
     return true;
@@ -928,7 +924,7 @@ bool est_invariants_hold(const est_t* const self) {
         return false;  // MISRA D4
     }
     for (uint_fast8_t i = 0U; i < est_theta_count(self); i++) {
-        if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !within(self->theta[i], -FLT_MAX, FLT_MAX)) {
+        if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !(est_magnitude(self->theta[i]) <= FLT_MAX)) {
             return false;  // MISRA D4
         }
     }

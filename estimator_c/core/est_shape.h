@@ -108,6 +108,9 @@ EST_SHARED float est_min(const float a, const float b) { return (a < b) ? a : b;
 /// The larger number; the second one if either is NaN.
 EST_SHARED float est_max(const float a, const float b) { return (a > b) ? a : b; }
 
+/// True iff the number is in the range. False for NaN.
+EST_SHARED bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
+
 /// Orders of the model.
 typedef struct {
     uint8_t na;

@@ -19,7 +19,7 @@ static inline bool est_trigger_config_valid(const est_trigger_config_t* const co
         (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
         ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
-    return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
+    return known && reset && within(config->ceiling, FLT_MIN, EST_CEILING_LIMIT);
 }
 
 typedef enum {
@@ -63,9 +63,7 @@ EST_ROBUST_SHARED bool est_trigger_end_doubt(est_trigger_t* const self, const es
     if (self->statistic >= config->ceiling) {
         return true;  // MISRA D4
     }
-    if (est_trigger_in_doubt(self)) {
-        self->statistic = est_trigger_best_rival(self);
-    }
+    self->statistic = est_min(est_trigger_best_rival(self), self->statistic);
     return false;
 }
 
