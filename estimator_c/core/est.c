@@ -143,16 +143,26 @@ static void follow_slip(est_t* const self, const bool late) {
 
 #if EST_WITH_ROBUSTNESS
 /// Compute theta in the plain form of est.h, after the first coefficient of A.
-EST_SHARED void compute_plain(const est_t* const self, const est_shape_t shape, float* const plain) {
+EST_INLINE void compute_plain_of(const est_t* const self, const est_shape_t shape, float* const plain) {
     float* const b = &plain[shape.na + 1U];
     plain[0]       = 1.0F;
     (void)append(&plain[1], self->theta, EST_THETA_MAX);
     if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
         b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
     }
-    if (est_delta_applies(self->config)) {
+    if (est_delta_applies(self)) {
         est_delta_to_plain(plain, shape.na);
         est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
+    }
+}
+
+/// The same with code specialised for the usual shape.
+EST_SHARED void compute_plain(const est_t* const self, float* const plain) {
+    const est_shape_t shape = est_shape_of(self->config);
+    if (EST_SPECIALISED && same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
+        compute_plain_of(self, EST_SHAPE_FREE_RUNNING, plain);
+    } else {
+        compute_plain_of(self, shape, plain);
     }
 }
 #endif
@@ -163,7 +173,7 @@ EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float
     float factor = 1.0F;
     *out         = 1.0F;
     (void)append(&out[1], self->theta, na);
-    if (est_delta_applies(self->config)) {
+    if (est_delta_applies(self)) {
         est_delta_to_plain(out, na);
     }
     EST_UNROLL
@@ -235,7 +245,7 @@ EST_SHARED void forget_samples(est_t* const self) {
 /// Set theta to zero.
 static void clear_theta(est_t* const self) {
     clear(self->theta, EST_THETA_MAX);
-    if (est_delta_applies(self->config)) {
+    if (est_delta_applies(self)) {
         self->theta[0] = 1.0F;  // the first coefficient of A, which is no parameter
         est_delta_from_plain(self->theta, self->config->na);
         *append(self->theta, &self->theta[1], self->config->na) = 0.0F;
@@ -247,7 +257,7 @@ static void clear_theta(est_t* const self) {
 EST_INLINE void subtract_reference(est_t* const self, float* const u, float* const y) {
 #if EST_WITH_ROBUSTNESS
     if (est_shape_of(self->config).offset > 0U) {
-        if ((self->counters.updated == 0U) && est_delta_applies(self->config)) {
+        if ((self->counters.updated == 0U) && est_delta_applies(self)) {
             self->reference_u = *u;
             self->reference_y = *y;
         }
@@ -540,7 +550,7 @@ static void put_on_trial(est_t* const self, const bool overflown) {
     if (self->scale.trial_n > 0U) {
         est_scale_conclude(&self->scale, self->noise_variance);
     }
-    if (!overflown && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
+    if (!overflown && self->cusum) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
@@ -636,7 +646,7 @@ EST_INLINE float weight_of(const est_t* const self) {
 static void find_hidden_change(est_t* const self) {
     est_scale_t* const scale = &self->scale;
     est_scale_count_high(scale, self->noise_variance);
-    if ((self->trigger.quiet_n > 0U) || (self->config->trigger.kind != EST_TRIGGER_CUSUM) || (scale->share <= 0.0F)) {
+    if ((self->trigger.quiet_n > 0U) || !self->cusum || (scale->share <= 0.0F)) {
         scale->high_n = 0U;
     } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
         scale->high_n           = 0U;
@@ -820,6 +830,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
 #if EST_WITH_ROBUSTNESS
+    self->cusum = config->trigger.kind == EST_TRIGGER_CUSUM;
     est_scale_init(&self->scale, config);
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
@@ -853,7 +864,7 @@ float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
 #if EST_WITH_ROBUSTNESS
     float plain[EST_THETA_MAX + 1U];
-    compute_plain(self, est_shape_of(self->config), plain);
+    compute_plain(self, plain);
     return plain[index + 1U];
 #else
     return self->theta[index];
@@ -863,13 +874,8 @@ float est_theta(const est_t* const self, const uint8_t index) {
 void est_copy_theta(const est_t* const self, float* const out) {
     EST_ASSERT((self != NULL) && (out != NULL));
 #if EST_WITH_ROBUSTNESS
-    const est_shape_t shape = est_shape_of(self->config);
-    float             plain[EST_THETA_MAX + 1U];
-    if (EST_SPECIALISED && same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
-        compute_plain(self, EST_SHAPE_FREE_RUNNING, plain);
-    } else {
-        compute_plain(self, shape, plain);
-    }
+    float plain[EST_THETA_MAX + 1U];
+    compute_plain(self, plain);
     (void)append(out, &plain[1], EST_THETA_MAX);
 #else
     (void)append(out, self->theta, EST_THETA_MAX);
@@ -882,9 +888,8 @@ float est_variance(const est_t* const self, const uint8_t index) {
     float             factor[EST_THETA_MAX + 1U];  // 0 for the first coefficient of A, then those of theta
     clear(factor, EST_THETA_MAX + 1U);
     factor[index + 1U] = 1.0F;
-    if (est_delta_applies(self->config)) {
-        est_delta_difference(factor, shape.na);
-        est_delta_difference(&factor[shape.na + 1U], (uint_fast8_t)(shape.nb - 1U));
+    if (est_delta_applies(self)) {
+        est_delta_difference_both(factor, shape.na, shape.nb);
     }
 #if EST_WITH_ROBUSTNESS
     if (est_is_offset(shape, index)) {  // see compute_plain()

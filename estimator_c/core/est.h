@@ -435,6 +435,7 @@ typedef struct {
     bool                settled;    ///< the gains of the whitener are c, and its variance is 1
     uint8_t             doubt_n;    ///< samples since the first edge in doubt, inclusive; 0: no doubt
 #if EST_WITH_ROBUSTNESS
+    bool    cusum;       ///< the trigger is the cumulative sum
     bool    edges_vary;  ///< edges come anywhere, against the configuration
     uint8_t bridged_n;   ///< samples before the next one that were predicted
 #endif

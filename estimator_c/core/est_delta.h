@@ -16,8 +16,13 @@
 
 /// True iff this configuration uses the delta form: with the cumulative sum. The other triggers keep the parameters and
 /// the prior of the thesis.
-EST_INLINE bool est_delta_applies(const est_config_t* const config) {
-    return EST_WITH_ROBUSTNESS && (config->trigger.kind == EST_TRIGGER_CUSUM);
+EST_INLINE bool est_delta_applies(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return self->cusum;
+#else
+    (void)self;
+    return false;
+#endif
 }
 
 /// Replace order + 1 consecutive values, newest first, by D^order x(k), D^(order-1) x(k-1), ..., x(k-order).
@@ -29,6 +34,12 @@ EST_ROBUST_SHARED void est_delta_difference(float* const x, const uint_fast8_t o
             x[i] -= x[i + 1U];
         }
     }
+}
+
+/// Replace y(k), y(k-1), ..., u(k-nk), ... by their differences, and a gradient in plain coefficients likewise.
+EST_ROBUST_SHARED void est_delta_difference_both(float* const x, const uint_fast8_t na, const uint_fast8_t nb) {
+    est_delta_difference(x, na);
+    est_delta_difference(&x[na + 1U], (uint_fast8_t)(nb - 1U));
 }
 
 /// Coefficients of the values from those of these differences: the transpose of the above. The first is the same in

@@ -18,19 +18,15 @@ typedef struct {
 
 /// Fill x from the stored samples.
 EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const x) {
-    const bool   delta  = est_delta_applies(self->config);
     float* const inputs = append(&x[1], self->y, shape.na);
+    float*       out    = append(inputs, &self->u[shape.nk], shape.nb);
     x[0]                = y;
-    if (delta) {
-        est_delta_difference(x, shape.na);
+    if (est_delta_applies(self)) {
+        est_delta_difference_both(x, shape.na, shape.nb);
     }
     EST_UNROLL
     for (uint_fast8_t i = 1U; i <= shape.na; i++) {
         x[i] = -x[i];
-    }
-    float* out = append(inputs, &self->u[shape.nk], shape.nb);
-    if (delta) {
-        est_delta_difference(inputs, (uint_fast8_t)(shape.nb - 1U));
     }
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
