@@ -471,12 +471,14 @@ EST_INLINE est_finding_t judge_readings(est_t* const                self,
                                         const est_shape_t           shape,
                                         const est_equation_t* const equation,
                                         const float                 weight) {
-    const float e = (self->doubt_n > 1U) ? est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape))
-                                         : equation->innovation;  // theta has not changed yet
-    const est_shares_t shares = est_edges_shares(self, shape);
-    watch_edges(self, e, shares.early - shares.late);
-    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - shares.early, e - shares.late,
-                                     weight, self->doubt_n >= EST_DOUBT_N);
+    const bool same = !EST_FOR_SIZE && (self->doubt_n <= 1U);  // theta has not changed yet
+    const float e = same ? equation->innovation
+                         : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
+    float share[EST_OTHER_READINGS];
+    est_edges_shares(self, shape, share);
+    watch_edges(self, e, share[0] - share[1]);
+    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e, share, weight,
+                                     self->doubt_n >= EST_DOUBT_N);
 }
 
 /// Store the residual of an equation after its update: it replaces e in the next equations (thesis section 3.5).
@@ -729,7 +731,8 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
 EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
     float* const past = self->whitener.past[0].x;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        (void)est_edges_shares(self, shape);
+        float share[EST_OTHER_READINGS];
+        est_edges_shares(self, shape, share);
     }
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {

@@ -376,11 +376,13 @@ typedef struct {
     est_past_t past[EST_THETA_MAX + 1U];  ///< one for each element of the equation
 } est_whitener_t;
 
-/// Effect of the recent edges of u if they had come one sample early or late. Private to est_edges.h.
+/// Readings of the recent edges other than the recorded one: one sample early, one sample late.
+#define EST_OTHER_READINGS 2U
+
+/// Effect of the recent edges of u under the other readings. Private to est_edges.h.
 typedef struct {
-    est_past_t early;                 ///< their share in the whitened equations
-    est_past_t late;                  ///< the same for late edges
-    float      theta[EST_THETA_MAX];  ///< theta before the first of these edges, or before an alarm on trial
+    est_past_t past[EST_OTHER_READINGS];  ///< their share in the whitened equations
+    float      theta[EST_THETA_MAX];      ///< theta before the first of these edges, or before an alarm on trial
 #if EST_WITH_ROBUSTNESS
     float along;   ///< sum of innovation times the effect of a displaced edge, since the edge
     float span;    ///< sum of that effect squared
@@ -388,9 +390,6 @@ typedef struct {
     float misfit;  ///< evidence that each edge is displaced otherwise
 #endif
 } est_edges_t;
-
-/// Readings of the recent edges other than the recorded one: one sample early, one sample late.
-#define EST_OTHER_READINGS 2U
 
 /// State of a trigger. Private to est_trigger.h.
 typedef struct {

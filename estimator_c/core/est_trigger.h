@@ -105,12 +105,14 @@ EST_SHARED float est_trigger_sum(const float before, const float term) {
 /// doubt has reached its term.
 static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
                                                       const float          ceiling,
-                                                      const float          early,
-                                                      const float          late,
+                                                      const float          innovation,
+                                                      const float* const   share,
                                                       const float          weight,
                                                       const bool           expires) {
-    self->rival[0] = est_trigger_sum(self->rival[0], est_trigger_term(early, weight));
-    self->rival[1] = est_trigger_sum(self->rival[1], est_trigger_term(late, weight));
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
+        self->rival[i] = est_trigger_sum(self->rival[i], est_trigger_term(innovation - share[i], weight));
+    }
     if (self->statistic < ceiling) {
         return EST_QUIET;  // MISRA D4
     }
