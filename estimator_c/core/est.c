@@ -169,9 +169,10 @@ EST_SHARED void compute_plain(const est_t* const self, float* const plain) {
 
 /// Compute the estimate of A, contracted: 1, c[0], ... With noise on the output, the noise of the equations is coloured
 /// by A (thesis section 3.5).
-EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const out) {
-    float factor = 1.0F;
-    *out         = 1.0F;
+EST_SHARED void contract_a(const est_t* const self, const est_shape_t shape, float* const out) {
+    const uint_fast8_t na     = est_shape_here(self->config, shape).na;
+    float              factor = 1.0F;
+    *out                      = 1.0F;
     (void)append(&out[1], self->theta, na);
     if (est_delta_applies(self)) {
         est_delta_to_plain(out, na);
@@ -183,9 +184,10 @@ EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float
     }
 }
 
-EST_SHARED void refresh_prefilter(est_t* const self, const uint_fast8_t na) {
-    float a[EST_NA_MAX + 1U];
-    contract_a(self, na, a);
+EST_SHARED void refresh_prefilter(est_t* const self, const est_shape_t shape) {
+    const uint_fast8_t na = est_shape_here(self->config, shape).na;
+    float              a[EST_NA_MAX + 1U];
+    contract_a(self, shape, a);
     self->refresh_in = self->config->refresh_n;
     if (est_whitener_accepts(&a[1], na)) {
         est_whitener_set(&self->whitener, &a[1], na);
@@ -203,7 +205,7 @@ static void renew(est_t* const self) {
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
-        refresh_prefilter(self, est_shape_of(self->config).na);
+        refresh_prefilter(self, est_shape_of(self->config));
     } else {
         // the last step left no work
     }
@@ -471,9 +473,9 @@ EST_INLINE est_finding_t judge_readings(est_t* const                self,
                                         const est_shape_t           shape,
                                         const est_equation_t* const equation,
                                         const float                 weight) {
-    const bool same = !EST_FOR_SIZE && (self->doubt_n <= 1U);  // theta has not changed yet
-    const float e = same ? equation->innovation
-                         : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
+    const bool  same = !EST_FOR_SIZE && (self->doubt_n <= 1U);  // theta has not changed yet
+    const float e =
+        same ? equation->innovation : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     float share[EST_OTHER_READINGS];
     est_edges_shares(self, shape, share);
     watch_edges(self, e, share[0] - share[1]);
@@ -512,7 +514,7 @@ static bool remembers_edge(const est_t* const self) {
 /// taken at the next sample, which has no equation.
 EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
     float a[EST_NA_MAX + 1U];
-    contract_a(self, shape.na, a);
+    contract_a(self, shape, a);
     const float moved = distance(&self->whitener, &a[1], shape.na);
     if (moved < REFRESH_STEP) {
         self->renewal    = EST_RENEWAL_NONE;
@@ -535,7 +537,7 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
         compare_prefilter(self, shape);
     } else if (self->renewal == EST_RENEWAL_PREFILTER) {
         self->renewal = EST_RENEWAL_NONE;
-        refresh_prefilter(self, shape.na);
+        refresh_prefilter(self, shape);
     } else if (remembers_edge(self)) {
         self->renewal = EST_RENEWAL_COMPARE;
     } else {

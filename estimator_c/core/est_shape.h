@@ -137,6 +137,11 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
 #endif
 }
 
+/// The shape, read anew in a build for size, where that is shorter than to pass it.
+EST_INLINE est_shape_t est_shape_here(const est_config_t* const config, const est_shape_t shape) {
+    return EST_FOR_SIZE ? est_shape_of(config) : shape;
+}
+
 /// Number of parameters.
 EST_INLINE uint_fast8_t est_shape_count(const est_shape_t shape) {
     return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + shape.offset);
