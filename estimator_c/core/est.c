@@ -44,11 +44,6 @@
 #define BRIDGED_MAX 8U
 #define BRIDGE_PRECISION 0.6F
 
-EST_SHARED void increment(uint16_t* const counter) {
-    const uint32_t next = *counter + (uint32_t)1U;
-    *counter            = (uint16_t)(next - (next >> 16U));
-}
-
 EST_SHARED void increment_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
 
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
@@ -141,42 +136,29 @@ static void follow_slip(est_t* const self, const bool late) {
     est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
 }
 
-#if EST_WITH_ROBUSTNESS
 /// Compute theta in the plain form of est.h, after the first coefficient of A.
-EST_INLINE void compute_plain_of(const est_t* const self, const est_shape_t shape, float* const plain) {
-    float* const b = &plain[shape.na + 1U];
-    plain[0]       = 1.0F;
+EST_SHARED void compute_plain(const est_t* const self, const est_shape_t given, float* const plain) {
+    const est_shape_t shape = est_shape_here(self->config, given);
+    float* const      b     = &plain[shape.na + 1U];
+    plain[0]                = 1.0F;
     (void)append(&plain[1], self->theta, EST_THETA_MAX);
+#if EST_WITH_ROBUSTNESS
     if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
         b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
     }
+#endif
     if (est_delta_applies(self)) {
         est_delta_to_plain(plain, shape.na);
         est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
     }
 }
 
-/// The same with code specialised for the usual shape.
-EST_SHARED void compute_plain(const est_t* const self, float* const plain) {
-    const est_shape_t shape = est_shape_of(self->config);
-    if (EST_SPECIALISED && same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
-        compute_plain_of(self, EST_SHAPE_FREE_RUNNING, plain);
-    } else {
-        compute_plain_of(self, shape, plain);
-    }
-}
-#endif
-
 /// Compute the estimate of A, contracted: 1, c[0], ... With noise on the output, the noise of the equations is coloured
 /// by A (thesis section 3.5).
 EST_SHARED void contract_a(const est_t* const self, const est_shape_t shape, float* const out) {
     const uint_fast8_t na     = est_shape_here(self->config, shape).na;
     float              factor = 1.0F;
-    *out                      = 1.0F;
-    (void)append(&out[1], self->theta, na);
-    if (est_delta_applies(self)) {
-        est_delta_to_plain(out, na);
-    }
+    compute_plain(self, shape, out);
     EST_UNROLL
     for (uint_fast8_t i = 1U; i <= na; i++) {
         factor *= CONTRACTION;
@@ -186,7 +168,7 @@ EST_SHARED void contract_a(const est_t* const self, const est_shape_t shape, flo
 
 EST_SHARED void refresh_prefilter(est_t* const self, const est_shape_t shape) {
     const uint_fast8_t na = est_shape_here(self->config, shape).na;
-    float              a[EST_NA_MAX + 1U];
+    float              a[EST_THETA_MAX + 1U];
     contract_a(self, shape, a);
     self->refresh_in = self->config->refresh_n;
     if (est_whitener_accepts(&a[1], na)) {
@@ -513,7 +495,7 @@ static bool remembers_edge(const est_t* const self) {
 /// Decide whether C follows A. If C moves far, or the gains have not settled, the whitening begins anew: C is then
 /// taken at the next sample, which has no equation.
 EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
-    float a[EST_NA_MAX + 1U];
+    float a[EST_THETA_MAX + 1U];
     contract_a(self, shape, a);
     const float moved = distance(&self->whitener, &a[1], shape.na);
     if (moved < REFRESH_STEP) {
@@ -842,7 +824,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     clear_theta(self);
     forget_samples(self);
     est_factors_reset(&self->factors, config);
-    est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
+    self->trigger.quiet_n = config->trigger.warm_up_n;
     return true;
 }
 
@@ -869,7 +851,7 @@ float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
 #if EST_WITH_ROBUSTNESS
     float plain[EST_THETA_MAX + 1U];
-    compute_plain(self, plain);
+    compute_plain(self, est_shape_of(self->config), plain);
     return plain[index + 1U];
 #else
     return self->theta[index];
@@ -879,8 +861,13 @@ float est_theta(const est_t* const self, const uint8_t index) {
 void est_copy_theta(const est_t* const self, float* const out) {
     EST_ASSERT((self != NULL) && (out != NULL));
 #if EST_WITH_ROBUSTNESS
-    float plain[EST_THETA_MAX + 1U];
-    compute_plain(self, plain);
+    const est_shape_t shape = est_shape_of(self->config);
+    float             plain[EST_THETA_MAX + 1U];
+    if (EST_SPECIALISED && same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
+        compute_plain(self, EST_SHAPE_FREE_RUNNING, plain);
+    } else {
+        compute_plain(self, shape, plain);
+    }
     (void)append(out, &plain[1], EST_THETA_MAX);
 #else
     (void)append(out, self->theta, EST_THETA_MAX);

@@ -60,15 +60,10 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
     const uint_fast8_t count = est_shape_count(shape);
-    float* const       x     = equation->x;          // cppcheck F2
-    float              gain[EST_NA_MAX] EST_ZEROED;  // MISRA D2
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        gain[i] = est_filter_of(whitener)[i];
-    }
+    float* const       x     = equation->x;  // cppcheck F2
     EST_UNROLL
     for (uint_fast8_t j = 0U; j <= count; j++) {
-        x[j] = est_filter(gain, &whitener->past[j], x[j]);
+        x[j] = est_filter(est_filter_of(whitener), &whitener->past[j], x[j]);
     }
     equation->innovation = est_equation_residual(x, theta, count);
 }

@@ -108,6 +108,12 @@ EST_SHARED float est_min(const float a, const float b) { return (a < b) ? a : b;
 /// The larger number; the second one if either is NaN.
 EST_SHARED float est_max(const float a, const float b) { return (a > b) ? a : b; }
 
+/// Count one up, to UINT16_MAX.
+EST_SHARED void increment(uint16_t* const counter) {
+    const uint32_t next = *counter + (uint32_t)1U;
+    *counter            = (uint16_t)(next - (next >> 16U));
+}
+
 /// True iff the number is in the range. False for NaN.
 EST_SHARED bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
 

@@ -33,7 +33,8 @@ static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t
     self->statistic = 0.0F;
     self->quiet_n   = quiet_n;
     if (EST_WITH_TRIGGERS) {
-        self->mean_n = 0U;
+        self->mean_n   = 0U;
+        self->rival[0] = 0.0F;
     }
 }
 
@@ -126,8 +127,7 @@ static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
 static inline float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
     const float  term = absolute ? est_magnitude(innovation) : innovation;
     float* const mean = &self->rival[0];
-    *mean             = (self->mean_n == 0U) ? 0.0F : *mean;
-    self->mean_n      = (uint16_t)(self->mean_n + ((self->mean_n < UINT16_MAX) ? 1U : 0U));
+    increment(&self->mean_n);
     *mean += (term - *mean) / (float)self->mean_n;
     return est_magnitude(*mean);
 }
