@@ -42,27 +42,22 @@ EST_ROBUST_SHARED void est_delta_difference_both(float* const x, const uint_fast
     est_delta_difference(&x[na + 1U], (uint_fast8_t)(nb - 1U));
 }
 
-/// Coefficients of the values from those of these differences: the transpose of the above. The first is the same in
-/// both forms.
-EST_ROBUST_SHARED void est_delta_to_plain(float* const x, const uint_fast8_t order) {
-    EST_UNROLL
-    for (uint_fast8_t n = 1U; n <= (EST_WITH_ROBUSTNESS ? order : 0U); n++) {
-        EST_UNROLL
-        for (uint_fast8_t i = n; i > 0U; i--) {
-            x[i] -= x[i - 1U];
-        }
-    }
-}
-
-/// The inverse of est_delta_to_plain().
-EST_ROBUST_SHARED void est_delta_from_plain(float* const x, const uint_fast8_t order) {
+/// Add to each coefficient `factor` times the one before, order times.
+EST_ROBUST_SHARED void est_delta_add(float* const x, const uint_fast8_t order, const float factor) {
     EST_UNROLL
     for (uint_fast8_t n = EST_WITH_ROBUSTNESS ? order : 0U; n > 0U; n--) {
         EST_UNROLL
         for (uint_fast8_t i = 1U; i <= n; i++) {
-            x[i] += x[i - 1U];
+            x[i] += factor * x[i - 1U];
         }
     }
 }
+
+/// Coefficients of the values from those of these differences: the transpose of the above. The first is the same in
+/// both forms.
+EST_INLINE void est_delta_to_plain(float* const x, const uint_fast8_t order) { est_delta_add(x, order, -1.0F); }
+
+/// The inverse of est_delta_to_plain().
+EST_INLINE void est_delta_from_plain(float* const x, const uint_fast8_t order) { est_delta_add(x, order, 1.0F); }
 
 #endif  // EST_DELTA_H_INCLUDED
