@@ -582,18 +582,20 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
     } else {
         increment_long(&self->counters.missing);
     }
-    const bool bridged = can_bridge(self);
+    if (!can_bridge(self)) {
+        self->known = false;
+    }
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->doubt_n++;
-        if (!bridged || (self->doubt_n >= EST_DOUBT_N)) {  // the last sample of a doubt decides and must be good
+        if (!self->known || (self->doubt_n >= EST_DOUBT_N)) {  // the last sample of a doubt decides and must be good
+            self->doubt_n = 0U;
             if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
                 note_slip(self);
             }
-            self->doubt_n = 0U;
         }
     }
 #if EST_WITH_ROBUSTNESS
-    if (bridged && self->known) {
+    if (self->known) {
         self->bridged_n++;
         shift_u(self, self->u[0]);
         *y = self->y[0];
