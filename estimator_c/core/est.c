@@ -292,7 +292,7 @@ EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
 
 /// Innovation of the last equation, with the present theta.
 static float last_innovation(const est_t* const self) {
-    const uint_fast8_t count = est_theta_count(self);
+    const uint_fast8_t count = EST_FOR_SIZE ? EST_THETA_MAX : est_theta_count(self);  // the rest is zero
     float              out   = self->whitener.past[0].x[0];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < count; i++) {
@@ -609,14 +609,10 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
     return false;
 }
 
-/// Update everything an equation determines besides theta.
-static void adapt(est_t* const self, const est_shape_t shape, const float* const x) {
-    const est_config_t* const config = self->config;
-    if (config->random_walk > 0.0F) {
-        est_factors_walk(&self->factors, config->random_walk, est_shape_count(shape));
-        est_factors_inflate(&self->factors, config, 1.0F);
-    }
-    store_residual(self, x);
+/// Let every parameter become less certain: the random walk of the configuration.
+static void walk(est_t* const self) {
+    est_factors_walk(&self->factors, self->config->random_walk, est_theta_count(self));
+    est_factors_inflate(&self->factors, self->config, 1.0F);
 }
 
 /// Weight of a squared innovation of unit precision in the cumulative sum.
@@ -749,8 +745,11 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         return;  // MISRA D4
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
-    if (EST_WITH_ADAPTATION && self->adaptive) {
-        adapt(self, shape, equation.x);
+    if (EST_WITH_ADAPTATION) {
+        if (config->random_walk > 0.0F) {
+            walk(self);
+        }
+        store_residual(self, equation.x);
     }
     const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
     const float weight = precision * weight_of(self);
@@ -801,12 +800,9 @@ static void dispatch_equation(est_t* const self, const float y, est_step_t* cons
 
 // ---------------------------------------------          API           ---------------------------------------------
 
-/// Copy the configuration. Without this function gcc emits one store for each field.
-EST_SHARED est_config_t copy_config(const est_config_t* const config) { return *config; }
-
 est_config_t est_config_default(void) {
     static const est_config_t config = EST_CONFIG_DEFAULT;
-    return copy_config(&config);
+    return config;
 }
 
 bool est_init(est_t* const self, const est_config_t* const config) {
@@ -815,7 +811,6 @@ bool est_init(est_t* const self, const est_config_t* const config) {
         return false;  // MISRA D4
     }
     *self                = (est_t){ .config = config };
-    self->adaptive       = EST_WITH_ADAPTATION && needs_adaptation(config);
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
 #if EST_WITH_ROBUSTNESS
@@ -922,7 +917,7 @@ bool est_invariants_hold(const est_t* const self) {
     if ((self == NULL) || (self->config == NULL) || !est_config_valid(self->config)) {
         return false;  // MISRA D4
     }
-    for (uint_fast8_t i = 0U; i < est_theta_count(self); i++) {
+    for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !(est_magnitude(self->theta[i]) <= FLT_MAX)) {
             return false;  // MISRA D4
         }

@@ -428,7 +428,6 @@ typedef struct {
     const est_config_t* config;
     uint8_t             same_n;     ///< samples of constant y since an edge of u
     uint8_t             pending_n;  ///< samples needed before the next equation is complete
-    bool                adaptive;   ///< residuals, random walk or noise variance need an update
     est_renewal_t       renewal;    ///< work left by the last step
     bool                known;      ///< the previous sample is known; if not, pending_n > 0
     bool                settled;    ///< the gains of the whitener are c, and its variance is 1
