@@ -2,6 +2,7 @@
 
 #include "est.h"
 #include "est_assert.h"
+#include "est_correlation.h"
 #include "est_edges.h"
 #include "est_equation.h"
 #include "est_scale.h"
@@ -203,6 +204,15 @@ EST_INLINE void forget_residuals(est_t* const self) {
 #endif
 }
 
+/// Forget the last innovations: the next one does not follow them.
+EST_INLINE void forget_innovations(est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    est_correlation_forget(&self->correlation);
+#else
+    (void)self;
+#endif
+}
+
 /// Count one sample towards the next complete equation. The step has time for the work that an alarm or a slip left,
 /// because it has no equation of its own.
 static void gather(est_t* const self) {
@@ -211,6 +221,7 @@ static void gather(est_t* const self) {
     renew(self);
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
+        forget_innovations(self);
         forget_residuals(self);
         self->settled = false;
         increment(&self->counters.restarts);
@@ -435,12 +446,9 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
 #if EST_WITH_ROBUSTNESS
     est_edges_compare(&self->edges, e, effect);
     if ((self->doubt_n >= EST_DOUBT_N) && est_edges_displaced(&self->edges)) {
-        self->edges_vary      = true;
-        self->scale.inflation = 1.0F;
-        if (self->scale.share > 0.0F) {
-            self->scale.share = EST_SHARE_WARM;
-        }
-        est_scale_restart(&self->scale, self->noise_variance);
+        self->edges_vary  = true;
+        self->correlation = (est_correlation_t){ .work = 0U };
+        est_scale_forgive(&self->scale, self->noise_variance);
     }
 #else
     (void)self;
@@ -635,26 +643,45 @@ static void find_hidden_change(est_t* const self) {
     } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
         scale->high_n           = 0U;
         self->trigger.statistic = 2.0F * self->config->trigger.ceiling;
-    } else {
+        } else {
         // nothing is hidden, or a doubt comes first
     }
 }
 
+/// Let the noise variance and the correlation of the innovations follow a complete block.
+static void follow_block(est_t* const self) {
+    est_scale_t* const       scale       = &self->scale;
+    est_correlation_t* const correlation = &self->correlation;
+    const float              mean        = est_scale_mean(scale);
+    if (scale->stage > 0U) {
+        const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
+        self->noise_variance =
+            est_scale_follow(scale, mean, self->noise_variance, EST_NOISE_LEAST * self->config->noise_variance,
+                             warm ? EST_SHARE_MIN : EST_SHARE_WARM, est_correlation_smooth(correlation));
+    } else if (self->cusum && (correlation->work > 0U)) {
+    #ifndef GW
+#define GW EST_SHARE_WARM
+#endif
+        const float share = (self->trigger.quiet_n > 0U) ? GW : EST_PARTIAL_SHARE;
+        est_correlation_follow(correlation, scale->product, mean, self->noise_variance, share);
+    } else {
+        // the block has no products
+    }
+}
+
 /// Update the scale after a block. A block that ends with a large statistic may contain a change and is discarded.
-/// Two steps, so that none is long.
+/// Three steps, so that none is long.
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    if (!scale->followed) {
+    if (scale->stage < EST_STAGES) {
         if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
-            const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
-            self->noise_variance =
-                est_scale_follow(scale, self->noise_variance, EST_NOISE_LEAST * self->config->noise_variance,
-                                 warm ? EST_SHARE_MIN : EST_SHARE_WARM);
+            follow_block(self);
         }
-        scale->followed = true;
+        scale->stage++;
     } else {
         find_hidden_change(self);
         est_scale_relax(scale);
+        est_correlation_restart(&self->correlation);
         est_scale_restart(scale, self->noise_variance);
     }
 }
@@ -723,6 +750,35 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     self->y[0] -= innovation;
 }
 
+/// Enter the innovation into the products of this block and the second reading. The statistic becomes the smaller one
+/// of both readings. `before`: the statistic so far; `weight` and `precision`: see est_correlation_enter().
+EST_INLINE void read_again(est_t* const                self,
+                           const est_equation_t* const equation,
+                           const float                 before,
+                           const float                 weight,
+                           const float                 precision) {
+#if EST_WITH_ROBUSTNESS
+    est_correlation_t* const correlation = &self->correlation;
+    if (correlation->work == 0U) {
+        return;  // MISRA D4
+    }
+    if (est_correlation_reads(correlation)) {
+        self->trigger.statistic =
+            est_correlation_read(correlation, equation->innovation, before, weight, precision);
+    }
+    if (self->scale.left_n > 0U) {
+        self->scale.product += precision * est_correlation_product(correlation, equation->innovation);
+    }
+    est_correlation_remember(correlation, equation->innovation);
+#else
+    (void)self;
+    (void)equation;
+    (void)before;
+    (void)weight;
+    (void)precision;
+#endif
+}
+
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     est_equation_t            equation;
@@ -755,9 +811,11 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     const float weight = precision * weight_of(self);
     const float term   = est_trigger_term(equation.innovation, weight);
     const float share  = held ? 0.0F : 1.0F;  // a theta that overflows raises an alarm all the same
+    const float before = self->trigger.statistic;
     est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, self->noise_variance / precision,
                       share * term, held);
     step->innovation      = equation.innovation;
+    read_again(self, &equation, before, share * weight, precision);
     step->statistic       = self->trigger.statistic;
     est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
@@ -897,7 +955,7 @@ float est_noise_variance(const est_t* const self) {
 float est_scale(const est_t* const self) {
     EST_ASSERT(self != NULL);
 #if EST_WITH_ROBUSTNESS
-    return self->noise_variance * self->scale.inflation;
+    return self->noise_variance * est_scale_factor(&self->scale);
 #else
     return self->noise_variance;
 #endif

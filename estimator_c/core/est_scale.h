@@ -13,6 +13,10 @@
 /// was before the change.
 #define EST_BLOCK_N 32U
 
+/// Stages of the update after a block before the next one begins: what follows it, the correlation of the innovations
+/// first, then the noise variance.
+#define EST_STAGES 2U
+
 /// Smallest share of a new block in the noise variance: a memory of 1,000 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
 #define EST_SHARE_MIN 0.032F
@@ -27,6 +31,12 @@
 
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
 #define EST_MARGIN 2.0F
+
+/// Dispersion of the blocks, mean of their squared mean squares in noise variances, beyond which the scale grows, and
+/// factor. That of Gaussian innovations is 1.06; noise whose variance varies has more. Largest value of one block.
+#define EST_DISPERSED 1.15F
+#define EST_DISPERSION_GAIN 2.0F
+#define EST_DISPERSION_MAX 10.0F
 
 /// Smallest noise variance that is followed, in configured ones: quantisation alone, with the default. The innovations of
 /// a plant without noise come in bursts.
@@ -70,19 +80,36 @@
 
 #if EST_WITH_ROBUSTNESS
 
+/// Factor of the noise variance in the scale.
+EST_SHARED float est_scale_factor(const est_scale_t* const self) {
+    return self->inflation * (1.0F + (EST_DISPERSION_GAIN * est_max(self->dispersion - EST_DISPERSED, 0.0F)));
+}
+
 /// Begin a block. The scale determines the weight of a squared innovation in the cumulative sum.
 EST_SHARED void est_scale_restart(est_scale_t* const self, const float noise_variance) {
-    self->weight   = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
+    self->weight   = EST_CUSUM_GAIN / (noise_variance * est_scale_factor(self) * (1.0F + (EST_MARGIN * self->share)));
     self->sum      = 0.0F;
+    self->product  = 0.0F;
     self->left_n   = EST_BLOCK_N;
-    self->followed = false;
+    self->stage    = 0U;
 }
 
 static inline void est_scale_init(est_scale_t* const self, const est_config_t* const config) {
-    self->inflation = 1.0F;
-    self->share     = config->noise_estimated ? 1.0F : 0.0F;
+    self->inflation  = 1.0F;
+    self->dispersion = 1.0F;
+    self->share      = config->noise_estimated ? 1.0F : 0.0F;
     self->credit    = EST_CREDIT_MAX;
     est_scale_restart(self, config->noise_variance);
+}
+
+/// Begin anew with another model of the edges: the innovations so far are those of the wrong one.
+static inline void est_scale_forgive(est_scale_t* const self, const float noise_variance) {
+    self->inflation  = 1.0F;
+    self->dispersion = 1.0F;
+    if (self->share > 0.0F) {
+        self->share = EST_SHARE_WARM;
+    }
+    est_scale_restart(self, noise_variance);
 }
 
 /// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
@@ -95,10 +122,20 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
     return true;
 }
 
-/// Noise variance after a complete block, at least `least`. `share_least`: smallest share of the next block.
-static inline float
-est_scale_follow(est_scale_t* const self, const float noise_variance, const float least, const float share_least) {
-    const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
+/// Mean square of the innovations of a complete block.
+static inline float est_scale_mean(const est_scale_t* const self) { return (self->sum * EST_MEAN_SQUARE) / self->weight; }
+
+/// Noise variance after a complete block with this mean square, at least `least`. `share_least`: smallest share of the
+/// next block. `smooth`: the squares have no peaks, and their dispersion counts as that of noise.
+static inline float est_scale_follow(est_scale_t* const self,
+                                     const float        mean,
+                                     const float        noise_variance,
+                                     const float        least,
+                                     const float        share_least,
+                                     const bool         smooth) {
+    const float ratio   = mean / noise_variance;
+    const float square  = est_min(ratio * ratio, EST_DISPERSION_MAX);
+    self->dispersion    = smooth ? 1.0F : (self->dispersion + (self->share * (square - self->dispersion)));
     const float limited = est_min(mean, EST_GROWTH_MAX * noise_variance);
     const float noise   = noise_variance + (self->share * (limited - noise_variance));
     self->share         = est_max(self->share / (1.0F + self->share), share_least);
