@@ -44,7 +44,12 @@
 #define BRIDGED_MAX 8U
 #define BRIDGE_PRECISION 0.6F
 
-EST_SHARED void increment_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
+EST_SHARED void increment_long(uint32_t* const counter) {
+    const uint32_t next = *counter + (uint32_t)1U;
+    if (next > 0U) {
+        *counter = next;
+    }
+}
 
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
@@ -302,10 +307,15 @@ static float last_innovation(const est_t* const self) {
 }
 #endif
 
+/// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
+EST_SHARED bool other_reading_leads(const est_t* const self) {
+    return (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger);
+}
+
 /// Enter an edge into the doubt. It joins the doubt about earlier edges if another reading of these leads; otherwise it
 /// begins a new doubt.
 static void doubt_edge(est_t* const self) {
-    if ((self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+    if (other_reading_leads(self)) {
         return;  // MISRA D4
     }
     const float step = self->u[0] - self->u[1];
@@ -451,18 +461,15 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
 
 /// Enter the innovation under the other readings of the edges in doubt. They are compared with theta before the doubt,
 /// because the estimate has followed the recorded reading since.
-EST_INLINE est_finding_t judge_readings(est_t* const                self,
-                                        const est_shape_t           shape,
-                                        const est_equation_t* const equation,
-                                        const float                 weight) {
+EST_INLINE void
+judge_readings(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float weight) {
     const bool  same = !EST_FOR_SIZE && (self->doubt_n <= 1U);  // theta has not changed yet
     const float e =
         same ? equation->innovation : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     float share[EST_OTHER_READINGS];
     est_edges_shares(self, shape, share);
-    watch_edges(self, e, share[0] - share[1]);
-    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e, share, weight,
-                                     self->doubt_n >= EST_DOUBT_N);
+    watch_edges(self, e, share[0] + share[1]);
+    est_trigger_enter_readings(&self->trigger, e, share, weight);
 }
 
 /// Store the residual of an equation after its update: it replaces e in the next equations (thesis section 3.5).
@@ -513,7 +520,7 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
 /// reading of the edges leads, because theta may have followed an edge that was misread. A doubt alone does not suspend
 /// it: with edges in quick succession it never ends.
 EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
-    if (EST_WITH_EDGES && (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+    if (EST_WITH_EDGES && other_reading_leads(self)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self, shape);
@@ -725,7 +732,8 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
-    est_equation_t            equation;
+    float                     x[EST_THETA_MAX + 2U];  // the last one is spare: gcc warns of an access that never is
+    est_equation_t            equation = { .x = x };
     float                     weight_min;
     if (self->settled) {
         equation.variance = 1.0F;
@@ -757,12 +765,12 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     const float share  = held ? 0.0F : 1.0F;  // a theta that overflows raises an alarm all the same
     est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, self->noise_variance / precision,
                       share * term, held);
-    step->innovation      = equation.innovation;
-    step->statistic       = self->trigger.statistic;
-    est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
+    step->innovation = equation.innovation;
+    step->statistic  = self->trigger.statistic;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        finding = judge_readings(self, shape, &equation, share * weight);
+        judge_readings(self, shape, &equation, share * weight);
     }
+    const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->doubt_n);
     if (finding == EST_ALARM) {
         raise_alarm(self, step);
         return;  // MISRA D4
