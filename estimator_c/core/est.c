@@ -138,7 +138,7 @@ static void follow_slip(est_t* const self, const bool late) {
         *append(b, &b[1], last) = 0.0F;
     }
     est_delta_from_plain(b, last);
-    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
+    est_factors_inflate(self, SLIP_DOUBT);
 }
 
 /// Compute theta in the plain form of est.h, after the first coefficient of A.
@@ -185,7 +185,7 @@ EST_SHARED void refresh_prefilter(est_t* const self, const est_shape_t shape) {
 /// Complete the work that the last step left.
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
-        est_factors_reset(&self->factors, self->config);
+        est_factors_reset(self);
         if (EST_WITH_ADAPTATION) {
             self->refresh_in = self->config->refresh_n;
         }
@@ -565,7 +565,7 @@ static void raise_alarm(est_t* const self, est_step_t* const step) {
     if (overflown) {
         step->statistic = FLT_MAX;
         if (EST_WITH_ADAPTATION) {  // P may have overflowed with the residuals in its regressors
-            est_factors_reset(&self->factors, self->config);
+            est_factors_reset(self);
         }
     }
     self->renewal = EST_RENEWAL_RESET;
@@ -619,7 +619,7 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
 /// Let every parameter become less certain: the random walk of the configuration.
 static void walk(est_t* const self) {
     est_factors_walk(&self->factors, self->config->random_walk, est_theta_count(self));
-    est_factors_inflate(&self->factors, self->config, 1.0F);
+    est_factors_inflate(self, 1.0F);
 }
 
 /// Weight of a squared innovation of unit precision in the cumulative sum.
@@ -708,7 +708,7 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
         if (EST_FOR_SIZE) {
-            est_factors_inflate(&self->factors, self->config, 1.0F);
+            est_factors_inflate(self, 1.0F);
         } else {
             est_factors_scale(&self->factors, self->config, shape, 1.0F);
         }
@@ -828,7 +828,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);
     forget_samples(self);
-    est_factors_reset(&self->factors, config);
+    est_factors_reset(self);
     self->trigger.quiet_n = config->trigger.warm_up_n;
     return true;
 }

@@ -37,17 +37,17 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
 }
 
 /// est_factors_scale() with the shape of the configuration.
-EST_SHARED void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
-    est_factors_scale(self, config, est_shape_of(config), factor);
+EST_SHARED void est_factors_inflate(est_t* const self, const float factor) {
+    est_factors_scale(&self->factors, self->config, est_shape_of(self->config), factor);
 }
 
-static inline void est_factors_reset(est_factors_t* const self, const est_config_t* const config) {
-    self->weight = 1.0F;
+static inline void est_factors_reset(est_t* const self) {
+    self->factors.weight = 1.0F;
     for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
-        self->d[j] = EST_VARIANCE_MAX;
+        self->factors.d[j] = EST_VARIANCE_MAX;
     }
-    clear(self->upper, EST_UPPER_N);
-    est_factors_inflate(self, config, 1.0F);  // limits each d to its prior
+    clear(self->factors.upper, EST_UPPER_N);
+    est_factors_inflate(self, 1.0F);  // limits each d to its prior
 }
 
 /// P := P + variance e e' with e the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.
