@@ -450,7 +450,7 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
         if (self->scale.share > 0.0F) {
             self->scale.share = EST_SHARE_WARM;
         }
-        est_scale_restart(&self->scale, self->noise_variance);
+        est_scale_restart(self);
     }
 #else
     (void)self;
@@ -541,7 +541,7 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 static void put_on_trial(est_t* const self, const bool overflown) {
 #if EST_WITH_ROBUSTNESS
     if (self->scale.trial_n > 0U) {
-        est_scale_conclude(&self->scale, self->noise_variance);
+        est_scale_conclude(self);
     }
     if (!overflown && self->cusum) {
         est_scale_begin_trial(&self->scale);
@@ -662,7 +662,7 @@ static void renew_scale(est_t* const self) {
     } else {
         find_hidden_change(self);
         est_scale_relax(scale);
-        est_scale_restart(scale, self->noise_variance);
+        est_scale_restart(self);
     }
 }
 
@@ -672,7 +672,7 @@ try_alarm(est_t* const self, const est_shape_t shape, const est_equation_t* cons
     const float old = est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     const float e   = equation->innovation;
     if (!est_scale_try(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
-        est_scale_conclude(&self->scale, self->noise_variance);
+        est_scale_conclude(self);
     }
 }
 #endif
@@ -823,7 +823,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     self->noise_variance = config->noise_variance;
 #if EST_WITH_ROBUSTNESS
     self->cusum = config->trigger.kind == EST_TRIGGER_CUSUM;
-    est_scale_init(&self->scale, config);
+    est_scale_init(self);
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);

@@ -71,18 +71,20 @@
 #if EST_WITH_ROBUSTNESS
 
 /// Begin a block. The scale determines the weight of a squared innovation in the cumulative sum.
-EST_SHARED void est_scale_restart(est_scale_t* const self, const float noise_variance) {
-    self->weight   = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
-    self->sum      = 0.0F;
-    self->left_n   = EST_BLOCK_N;
+EST_SHARED void est_scale_restart(est_t* const estimator) {
+    est_scale_t* const self = &estimator->scale;
+    self->weight = EST_CUSUM_GAIN / (estimator->noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
+    self->sum    = 0.0F;
+    self->left_n = EST_BLOCK_N;
     self->followed = false;
 }
 
-static inline void est_scale_init(est_scale_t* const self, const est_config_t* const config) {
-    self->inflation = 1.0F;
-    self->share     = config->noise_estimated ? 1.0F : 0.0F;
-    self->credit    = EST_CREDIT_MAX;
-    est_scale_restart(self, config->noise_variance);
+static inline void est_scale_init(est_t* const estimator) {
+    est_scale_t* const self = &estimator->scale;
+    self->inflation         = 1.0F;
+    self->share             = estimator->config->noise_estimated ? 1.0F : 0.0F;
+    self->credit            = EST_CREDIT_MAX;
+    est_scale_restart(estimator);
 }
 
 /// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
@@ -131,9 +133,10 @@ static inline void est_scale_begin_trial(est_scale_t* const self) {
 }
 
 /// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
-EST_SHARED void est_scale_conclude(est_scale_t* const self, const float noise_variance) {
-    const bool  justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
-    const float cost      = ((self->sum * self->weight) > EST_PLAIN) ? 0.0F : 1.0F;
+EST_SHARED void est_scale_conclude(est_t* const estimator) {
+    est_scale_t* const self      = &estimator->scale;
+    const bool         justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
+    const float        cost      = ((self->sum * self->weight) > EST_PLAIN) ? 0.0F : 1.0F;
     if (justified && (self->credit >= cost)) {
         self->credit -= cost;
     } else if (self->inflation < EST_INFLATION_MAX) {
@@ -142,7 +145,7 @@ EST_SHARED void est_scale_conclude(est_scale_t* const self, const float noise_va
         // the scale is large enough
     }
     self->trial_n = 0U;
-    est_scale_restart(self, noise_variance);
+    est_scale_restart(estimator);
 }
 
 /// Enter one equation into the trial of an alarm: the squared errors of the old and the new estimate, the latter
