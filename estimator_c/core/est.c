@@ -894,7 +894,8 @@ float est_variance(const est_t* const self, const uint8_t index) {
         factor[shape.na + shape.nb] -= self->reference_u;
     }
 #endif
-    return est_factors_variance(&self->factors, est_shape_count(shape), &factor[1]);
+    const uint_fast8_t count = EST_FOR_SIZE ? EST_THETA_MAX : est_shape_count(shape);  // the rest is zero
+    return est_factors_variance(&self->factors, count, &factor[1]);
 }
 
 float est_noise_variance(const est_t* const self) {
@@ -926,10 +927,10 @@ bool est_invariants_hold(const est_t* const self) {
         return false;  // MISRA D4
     }
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
-        if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !(est_magnitude(self->theta[i]) <= FLT_MAX)) {
+        if (!(est_magnitude(self->theta[i]) <= FLT_MAX) || !within(self->factors.d[i], FLT_MIN, FLT_MAX)) {
             return false;  // MISRA D4
         }
     }
-    return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) &&
-           within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, FLT_MIN, FLT_MAX);
+    return within(self->noise_variance, FLT_MIN, FLT_MAX) && within(self->trigger.statistic, 0.0F, FLT_MAX) &&
+           within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F);
 }

@@ -60,7 +60,7 @@ static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
 /// was a slip: the recorded reading has passed the ceiling, and another reading explained the innovations. Otherwise
 /// the statistic continues from the best reading. At its term, by contrast, a doubt has seen the whole effect of an
 /// edge, and the recorded reading continues.
-EST_ROBUST_SHARED bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
+static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
         return true;  // MISRA D4
     }
@@ -98,7 +98,7 @@ EST_INLINE float est_trigger_term(const float innovation, const float weight) {
 /// Add one term to a cumulative sum.
 EST_SHARED float est_trigger_sum(const float before, const float term) {
     const float sum = before + (term - EST_CUSUM_DRIFT);
-    return (sum <= 0.0F) ? 0.0F : sum;
+    return est_max(0.0F, sum);
 }
 
 /// Enter the innovation under the other readings of the edges in doubt. `share`: as from est_edges_shares().
