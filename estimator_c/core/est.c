@@ -143,10 +143,10 @@ static void follow_slip(est_t* const self, const bool late) {
 
 /// Compute theta in the plain form of est.h, after the first coefficient of A.
 EST_SHARED void compute_plain(const est_t* const self, const est_shape_t given, float* const plain) {
+    plain[0] = 1.0F;
+    (void)append(&plain[1], self->theta, EST_THETA_MAX);
     const est_shape_t shape = est_shape_here(self->config, given);
     float* const      b     = &plain[shape.na + 1U];
-    plain[0]                = 1.0F;
-    (void)append(&plain[1], self->theta, EST_THETA_MAX);
 #if EST_WITH_ROBUSTNESS
     if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
         b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
@@ -232,7 +232,7 @@ EST_SHARED void forget_samples(est_t* const self) {
 }
 
 /// Set theta to zero.
-static void clear_theta(est_t* const self) {
+EST_SHARED void clear_theta(est_t* const self) {
     clear(self->theta, EST_THETA_MAX);
     if (est_delta_applies(self)) {
         self->theta[0] = 1.0F;  // the first coefficient of A, which is no parameter

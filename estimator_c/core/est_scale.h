@@ -82,8 +82,10 @@ EST_SHARED void est_scale_restart(est_t* const estimator) {
 static inline void est_scale_init(est_t* const estimator) {
     est_scale_t* const self = &estimator->scale;
     self->inflation         = 1.0F;
-    self->share             = estimator->config->noise_estimated ? 1.0F : 0.0F;
-    self->credit            = EST_CREDIT_MAX;
+    if (estimator->config->noise_estimated) {
+        self->share = 1.0F;
+    }
+    self->credit = EST_CREDIT_MAX;
     est_scale_restart(estimator);
 }
 
@@ -136,9 +138,10 @@ static inline void est_scale_begin_trial(est_scale_t* const self) {
 EST_SHARED void est_scale_conclude(est_t* const estimator) {
     est_scale_t* const self      = &estimator->scale;
     const bool         justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
-    const float        cost      = ((self->sum * self->weight) > EST_PLAIN) ? 0.0F : 1.0F;
-    if (justified && (self->credit >= cost)) {
-        self->credit -= cost;
+    if (justified && ((self->sum * self->weight) > EST_PLAIN)) {
+        // a plain one costs no credit
+    } else if (justified && (self->credit >= 1.0F)) {
+        self->credit -= 1.0F;
     } else if (self->inflation < EST_INFLATION_MAX) {
         self->inflation *= EST_INFLATION_STEP;
     } else {
