@@ -45,7 +45,12 @@
 #define BRIDGED_MAX 8U
 #define BRIDGE_PRECISION 0.6F
 
-EST_SHARED void increment_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
+EST_SHARED void increment_long(uint32_t* const counter) {
+    const uint32_t next = *counter + (uint32_t)1U;
+    if (next > 0U) {
+        *counter = next;
+    }
+}
 
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
@@ -134,15 +139,15 @@ static void follow_slip(est_t* const self, const bool late) {
         *append(b, &b[1], last) = 0.0F;
     }
     est_delta_from_plain(b, last);
-    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
+    est_factors_inflate(self, SLIP_DOUBT);
 }
 
 /// Compute theta in the plain form of est.h, after the first coefficient of A.
 EST_SHARED void compute_plain(const est_t* const self, const est_shape_t given, float* const plain) {
+    plain[0] = 1.0F;
+    (void)append(&plain[1], self->theta, EST_THETA_MAX);
     const est_shape_t shape = est_shape_here(self->config, given);
     float* const      b     = &plain[shape.na + 1U];
-    plain[0]                = 1.0F;
-    (void)append(&plain[1], self->theta, EST_THETA_MAX);
 #if EST_WITH_ROBUSTNESS
     if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
         b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
@@ -181,7 +186,7 @@ EST_SHARED void refresh_prefilter(est_t* const self, const est_shape_t shape) {
 /// Complete the work that the last step left.
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
-        est_factors_reset(&self->factors, self->config);
+        est_factors_reset(self);
         if (EST_WITH_ADAPTATION) {
             self->refresh_in = self->config->refresh_n;
         }
@@ -238,7 +243,7 @@ EST_SHARED void forget_samples(est_t* const self) {
 }
 
 /// Set theta to zero.
-static void clear_theta(est_t* const self) {
+EST_SHARED void clear_theta(est_t* const self) {
     clear(self->theta, EST_THETA_MAX);
     if (est_delta_applies(self)) {
         self->theta[0] = 1.0F;  // the first coefficient of A, which is no parameter
@@ -313,10 +318,15 @@ static float last_innovation(const est_t* const self) {
 }
 #endif
 
+/// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
+EST_SHARED bool other_reading_leads(const est_t* const self) {
+    return (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger);
+}
+
 /// Enter an edge into the doubt. It joins the doubt about earlier edges if another reading of these leads; otherwise it
 /// begins a new doubt.
 static void doubt_edge(est_t* const self) {
-    if ((self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+    if (other_reading_leads(self)) {
         return;  // MISRA D4
     }
     const float step = self->u[0] - self->u[1];
@@ -448,7 +458,7 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
     if ((self->doubt_n >= EST_DOUBT_N) && est_edges_displaced(&self->edges)) {
         self->edges_vary  = true;
         self->correlation = (est_correlation_t){ .work = 0U };
-        est_scale_forgive(&self->scale, self->noise_variance);
+        est_scale_forgive(self);
     }
 #else
     (void)self;
@@ -459,18 +469,15 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
 
 /// Enter the innovation under the other readings of the edges in doubt. They are compared with theta before the doubt,
 /// because the estimate has followed the recorded reading since.
-EST_INLINE est_finding_t judge_readings(est_t* const                self,
-                                        const est_shape_t           shape,
-                                        const est_equation_t* const equation,
-                                        const float                 weight) {
+EST_INLINE void
+judge_readings(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float weight) {
     const bool  same = !EST_FOR_SIZE && (self->doubt_n <= 1U);  // theta has not changed yet
     const float e =
         same ? equation->innovation : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     float share[EST_OTHER_READINGS];
     est_edges_shares(self, shape, share);
-    watch_edges(self, e, share[0] - share[1]);
-    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e, share, weight,
-                                     self->doubt_n >= EST_DOUBT_N);
+    watch_edges(self, e, share[0] + share[1]);
+    est_trigger_enter_readings(&self->trigger, e, share, weight);
 }
 
 /// Store the residual of an equation after its update: it replaces e in the next equations (thesis section 3.5).
@@ -521,7 +528,7 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
 /// reading of the edges leads, because theta may have followed an edge that was misread. A doubt alone does not suspend
 /// it: with edges in quick succession it never ends.
 EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
-    if (EST_WITH_EDGES && (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+    if (EST_WITH_EDGES && other_reading_leads(self)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self, shape);
@@ -542,7 +549,7 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 static void put_on_trial(est_t* const self, const bool overflown) {
 #if EST_WITH_ROBUSTNESS
     if (self->scale.trial_n > 0U) {
-        est_scale_conclude(&self->scale, self->noise_variance);
+        est_scale_conclude(self);
     }
     if (!overflown && self->cusum) {
         est_scale_begin_trial(&self->scale);
@@ -566,7 +573,7 @@ static void raise_alarm(est_t* const self, est_step_t* const step) {
     if (overflown) {
         step->statistic = FLT_MAX;
         if (EST_WITH_ADAPTATION) {  // P may have overflowed with the residuals in its regressors
-            est_factors_reset(&self->factors, self->config);
+            est_factors_reset(self);
         }
     }
     self->renewal = EST_RENEWAL_RESET;
@@ -620,7 +627,7 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
 /// Let every parameter become less certain: the random walk of the configuration.
 static void walk(est_t* const self) {
     est_factors_walk(&self->factors, self->config->random_walk, est_theta_count(self));
-    est_factors_inflate(&self->factors, self->config, 1.0F);
+    est_factors_inflate(self, 1.0F);
 }
 
 /// Weight of a squared innovation of unit precision in the cumulative sum.
@@ -648,42 +655,45 @@ static void find_hidden_change(est_t* const self) {
     }
 }
 
-/// Let the noise variance and the correlation of the innovations follow a complete block.
-static void follow_block(est_t* const self) {
-    est_scale_t* const       scale       = &self->scale;
-    est_correlation_t* const correlation = &self->correlation;
-    const float              mean        = est_scale_mean(scale);
-    if (scale->stage > 0U) {
-        const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
-        self->noise_variance =
-            est_scale_follow(scale, mean, self->noise_variance, EST_NOISE_LEAST * self->config->noise_variance,
-                             warm ? EST_SHARE_MIN : EST_SHARE_WARM, est_correlation_smooth(correlation));
-    } else if (self->cusum && (correlation->work > 0U)) {
-    #ifndef GW
-#define GW EST_SHARE_WARM
-#endif
-        const float share = (self->trigger.quiet_n > 0U) ? GW : EST_PARTIAL_SHARE;
-        est_correlation_follow(correlation, scale->product, mean, self->noise_variance, share);
-    } else {
-        // the block has no products
+/// Let the correlation of the innovations follow a complete block.
+static void follow_correlation(est_t* const self) {
+    if (self->cusum && (self->correlation.work > 0U)) {
+        const float share = (self->trigger.quiet_n > 0U) ? EST_PARTIAL_WARM : EST_PARTIAL_SHARE;
+        est_correlation_follow(&self->correlation, &self->scale, self->noise_variance, share);
     }
 }
 
+/// Let the noise variance follow a complete block.
+static void follow_noise(est_t* const self) {
+    const est_scale_t* const scale = &self->scale;
+    const bool               warm  = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
+    est_scale_follow(self, warm ? EST_SHARE_MIN : EST_SHARE_WARM, est_correlation_smooth(&self->correlation));
+}
+
 /// Update the scale after a block. A block that ends with a large statistic may contain a change and is discarded.
-/// Three steps, so that none is long.
+/// Several steps, so that none is long.
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    if (scale->stage < EST_STAGES) {
-        if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
-            follow_block(self);
+    const bool counts = (scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling));
+    if (scale->stage == EST_STAGE_CORRELATION) {
+        if (counts) {
+            follow_correlation(self);
         }
-        scale->stage++;
-    } else {
+    } else if (scale->stage == EST_STAGE_NOISE) {
+        if (counts) {
+            follow_noise(self);
+        }
+    } else if (scale->stage == EST_STAGE_CHANGE) {
         find_hidden_change(self);
+        if (self->cusum) {
+            est_correlation_restart(&self->correlation);
+        }
+    } else {
         est_scale_relax(scale);
-        est_correlation_restart(&self->correlation);
-        est_scale_restart(scale, self->noise_variance);
+        est_scale_restart(self);
+        return;  // MISRA D4
     }
+    scale->stage++;
 }
 
 /// Continue the trial of the last alarm by one equation.
@@ -692,7 +702,7 @@ try_alarm(est_t* const self, const est_shape_t shape, const est_equation_t* cons
     const float old = est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     const float e   = equation->innovation;
     if (!est_scale_try(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
-        est_scale_conclude(&self->scale, self->noise_variance);
+        est_scale_conclude(self);
     }
 }
 #endif
@@ -728,7 +738,7 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
         if (EST_FOR_SIZE) {
-            est_factors_inflate(&self->factors, self->config, 1.0F);
+            est_factors_inflate(self, 1.0F);
         } else {
             est_factors_scale(&self->factors, self->config, shape, 1.0F);
         }
@@ -750,38 +760,31 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     self->y[0] -= innovation;
 }
 
-/// Enter the innovation into the products of this block and the second reading. The statistic becomes the smaller one
-/// of both readings. `before`: the statistic so far; `weight` and `precision`: see est_correlation_enter().
-EST_INLINE void read_again(est_t* const                self,
-                           const est_equation_t* const equation,
-                           const float                 before,
-                           const float                 weight,
-                           const float                 precision) {
+/// Enter an innovation into the statistic. `term`: of the cumulative sum, `weight`: of a squared innovation in it, both
+/// 0 while the trigger is held; `precision`: reciprocal of its variance [1 / noise variance].
+EST_INLINE void enter_innovation(
+    est_t* const self, const float e, const float term, const float weight, const float precision, const bool held) {
+    float entered = term;
 #if EST_WITH_ROBUSTNESS
     est_correlation_t* const correlation = &self->correlation;
     if (correlation->work == 0U) {
-        return;  // MISRA D4
+        self->trigger.statistic = est_trigger_sum(self->trigger.statistic, term);
+        return;  // the usual step; MISRA D4
     }
-    if (est_correlation_reads(correlation)) {
-        self->trigger.statistic =
-            est_correlation_read(correlation, equation->innovation, before, weight, precision);
+    if (correlation->work != EST_WORK_OTHER_TRIGGER) {
+        self->scale.product += precision * est_correlation_product(correlation, e);
+        entered = est_correlation_read(correlation, e, self->trigger.statistic, term, weight, precision);
     }
-    if (self->scale.left_n > 0U) {
-        self->scale.product += precision * est_correlation_product(correlation, equation->innovation);
-    }
-    est_correlation_remember(correlation, equation->innovation);
 #else
-    (void)self;
-    (void)equation;
-    (void)before;
     (void)weight;
-    (void)precision;
 #endif
+    est_trigger_enter(&self->trigger, &self->config->trigger, e, self->noise_variance / precision, entered, held);
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
-    est_equation_t            equation;
+    float                     x[EST_THETA_MAX + 2U];  // the last one is spare: gcc warns of an access that never is
+    est_equation_t            equation = { .x = x };
     float                     weight_min;
     if (self->settled) {
         equation.variance = 1.0F;
@@ -811,16 +814,13 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     const float weight = precision * weight_of(self);
     const float term   = est_trigger_term(equation.innovation, weight);
     const float share  = held ? 0.0F : 1.0F;  // a theta that overflows raises an alarm all the same
-    const float before = self->trigger.statistic;
-    est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, self->noise_variance / precision,
-                      share * term, held);
-    step->innovation      = equation.innovation;
-    read_again(self, &equation, before, share * weight, precision);
-    step->statistic       = self->trigger.statistic;
-    est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
+    enter_innovation(self, equation.innovation, share * term, share * weight, precision, held);
+    step->innovation = equation.innovation;
+    step->statistic  = self->trigger.statistic;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        finding = judge_readings(self, shape, &equation, share * weight);
+        judge_readings(self, shape, &equation, share * weight);
     }
+    const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->doubt_n);
     if (finding == EST_ALARM) {
         raise_alarm(self, step);
         return;  // MISRA D4
@@ -873,12 +873,15 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     self->noise_variance = config->noise_variance;
 #if EST_WITH_ROBUSTNESS
     self->cusum = config->trigger.kind == EST_TRIGGER_CUSUM;
-    est_scale_init(&self->scale, config);
+    est_scale_init(self);
+    if (!self->cusum) {
+        self->correlation.work = EST_WORK_OTHER_TRIGGER;
+    }
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);
     forget_samples(self);
-    est_factors_reset(&self->factors, config);
+    est_factors_reset(self);
     self->trigger.quiet_n = config->trigger.warm_up_n;
     return true;
 }
@@ -944,7 +947,8 @@ float est_variance(const est_t* const self, const uint8_t index) {
         factor[shape.na + shape.nb] -= self->reference_u;
     }
 #endif
-    return est_factors_variance(&self->factors, est_shape_count(shape), &factor[1]);
+    const uint_fast8_t count = EST_FOR_SIZE ? EST_THETA_MAX : est_shape_count(shape);  // the rest is zero
+    return est_factors_variance(&self->factors, count, &factor[1]);
 }
 
 float est_noise_variance(const est_t* const self) {
@@ -976,10 +980,10 @@ bool est_invariants_hold(const est_t* const self) {
         return false;  // MISRA D4
     }
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
-        if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !(est_magnitude(self->theta[i]) <= FLT_MAX)) {
+        if (!(est_magnitude(self->theta[i]) <= FLT_MAX) || !within(self->factors.d[i], FLT_MIN, FLT_MAX)) {
             return false;  // MISRA D4
         }
     }
-    return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) &&
-           within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, FLT_MIN, FLT_MAX);
+    return within(self->noise_variance, FLT_MIN, FLT_MAX) && within(self->trigger.statistic, 0.0F, FLT_MAX) &&
+           within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F);
 }

@@ -437,19 +437,19 @@ typedef enum {
 /// below 128 bytes fits a short Thumb instruction.
 typedef struct {
     const est_config_t* config;
-    uint8_t             same_n;     ///< samples of constant y since an edge of u
-    uint8_t             pending_n;  ///< samples needed before the next equation is complete
-    est_renewal_t       renewal;    ///< work left by the last step
-    bool                known;      ///< the previous sample is known; if not, pending_n > 0
-    bool                settled;    ///< the gains of the whitener are c, and its variance is 1
-    uint8_t             doubt_n;    ///< samples since the first edge in doubt, inclusive; 0: no doubt
+    uint16_t            edge_age_n;  ///< samples since the last edge of u
+    uint8_t             same_n;      ///< samples of constant y since an edge of u
+    uint8_t             pending_n;   ///< samples needed before the next equation is complete
+    est_renewal_t       renewal;     ///< work left by the last step
+    bool                known;       ///< the previous sample is known; if not, pending_n > 0
+    bool                settled;     ///< the gains of the whitener are c, and its variance is 1
+    uint8_t             doubt_n;     ///< samples since the first edge in doubt, inclusive; 0: no doubt
 #if EST_WITH_ROBUSTNESS
     bool    cusum;       ///< the trigger is the cumulative sum
     bool    edges_vary;  ///< edges come anywhere, against the configuration
     uint8_t bridged_n;   ///< samples before the next one that were predicted
 #endif
     uint16_t refresh_in;  ///< equations until C is compared with A; 0: never
-    uint16_t edge_age_n;  ///< samples since the last edge of u
 #if EST_WITH_ROBUSTNESS
     est_scale_t       scale;
     est_correlation_t correlation;

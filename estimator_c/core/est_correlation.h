@@ -11,16 +11,15 @@
 
 /// Sum of the squared partial correlations from which on the innovations have a second reading. That of white
 /// innovations is 0.002 on average.
-#define EST_CORRELATED 0.018F
+#define EST_CORRELATED 0.012F
 
 /// Squared correlation beyond which they have none. Such innovations are the slow residual of a poor model: their
 /// squares have no peaks, while what an autoregression leaves of them has.
 #define EST_SMOOTH 0.77F
 
-/// Share of a block in a partial correlation; before the trigger is armed it is EST_SHARE_WARM.
-#ifndef EST_PARTIAL_SHARE
-#define EST_PARTIAL_SHARE 0.05F
-#endif
+/// Share of a block in a partial correlation, before the trigger is armed and later.
+#define EST_PARTIAL_WARM 0.5F
+#define EST_PARTIAL_SHARE 0.04F
 
 /// Energy of the innovations, over the measured one, to which their products are related: noise of the estimate would
 /// otherwise remove part of a change. Largest magnitude of a partial correlation.
@@ -35,14 +34,15 @@
 #define EST_WORK_LAG_1 1U
 #define EST_WORK_LAG_2 2U
 #define EST_WORK_READS 4U
+#define EST_WORK_OTHER_TRIGGER 8U  ///< none, for good: the trigger is not the cumulative sum
 
 /// Blocks from one with products to the next while there is no second reading: most steps are without work.
-#define EST_RESTING_N 3U
+#define EST_RESTING_N 4U
 
 #if EST_WITH_ROBUSTNESS
 
 /// True iff the innovations have a second reading.
-EST_INLINE bool est_correlation_reads(const est_correlation_t* const self) { return self->work >= EST_WORK_READS; }
+EST_INLINE bool est_correlation_reads(const est_correlation_t* const self) { return (self->work & EST_WORK_READS) != 0U; }
 
 /// True iff the innovations are the slow residual of a poor model.
 static inline bool est_correlation_smooth(const est_correlation_t* const self) {
@@ -55,12 +55,6 @@ static inline void est_correlation_forget(est_correlation_t* const self) {
     self->lead = 0.0F;
 }
 
-/// Keep an innovation for the next two.
-EST_INLINE void est_correlation_remember(est_correlation_t* const self, const float e) {
-    self->last[1] = self->last[0];
-    self->last[0] = e;
-}
-
 /// Product of an innovation with an earlier one, at the lag of this block: with that of lag 1, or of what lag 1 leaves
 /// of both.
 static inline float est_correlation_product(const est_correlation_t* const self, const float e) {
@@ -69,34 +63,43 @@ static inline float est_correlation_product(const est_correlation_t* const self,
     return (e - (known * self->last[0])) * (other - (known * self->last[0]));
 }
 
-/// Enter one innovation into both readings. `statistic`: the smaller one of their sums so far. `weight`: of a squared
-/// innovation in the sums; `precision`: reciprocal of its variance [1 / noise variance]. Return the smaller sum.
-static inline float est_correlation_read(
-    est_correlation_t* const self, const float e, const float statistic, const float weight, const float precision) {
+/// Enter one innovation. `statistic`: the smaller sum of the readings so far; `term`: of the first reading; `weight`: of
+/// a squared innovation in the sums; `precision`: reciprocal of its variance [1 / noise variance]. Return the term that
+/// leads to the smaller sum.
+static inline float est_correlation_read(est_correlation_t* const self,
+                                         const float              e,
+                                         const float              statistic,
+                                         const float              term,
+                                         const float              weight,
+                                         const float              precision) {
     const float first    = self->partial[0];
     const float second   = self->partial[1];
     const float forward  = e - (first * self->last[0]);
     const float backward = self->last[1] - (first * self->last[0]);
-    const float left     = (1.0F - (first * first)) * (1.0F - (second * second));  // of the variance
-    const float spread   = 1.0F + (EST_LEVERAGE * (1.0F - precision));
-    const float term     = est_trigger_term(forward - (second * backward), weight / (left * spread));
-    const float one      = est_trigger_sum(statistic + est_max(self->lead, 0.0F), est_trigger_term(e, weight));
-    const float other    = est_trigger_sum(statistic + est_max(-self->lead, 0.0F), term);
-    self->lead           = one - other;
-    return est_min(one, other);
+    self->last[1]        = self->last[0];
+    self->last[0]        = e;
+    if (!est_correlation_reads(self)) {
+        return term;  // MISRA D4
+    }
+    const float left   = (1.0F - (first * first)) * (1.0F - (second * second));  // of the variance
+    const float spread = 1.0F + (EST_LEVERAGE * (1.0F - precision));
+    const float one    = est_trigger_sum(statistic + est_max(self->lead, 0.0F), term);
+    const float other  = est_trigger_sum(statistic + est_max(-self->lead, 0.0F),
+                                         est_trigger_term(forward - (second * backward), weight / (left * spread)));
+    self->lead         = one - other;
+    return (est_min(one, other) - statistic) + EST_CUSUM_DRIFT;
 }
 
-/// Improve the partial correlation of a complete block. `product`: sum of those of its innovations, `mean`: of their
-/// squares, `noise_variance`: expected of it, `share`: of the block in the estimate.
+/// Improve the partial correlation of the lag of a complete block. `share`: of the block in the estimate.
 static inline void est_correlation_follow(est_correlation_t* const self,
-                                          const float              product,
-                                          const float              mean,
+                                          const est_scale_t* const scale,
                                           const float              noise_variance,
                                           const float              share) {
     const bool   second  = (self->work & EST_WORK_LAG_2) != 0U;
     float* const partial = &self->partial[second ? 1U : 0U];
     const float  left    = second ? (1.0F - (self->partial[0] * self->partial[0])) : 1.0F;
-    const float  error   = (product / (float)EST_BLOCK_N) - (EST_PARTIAL_LOAD * left * mean * *partial);
+    const float  mean    = est_scale_mean(scale);
+    const float  error   = (scale->product / (float)EST_BLOCK_N) - (EST_PARTIAL_LOAD * left * mean * *partial);
     const float  next    = *partial + ((share * error) / est_max(mean, noise_variance));
     *partial             = est_max(est_min(next, EST_PARTIAL_MAX), -EST_PARTIAL_MAX);
 }

@@ -66,7 +66,8 @@ est_edges_begin(est_edges_t* const self, const est_config_t* const config, const
 
 /// Compute what early edges, and late edges, would have added to the present equation, whitened. With an early edge u
 /// changes in the sample before it was recorded, with a late one in the sample after. u since the beginning of the
-/// doubt is therefore shifted by one sample against y, including its noise.
+/// doubt is therefore shifted by one sample against y, including its noise. share[0] is that of early edges, share[1]
+/// that of late ones with the opposite sign.
 EST_ROBUST_SHARED void est_edges_shares(est_t* const self, const est_shape_t of, float* const share) {
     const est_shape_t  shape = est_shape_here(self->config, of);
     est_edges_t* const edges = &self->edges;
@@ -87,7 +88,7 @@ EST_ROBUST_SHARED void est_edges_shares(est_t* const self, const est_shape_t of,
                     sum += b[j] * (u[lag - 1U] - u[lag]);
                 }
             }
-            share[reading] = (reading == 0U) ? sum : -sum;
+            share[reading] = sum;
         }
     }
     EST_UNROLL

@@ -11,9 +11,9 @@
 #include "est_whitener.h"
 
 typedef struct {
-    float x[EST_THETA_MAX + 1U];  ///< y(k), followed by the regressor phi in the order of theta
-    float innovation;             ///< prediction error of y(k) [codes]
-    float variance;               ///< variance of the equation's noise [noise variances]
+    float* x;           ///< y(k), followed by the regressor phi in the order of theta
+    float  innovation;  ///< prediction error of y(k) [codes]
+    float  variance;    ///< variance of the equation's noise [noise variances]
 } est_equation_t;
 
 /// Fill x from the stored samples.

@@ -60,7 +60,7 @@ static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
 /// was a slip: the recorded reading has passed the ceiling, and another reading explained the innovations. Otherwise
 /// the statistic continues from the best reading. At its term, by contrast, a doubt has seen the whole effect of an
 /// edge, and the recorded reading continues.
-EST_ROBUST_SHARED bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
+static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
         return true;  // MISRA D4
     }
@@ -98,27 +98,28 @@ EST_INLINE float est_trigger_term(const float innovation, const float weight) {
 /// Add one term to a cumulative sum.
 EST_SHARED float est_trigger_sum(const float before, const float term) {
     const float sum = before + (term - EST_CUSUM_DRIFT);
-    return (sum <= 0.0F) ? 0.0F : sum;
+    return est_max(0.0F, sum);
 }
 
-/// Enter the innovation under the other readings of the edges in doubt; the statistic already contains the recorded
-/// one. The plant has changed only if no reading explains the innovations, or if theta has overflowed. `expires`: the
-/// doubt has reached its term.
-static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
-                                                      const float          ceiling,
-                                                      const float          innovation,
-                                                      const float* const   share,
-                                                      const float          weight,
-                                                      const bool           expires) {
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
-        self->rival[i] = est_trigger_sum(self->rival[i], est_trigger_term(innovation - share[i], weight));
-    }
+/// Enter the innovation under the other readings of the edges in doubt. `share`: as from est_edges_shares().
+static inline void est_trigger_enter_readings(est_trigger_t* const self,
+                                              const float          innovation,
+                                              const float* const   share,
+                                              const float          weight) {
+    self->rival[0] = est_trigger_sum(self->rival[0], est_trigger_term(innovation - share[0], weight));
+    self->rival[1] = est_trigger_sum(self->rival[1], est_trigger_term(innovation + share[1], weight));
+}
+
+/// Judge all readings of the edges, after the innovation was entered into each. The plant has changed only if no reading
+/// explains the innovations, or if theta has overflowed. `doubt_n`: duration of the doubt so far, at most EST_DOUBT_N.
+EST_INLINE est_finding_t est_trigger_find(const est_trigger_t* const self,
+                                          const float                ceiling,
+                                          const uint_fast8_t         doubt_n) {
     if (self->statistic < ceiling) {
         return EST_QUIET;  // MISRA D4
     }
-    if ((est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
-        return expires ? EST_SLIP : EST_QUIET;  // MISRA D4
+    if (EST_WITH_EDGES && (doubt_n > 0U) && (est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
+        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_QUIET;  // MISRA D4
     }
     return EST_ALARM;
 }
