@@ -128,12 +128,12 @@ static inline uint8_t count_past(const est_config_t* const config) {
 /// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
 /// u(k), or the reverse. Every parameter becomes less certain.
 static void follow_slip(est_t* const self, const bool late) {
+    (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
     const uint_fast8_t last = (uint_fast8_t)(self->config->nb - 1U);
     float* const       b    = &self->theta[self->config->na];
-    (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
     est_delta_to_plain(b, last);
     if (late) {
-        shift(b, self->config->nb, 0.0F);
+        shift(b, (uint_fast8_t)(last + 1U), 0.0F);
     } else {
         *append(b, &b[1], last) = 0.0F;
     }
