@@ -47,7 +47,7 @@
 
 EST_SHARED void increment_long(uint32_t* const counter) {
     const uint32_t next = *counter + (uint32_t)1U;
-    if (next > 0U) {
+    if (next > 0U) {  // cppcheck F5
         *counter = next;
     }
 }
@@ -129,12 +129,12 @@ static inline uint8_t count_past(const est_config_t* const config) {
 /// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
 /// u(k), or the reverse. Every parameter becomes less certain.
 static void follow_slip(est_t* const self, const bool late) {
+    (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
     const uint_fast8_t last = (uint_fast8_t)(self->config->nb - 1U);
     float* const       b    = &self->theta[self->config->na];
-    (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
     est_delta_to_plain(b, last);
     if (late) {
-        shift(b, self->config->nb, 0.0F);
+        shift(b, (uint_fast8_t)(last + 1U), 0.0F);
     } else {
         *append(b, &b[1], last) = 0.0F;
     }
@@ -164,7 +164,11 @@ EST_SHARED void compute_plain(const est_t* const self, const est_shape_t given, 
 EST_SHARED void contract_a(const est_t* const self, const est_shape_t shape, float* const out) {
     const uint_fast8_t na     = est_shape_here(self->config, shape).na;
     float              factor = 1.0F;
-    compute_plain(self, shape, out);
+    *out                      = 1.0F;
+    (void)append(&out[1], self->theta, na);
+    if (est_delta_applies(self)) {
+        est_delta_to_plain(out, na);
+    }
     EST_UNROLL
     for (uint_fast8_t i = 1U; i <= na; i++) {
         factor *= CONTRACTION;
@@ -173,11 +177,11 @@ EST_SHARED void contract_a(const est_t* const self, const est_shape_t shape, flo
 }
 
 EST_SHARED void refresh_prefilter(est_t* const self, const est_shape_t shape) {
-    const uint_fast8_t na = est_shape_here(self->config, shape).na;
-    float              a[EST_THETA_MAX + 1U];
+    const uint_fast8_t na                 = est_shape_here(self->config, shape).na;
+    float              a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
     contract_a(self, shape, a);
     self->refresh_in = self->config->refresh_n;
-    if (est_whitener_accepts(&a[1], na)) {
+    if (est_whitener_accepts(&a[1], EST_NA_MAX)) {
         est_whitener_set(&self->whitener, &a[1], na);
         increment(&self->counters.refreshes);
     }
@@ -510,7 +514,7 @@ static bool remembers_edge(const est_t* const self) {
 /// Decide whether C follows A. If C moves far, or the gains have not settled, the whitening begins anew: C is then
 /// taken at the next sample, which has no equation.
 EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
-    float a[EST_THETA_MAX + 1U];
+    float a[EST_NA_MAX + 1U];
     contract_a(self, shape, a);
     const float moved = distance(&self->whitener, &a[1], shape.na);
     if (moved < REFRESH_STEP) {
@@ -805,7 +809,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION) {
-        if (config->random_walk > 0.0F) {
+        if (!same_bits(config->random_walk, 0.0F)) {  // shorter than a comparison
             walk(self);
         }
         store_residual(self, equation.x);

@@ -42,12 +42,12 @@ EST_ROBUST_SHARED void est_delta_difference_both(float* const x, const uint_fast
     est_delta_difference(&x[na + 1U], (uint_fast8_t)(nb - 1U));
 }
 
-/// Add to each coefficient `factor` times the one before, order times.
+/// Add to each coefficient `factor` times the one before it: n passes, each over one coefficient more than the last.
 EST_ROBUST_SHARED void est_delta_add(float* const x, const uint_fast8_t order, const float factor) {
     EST_UNROLL
-    for (uint_fast8_t n = EST_WITH_ROBUSTNESS ? order : 0U; n > 0U; n--) {
+    for (uint_fast8_t n = 1U; n <= (EST_WITH_ROBUSTNESS ? order : 0U); n++) {
         EST_UNROLL
-        for (uint_fast8_t i = 1U; i <= n; i++) {
+        for (uint_fast8_t i = n; i > 0U; i--) {
             x[i] += factor * x[i - 1U];
         }
     }

@@ -60,7 +60,7 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
     const uint_fast8_t count = est_shape_count(shape);
-    float* const       x     = equation->x;  // cppcheck F2
+    float* const       x     = equation->x;
     EST_UNROLL
     for (uint_fast8_t j = 0U; j <= count; j++) {
         x[j] = est_filter(est_filter_of(whitener), &whitener->past[j], x[j]);

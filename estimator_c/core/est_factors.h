@@ -56,13 +56,13 @@ static inline void walk_row(est_factors_t* const self, const uint_fast8_t row, c
     float c = variance;
     clear(a, EST_THETA_MAX);
     a[row] = 1.0F;
-    for (uint_fast8_t j = (uint_fast8_t)(row + 1U); j > 0U;) {
-        j--;
-        float* const column = &self->upper[(j * (j - 1U)) / 2U];
-        const float  s      = a[j];
-        const float  before = self->d[j];
-        const float  d      = before + (c * s * s);
-        const float  b      = (c * s) / d;
+    for (uint_fast8_t left = (uint_fast8_t)(row + 1U); left > 0U; left--) {
+        const uint_fast8_t j      = (uint_fast8_t)(left - 1U);
+        float* const       column = &self->upper[(j * (j - 1U)) / 2U];
+        const float        s      = a[j];
+        const float        before = self->d[j];
+        const float        d      = before + (c * s * s);
+        const float        b      = (c * s) / d;
         c *= before / d;
         self->d[j] = d;
         for (uint_fast8_t i = 0U; i < j; i++) {

@@ -31,7 +31,7 @@
 
 /// Functions with several callers. They are inline too, except in a build for size: its code would grow by a seventh.
 /// With EST_WITH_EDGES=0 most of them have one caller left, and gcc decides.
-#if EST_FOR_SIZE && EST_WITH_EDGES
+#if (EST_FOR_SIZE && EST_WITH_EDGES) || (defined(__GNUC__) && !defined(__OPTIMIZE__))
 #define EST_SHARED static __attribute__((noinline, unused))
 #elif EST_FOR_SIZE
 #define EST_SHARED static inline
@@ -145,7 +145,13 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
 
 /// The shape, read anew in a build for size, where that is shorter than to pass it.
 EST_INLINE est_shape_t est_shape_here(const est_config_t* const config, const est_shape_t shape) {
-    return EST_FOR_SIZE ? est_shape_of(config) : shape;
+#if EST_FOR_SIZE
+    (void)shape;
+    return est_shape_of(config);
+#else
+    (void)config;
+    return shape;
+#endif
 }
 
 /// Number of parameters.
