@@ -654,7 +654,7 @@ static void find_hidden_change(est_t* const self) {
     } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
         scale->high_n           = 0U;
         self->trigger.statistic = 2.0F * self->config->trigger.ceiling;
-        } else {
+    } else {
         // nothing is hidden, or a doubt comes first
     }
 }
@@ -764,25 +764,28 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     self->y[0] -= innovation;
 }
 
-/// Enter an innovation into the statistic. `term`: of the cumulative sum, `weight`: of a squared innovation in it, both
-/// 0 while the trigger is held; `precision`: reciprocal of its variance [1 / noise variance].
+/// Enter an innovation into the statistic. `term`: of the cumulative sum, `weight`: of a squared innovation in it;
+/// `precision`: reciprocal of the innovation's variance [1 / noise variance]; `held`: the statistic is held at zero.
 EST_INLINE void enter_innovation(
     est_t* const self, const float e, const float term, const float weight, const float precision, const bool held) {
-    float entered = term;
+    est_trigger_t* const trigger = &self->trigger;
+    const float          share   = est_trigger_share(held);
 #if EST_WITH_ROBUSTNESS
     est_correlation_t* const correlation = &self->correlation;
     if (correlation->work == 0U) {
-        self->trigger.statistic = est_trigger_sum(self->trigger.statistic, term);
+        trigger->statistic = est_trigger_sum(trigger->statistic, share * term);
         return;  // the usual step; MISRA D4
     }
     if (correlation->work != EST_WORK_OTHER_TRIGGER) {
         self->scale.product += precision * est_correlation_product(correlation, e);
-        entered = est_correlation_read(correlation, e, self->trigger.statistic, term, weight, precision);
+        trigger->statistic =
+            est_correlation_read(correlation, e, trigger->statistic, share * term, share * weight, precision);
+        return;  // MISRA D4
     }
 #else
     (void)weight;
 #endif
-    est_trigger_enter(&self->trigger, &self->config->trigger, e, self->noise_variance / precision, entered, held);
+    est_trigger_enter(trigger, &self->config->trigger, e, self->noise_variance / precision, share * term, held);
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
@@ -814,15 +817,14 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         }
         store_residual(self, equation.x);
     }
-    const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
+    const bool  held   = est_trigger_holds(&self->trigger);
     const float weight = precision * weight_of(self);
     const float term   = est_trigger_term(equation.innovation, weight);
-    const float share  = held ? 0.0F : 1.0F;  // a theta that overflows raises an alarm all the same
-    enter_innovation(self, equation.innovation, share * term, share * weight, precision, held);
+    enter_innovation(self, equation.innovation, term, weight, precision, held);
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        judge_readings(self, shape, &equation, share * weight);
+        judge_readings(self, shape, &equation, est_trigger_share(held) * weight);
     }
     const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->doubt_n);
     if (finding == EST_ALARM) {
@@ -878,9 +880,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 #if EST_WITH_ROBUSTNESS
     self->cusum = config->trigger.kind == EST_TRIGGER_CUSUM;
     est_scale_init(self);
-    if (!self->cusum) {
-        self->correlation.work = EST_WORK_OTHER_TRIGGER;
-    }
+    self->correlation.work = self->cusum ? 0U : EST_WORK_OTHER_TRIGGER;
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);

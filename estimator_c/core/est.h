@@ -401,17 +401,17 @@ typedef struct {
 
 /// Scale of the innovations and the trial of the last alarm. Private to est_scale.h.
 typedef struct {
-    uint8_t left_n;    ///< equations left in this block; 0: it is complete, or an alarm is on trial
-    uint8_t stage;     ///< of the update after a complete block
-    uint8_t trial_n;   ///< equations since the alarm on trial; 0: none is
-    uint8_t high_n;    ///< steps of high blocks
-    float   weight;    ///< of a squared innovation in the cumulative sum
-    float   sum;    ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
-    float   product;    ///< sum of this block's products of innovations at one lag: see est_correlation.h
-    float   share;  ///< share of this block in the noise variance
-    float   inflation;  ///< factor for what the model does not explain
+    uint8_t left_n;   ///< equations left in this block; 0: it is complete, or an alarm is on trial
+    uint8_t stage;    ///< of the update after a complete block
+    uint8_t trial_n;  ///< equations since the alarm on trial; 0: none is
+    uint8_t high_n;   ///< steps of high blocks
+    float   weight;   ///< of a squared innovation in the cumulative sum
+    float   sum;      ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
+    float   product;  ///< sum of this block's products of innovations at one lag: see est_correlation.h
+    float   share;    ///< share of this block in the noise variance
+    float   inflation;   ///< factor for what the model does not explain
     float   dispersion;  ///< mean of the squared mean squares of the blocks [noise variances^2]
-    float   credit;     ///< alarms that may be justified without being plain
+    float   credit;      ///< alarms that may be justified without being plain
 } est_scale_t;
 
 /// Serial correlation of the innovations. Private to est_correlation.h.
@@ -453,8 +453,8 @@ typedef struct {
 #if EST_WITH_ROBUSTNESS
     est_scale_t       scale;
     est_correlation_t correlation;
-    float       reference_u;  ///< codes of the first sample, subtracted from all if the offset is estimated
-    float       reference_y;
+    float             reference_u;  ///< codes of the first sample, subtracted from all if the offset is estimated
+    float             reference_y;
 #endif
     est_trigger_t  trigger;
     est_counters_t counters;

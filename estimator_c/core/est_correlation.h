@@ -36,13 +36,15 @@
 #define EST_WORK_READS 4U
 #define EST_WORK_OTHER_TRIGGER 8U  ///< none, for good: the trigger is not the cumulative sum
 
-/// Blocks from one with products to the next while there is no second reading: most steps are without work.
+/// Blocks from one with products to the next while there is no second reading: most steps are without work. Even.
 #define EST_RESTING_N 4U
 
 #if EST_WITH_ROBUSTNESS
 
 /// True iff the innovations have a second reading.
-EST_INLINE bool est_correlation_reads(const est_correlation_t* const self) { return (self->work & EST_WORK_READS) != 0U; }
+EST_INLINE bool est_correlation_reads(const est_correlation_t* const self) {
+    return (self->work & EST_WORK_READS) != 0U;
+}
 
 /// True iff the innovations are the slow residual of a poor model.
 static inline bool est_correlation_smooth(const est_correlation_t* const self) {
@@ -64,8 +66,8 @@ static inline float est_correlation_product(const est_correlation_t* const self,
 }
 
 /// Enter one innovation. `statistic`: the smaller sum of the readings so far; `term`: of the first reading; `weight`: of
-/// a squared innovation in the sums; `precision`: reciprocal of its variance [1 / noise variance]. Return the term that
-/// leads to the smaller sum.
+/// a squared innovation in the sums; `precision`: reciprocal of its variance [1 / noise variance]. Return the smaller
+/// sum.
 static inline float est_correlation_read(est_correlation_t* const self,
                                          const float              e,
                                          const float              statistic,
@@ -79,7 +81,7 @@ static inline float est_correlation_read(est_correlation_t* const self,
     self->last[1]        = self->last[0];
     self->last[0]        = e;
     if (!est_correlation_reads(self)) {
-        return term;  // MISRA D4
+        return est_trigger_sum(statistic, term);  // MISRA D4
     }
     const float left   = (1.0F - (first * first)) * (1.0F - (second * second));  // of the variance
     const float spread = 1.0F + (EST_LEVERAGE * (1.0F - precision));
@@ -87,7 +89,7 @@ static inline float est_correlation_read(est_correlation_t* const self,
     const float other  = est_trigger_sum(statistic + est_max(-self->lead, 0.0F),
                                          est_trigger_term(forward - (second * backward), weight / (left * spread)));
     self->lead         = one - other;
-    return (est_min(one, other) - statistic) + EST_CUSUM_DRIFT;
+    return est_min(one, other);
 }
 
 /// Improve the partial correlation of the lag of a complete block. `share`: of the block in the estimate.
@@ -104,17 +106,18 @@ static inline void est_correlation_follow(est_correlation_t* const self,
     *partial             = est_max(est_min(next, EST_PARTIAL_MAX), -EST_PARTIAL_MAX);
 }
 
-/// Begin a block.
+/// Begin a block. The correlation at lag 2 is estimated while there is a second reading.
 static inline void est_correlation_restart(est_correlation_t* const self) {
     const float squares = (self->partial[0] * self->partial[0]) + (self->partial[1] * self->partial[1]);
     const bool  reads   = (squares > EST_CORRELATED) && !est_correlation_smooth(self);
     if (!est_correlation_reads(self)) {
         est_correlation_forget(self);
     }
-    self->turn = (uint8_t)((self->turn + 1U) % (2U * EST_RESTING_N));
-    self->work = reads ? EST_WORK_READS : 0U;
-    if (reads || ((self->turn % EST_RESTING_N) == 0U)) {
-        self->work |= ((self->turn % 2U) == 0U) ? EST_WORK_LAG_1 : EST_WORK_LAG_2;
+    self->turn = (uint8_t)((self->turn + 1U) % EST_RESTING_N);
+    if (reads) {
+        self->work = (uint8_t)(EST_WORK_READS + (((self->turn % 2U) == 0U) ? EST_WORK_LAG_1 : EST_WORK_LAG_2));
+    } else {
+        self->work = (self->turn == 0U) ? EST_WORK_LAG_1 : 0U;
     }
 }
 #endif

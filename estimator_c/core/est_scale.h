@@ -131,7 +131,9 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
 }
 
 /// Mean square of the innovations of a complete block.
-static inline float est_scale_mean(const est_scale_t* const self) { return (self->sum * EST_MEAN_SQUARE) / self->weight; }
+static inline float est_scale_mean(const est_scale_t* const self) {
+    return (self->sum * EST_MEAN_SQUARE) / self->weight;
+}
 
 /// Let the noise variance and the dispersion follow a complete block. `share_least`: smallest share of the next block.
 /// `smooth`: the squares have no peaks, and their dispersion does not count.

@@ -157,13 +157,16 @@ static inline float est_trigger_other_statistic(est_trigger_t* const            
 }
 
 /// True iff the statistic is held at zero. Counts down the innovations of the hold.
-EST_INLINE bool est_trigger_holds(est_trigger_t* const self, const est_trigger_kind_t kind) {
+EST_INLINE bool est_trigger_holds(est_trigger_t* const self) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
         return true;  // MISRA D4
     }
-    return kind == EST_TRIGGER_NONE;
+    return false;
 }
+
+/// Share of a term that counts. A theta that overflows raises an alarm although the statistic is held at zero.
+EST_INLINE float est_trigger_share(const bool held) { return held ? 0.0F : 1.0F; }
 
 /// Enter one innovation [codes] as recorded, with its variance [codes^2] and its term in the cumulative sum. The term is
 /// zero while the statistic is held.
@@ -173,10 +176,10 @@ EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
                                   const float                       variance,
                                   const float                       term,
                                   const bool                        held) {
-    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && !held) {
+    if (EST_WITH_TRIGGERS && (config->kind > EST_TRIGGER_NONE) && (config->kind != EST_TRIGGER_CUSUM) && !held) {
         self->statistic = est_trigger_other_statistic(self, config, innovation, variance);
     } else {
-        self->statistic = est_trigger_sum(self->statistic, term);
+        self->statistic = est_trigger_sum(self->statistic, est_trigger_share(config->kind == EST_TRIGGER_NONE) * term);
     }
 }
 
