@@ -777,7 +777,9 @@ EST_INLINE void enter_innovation(
         return;  // the usual step; MISRA D4
     }
     if (correlation->work != EST_WORK_OTHER_TRIGGER) {
-        self->scale.product += precision * est_correlation_product(correlation, e);
+        if (self->scale.left_n > 0U) {
+            self->scale.product += precision * est_correlation_product(correlation, e);
+        }
         trigger->statistic =
             est_correlation_read(correlation, e, trigger->statistic, share * term, share * weight, precision);
         return;  // MISRA D4
