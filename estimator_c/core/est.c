@@ -773,11 +773,8 @@ EST_INLINE void enter_innovation(
         return;  // the usual step; MISRA D4
     }
     if (correlation->work != EST_WORK_OTHER_TRIGGER) {
-        if (self->scale.left_n > 0U) {
-            self->scale.product += precision * est_correlation_product(correlation, e);
-        }
-        trigger->statistic =
-            est_correlation_read(correlation, e, trigger->statistic, share * term, share * weight, precision);
+        trigger->statistic = est_correlation_enter(correlation, &self->scale, e, trigger->statistic, share * term,
+                                                   share * weight, precision);
         return;  // MISRA D4
     }
 #else
@@ -810,7 +807,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION) {
-        if (!same_bits(config->random_walk, 0.0F)) {  // shorter than a comparison
+        if (config->random_walk > 0.0F) {
             walk(self);
         }
         store_residual(self, equation.x);

@@ -57,29 +57,26 @@ static inline void est_correlation_forget(est_correlation_t* const self) {
     self->lead = 0.0F;
 }
 
-/// Product of an innovation with an earlier one, at the lag of this block: with that of lag 1, or of what lag 1 leaves
-/// of both.
-static inline float est_correlation_product(const est_correlation_t* const self, const float e) {
-    const float known = ((self->work & EST_WORK_LAG_2) != 0U) ? self->partial[0] : 0.0F;
-    const float other = ((self->work & EST_WORK_LAG_2) != 0U) ? self->last[1] : self->last[0];
-    return (e - (known * self->last[0])) * (other - (known * self->last[0]));
-}
-
-/// Enter one innovation. `statistic`: the smaller sum of the readings so far; `term`: of the first reading; `weight`: of
-/// a squared innovation in the sums; `precision`: reciprocal of its variance [1 / noise variance]. Return the smaller
-/// sum.
-static inline float est_correlation_read(est_correlation_t* const self,
-                                         const float              e,
-                                         const float              statistic,
-                                         const float              term,
-                                         const float              weight,
-                                         const float              precision) {
+/// Enter one innovation into the products of the block and into both readings. `statistic`: their smaller sum so far;
+/// `term`: of the first reading; `weight`: of a squared innovation in the sums; `precision`: reciprocal of its variance
+/// [1 / noise variance]. Return the smaller sum.
+static inline float est_correlation_enter(est_correlation_t* const self,
+                                          est_scale_t* const       scale,
+                                          const float              e,
+                                          const float              statistic,
+                                          const float              term,
+                                          const float              weight,
+                                          const float              precision) {
     const float first    = self->partial[0];
     const float second   = self->partial[1];
-    const float forward  = e - (first * self->last[0]);
-    const float backward = self->last[1] - (first * self->last[0]);
-    self->last[1]        = self->last[0];
+    const float before   = self->last[0];
+    const float forward  = e - (first * before);
+    const float backward = self->last[1] - (first * before);
+    self->last[1]        = before;
     self->last[0]        = e;
+    if (scale->left_n > 0U) {
+        scale->product += precision * (((self->work & EST_WORK_LAG_2) != 0U) ? (forward * backward) : (e * before));
+    }
     if (!est_correlation_reads(self)) {
         return est_trigger_sum(statistic, term);  // MISRA D4
     }

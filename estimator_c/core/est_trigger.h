@@ -19,7 +19,7 @@ static inline bool est_trigger_config_valid(const est_trigger_config_t* const co
         (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
         ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
-    return known && reset && within(config->ceiling, FLT_MIN, EST_CEILING_LIMIT);
+    return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
 }
 
 typedef enum {
