@@ -31,8 +31,9 @@
 ///
 /// The false-alarm rate holds from the end of the warm-up on, by default 550 innovations after est_init(). It holds for
 /// white noise of 0.3 to 4 codes, 10 to 18 bits, and poles from 0.3 to 0.999. If the edges of u drift by 20 ppm, it
-/// holds on average over such plants, and slow ones have up to 2.5 times as many false alarms. If the model does not fit
-/// the plant, the trigger becomes less sensitive: est_scale() grows. est_fit.h names the cause.
+/// holds on average over such plants, and slow ones have up to 2.5 times as many false alarms. If the noise is coloured,
+/// or the model does not fit the plant, the trigger becomes less sensitive: est_scale() grows, and an alarm needs a second
+/// reading of correlated innovations. est_fit.h names the cause.
 ///
 /// Units: signals are in codes of the converter, so that quantisation is 1. The defaults assume noise of about one
 /// code. If signals have another unit, say volts, either divide them by the volts per code, which needs no other
