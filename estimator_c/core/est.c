@@ -87,16 +87,13 @@ static bool codes_valid(const est_config_t* const config) {
            ((uint32_t)config->edge_instants <= (uint32_t)EST_EDGES_ANYWHERE);
 }
 
-static bool needs_adaptation(const est_config_t* const config) {
-    return (est_shape_of(config).nc > 0U) || (config->random_walk > 0.0F);
-}
-
 /// True iff this build supports the configuration.
 static bool is_supported(const est_config_t* const config) {
     return same_shape(requested_shape(config), est_shape_of(config)) &&
            (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
            (EST_WITH_ROBUSTNESS || !config->noise_estimated) &&
-           (EST_WITH_ADAPTATION || (!needs_adaptation(config) && (config->refresh_n == 0U))) &&
+           (EST_WITH_ADAPTATION ||
+            ((est_shape_of(config).nc == 0U) && (config->random_walk <= 0.0F) && (config->refresh_n == 0U))) &&
            (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
 }
 
