@@ -517,8 +517,8 @@ float est_variance(const est_t* self, uint8_t index);
 /// Noise variance [codes^2], configured or estimated. Cost: constant. May be called from an interrupt.
 float est_noise_variance(const est_t* self);
 
-/// Variance that the trigger expects of the noise [codes^2]: the noise variance times the inflation. Cost: constant.
-/// May be called from an interrupt.
+/// Variance that the trigger expects of the noise [codes^2]: the noise variance times the inflation, and more if the
+/// noise variance varies. Cost: constant. May be called from an interrupt.
 float est_scale(const est_t* self);
 
 /// One coefficient of the prefilter C; zero beyond the order of A. index is in [0, EST_NA_MAX), asserted. Cost:

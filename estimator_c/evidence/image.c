@@ -13,8 +13,10 @@
 #define SAMPLES_N 600U
 #endif
 #define MISSING_SAMPLE 330U
+#ifndef LATE_SAMPLE
 #define LATE_SAMPLE 381U  ///< first sample after a drifting edge crosses a sampling instant
-#define SOFT_SAMPLE 480U  ///< first sample of the changed plant
+#endif
+#define SOFT_SAMPLE (LATE_SAMPLE + 99U)  ///< first sample of the changed plant
 
 static float u_codes[SAMPLES_N];
 static float y_codes[SAMPLES_N];

@@ -69,6 +69,7 @@ GENERATED = ROOT / "build" / "generated"
 TESTS = (
     *("tests/estimator_c/test_est_estimation.py", "tests/estimator_c/test_est_watch.py"),
     *("tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_est_adversarial.py"),
+    "tests/estimator_c/test_est_correlation.py",
     *("tests/estimator_c/test_numerics.py", "tests/estimator_c/test_reference.py"),
 )
 LONG = "not millions_of_samples and not long_free_running and not rarer_than_promised"

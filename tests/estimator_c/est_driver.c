@@ -2,6 +2,7 @@
 /* Runs whole blocks of samples through the public header est.h, for the tests. */
 
 #include "est.h"
+#include "est_correlation.h"
 #include "est_delta.h"
 #include "est_fit.h"
 #include "est_isolation.h"
@@ -177,6 +178,13 @@ void driver_age_counters(void) {
 
 /* Sets the inflation of the scale, as after alarms that were not justified. The weight follows with the next block. */
 void driver_inflate(double inflation) { self.scale.inflation = (float)inflation; }
+
+/* partial, (2,): partial correlations of the innovations at lags 1 and 2; returns whether they have a second reading. */
+int driver_correlation(double* partial) {
+    partial[0] = self.correlation.partial[0];
+    partial[1] = self.correlation.partial[1];
+    return est_correlation_reads(&self.correlation) ? 1 : 0;
+}
 
 /* Damages the state in one way, asks for the invariants, and mends it. */
 int driver_invariants_hold_if_damaged(int way) {
@@ -365,6 +373,7 @@ void driver_judge_fit(size_t               n,
         step.alarm                = alarm[k] != 0;
         step.innovation           = (float)innovation[k];
         self.scale.inflation      = (float)inflation;
+        self.scale.dispersion     = 1.0F;
         est_fit_enter(&fit, &self, step);
         cause[k] = (unsigned char)est_fit_misfit(&fit).kind;
     }

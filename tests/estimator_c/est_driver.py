@@ -204,6 +204,19 @@ class Estimator:
         """Sets the inflation of the scale, as after alarms that were not justified."""
         self._c.driver_inflate(ctypes.c_double(inflation))
 
+    def partial_correlations(self) -> NDArray[np.float64]:
+        """(2,) of the innovations, at lags 1 and 2."""
+        return self._correlation()[0]
+
+    def reads_twice(self) -> bool:
+        """True if the innovations have a second reading."""
+        return self._correlation()[1]
+
+    def _correlation(self) -> tuple[NDArray[np.float64], bool]:
+        partial = np.zeros(2)
+        reads = self._c.driver_correlation(ctypes.c_void_p(partial.ctypes.data))
+        return partial, bool(reads)
+
     def invariants_hold_if_damaged(self, way: int) -> bool:
         """Result of est_invariants_hold() for a state damaged in one of the ways 0 .. 9; 10: not at all."""
         return bool(self._c.driver_invariants_hold_if_damaged(way))

@@ -78,6 +78,12 @@ def test_two_changes_at_once_are_not_taken_for_one(estimator: Estimator, change:
     assert found.right >= 0.95
 
 
+def test_several_changes_at_once_are_stated_as_such(estimator: Estimator) -> None:
+    played = isolation.play(FRONT, {"B": 1.2, "K": 1.2}, FULL, 8, seed=31)
+    assert estimator.init(**SHARED_CLOCK)
+    assert (estimator.isolate(played.u, played.y, played.onset).change == "several").sum() >= 6
+
+
 @pytest.mark.parametrize("change", SINGLE, ids=str)
 def test_random_plants_are_isolated_as_well(estimator: Estimator, change: Change) -> None:
     """With 20 trials each of ten."""

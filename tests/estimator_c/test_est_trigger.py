@@ -398,18 +398,20 @@ def test_long_free_running_stretch_stays_quiet(estimator: Estimator, plant: Plan
 
 @pytest.mark.parametrize("period_n", [33.37, 66.66, 50.05], ids=str)
 def test_edges_anywhere_between_the_samples_raise_no_alarm(estimator: Estimator, period_n: float) -> None:
-    """Half periods of no whole number of samples, the last one a drift of 1000 ppm; 20 runs, one change in each."""
-    alarms = {ANYWHERE: 0, LOCKED: 0}
+    """Half periods of no whole number of samples, the last one a drift of 1000 ppm; 20 runs, one change in each.
+
+    With LOCKED, the innovations after the edges enlarge the scale, and the alarm comes later.
+    """
+    delay_n = {ANYWHERE: 0, LOCKED: 0}
     for seed in range(20):
         edges = np.arange(10.3 + seed, 1600.0, period_n)
         u, y = suspension([(0, FRONT), (1400, (115.0, 3021.0, 18000.0))], edges, 1600, 1.0, seed)
-        for instants in alarms:
+        for instants in delay_n:
             assert estimator.init(edge_instants=instants)
             raised = estimator.run(u, y).alarms
-            alarms[instants] += len(raised)
+            delay_n[instants] += next((int(alarm) for alarm in raised if alarm > 1400), 1600) - 1400
             assert instants == LOCKED or (len(raised) == 1 and 1400 < raised[0] <= 1480)
-    assert alarms[ANYWHERE] == 20
-    assert alarms[LOCKED] > 60, "without it hardly an edge passes for what it is"
+    assert delay_n[LOCKED] > 3 * delay_n[ANYWHERE]
 
 
 @pytest.mark.parametrize("noise_estimated", [0, 1])

@@ -33,7 +33,7 @@ NEAR = 0.003
 """Relative distance from a threshold at which rounding may decide."""
 
 
-class Stage(Enum):
+class BlockStage(Enum):
     """Stage of the update after a block, one an equation."""
 
     CORRELATION = 0
@@ -88,7 +88,7 @@ class ReferenceScale:
         """Variance that the trigger expects."""
 
     def _restart(self) -> None:
-        self._squares, self._left_n, self._stage = 0.0, BLOCK_N, Stage.CORRELATION
+        self._squares, self._left_n, self._stage = 0.0, BLOCK_N, BlockStage.CORRELATION
         self.correlation.restart_products()
 
     def begin_trial(self, old: Vector) -> None:
@@ -148,17 +148,17 @@ class ReferenceScale:
         A block whose sum is half way to an alarm is discarded.
         """
         stage, counts = self._stage, self._share > 0.0 and excess < 1.0
-        if stage in (Stage.CORRELATION, Stage.NOISE):
+        if stage in (BlockStage.CORRELATION, BlockStage.NOISE):
             self.is_doubtful |= self._share > 0.0 and abs(excess - 1.0) < NEAR
-        self._stage = Stage(min(stage.value + 1, Stage.END.value))
-        if stage is Stage.CORRELATION and counts and self._is_cusum:
+        self._stage = BlockStage(min(stage.value + 1, BlockStage.END.value))
+        if stage is BlockStage.CORRELATION and counts and self._is_cusum:
             self.correlation.follow(self._squares / BLOCK_N, self.noise_variance, BLOCK_N, armed=quiet_n == 0)
-        elif stage is Stage.NOISE and counts:
+        elif stage is BlockStage.NOISE and counts:
             self._follow(warm=quiet_n >= WARM_N)
-        elif stage is Stage.CHANGE:
+        elif stage is BlockStage.CHANGE:
             self._count_high()
             return True
-        elif stage is Stage.END:
+        elif stage is BlockStage.END:
             self._relax()
         return False
 
