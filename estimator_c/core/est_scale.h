@@ -136,7 +136,8 @@ static inline float est_scale_mean(const est_scale_t* const self) {
 }
 
 /// Let the noise variance and the dispersion follow a complete block. `share_least`: smallest share of the next block.
-/// `smooth`: the squares have no peaks, and their dispersion does not count.
+/// `smooth`: the squares have no peaks, and their dispersion does not count. Neither does it before the trigger is armed,
+/// while theta settles.
 static inline void est_scale_follow(est_t* const estimator, const float share_least, const bool smooth) {
     est_scale_t* const self    = &estimator->scale;
     const float        before  = estimator->noise_variance;
@@ -145,7 +146,8 @@ static inline void est_scale_follow(est_t* const estimator, const float share_le
     const float        square  = est_min(ratio * ratio, EST_DISPERSION_MAX);
     const float        limited = est_min(mean, EST_GROWTH_MAX * before);
     const float        noise   = before + (self->share * (limited - before));
-    self->dispersion           = smooth ? 1.0F : (self->dispersion + (self->share * (square - self->dispersion)));
+    const bool         counts  = !smooth && (estimator->trigger.quiet_n == 0U);
+    self->dispersion           = counts ? (self->dispersion + (self->share * (square - self->dispersion))) : 1.0F;
     self->share                = est_max(self->share / (1.0F + self->share), share_least);
     estimator->noise_variance  = est_max(noise, EST_NOISE_LEAST * estimator->config->noise_variance);
 }

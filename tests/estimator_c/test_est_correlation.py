@@ -111,13 +111,6 @@ def test_innovations_at_lag_2_alone_need_lag_1_to_be_looked_at(estimator: Estima
     assert np.abs(white[50:]).max() < 0.15
 
 
-def test_correlations_stay_below_1_in_magnitude_with_any_innovations(estimator: Estimator) -> None:
-    """Here each innovation is the last one times 1.5, in ramps as long as a block with its update."""
-    assert estimator.init(**GIVEN | {"warm_up_n": 10_000})
-    followed, _ = follow(estimator, 1.5 ** (np.arange(8000.0) % 36.0), 10)
-    assert np.abs(followed).max() == pytest.approx(0.98)
-
-
 def test_declared_noise_has_no_second_reading(estimator: Estimator) -> None:
     """The scale is not followed, and so nothing is known of the innovations."""
     innovations = correlated((0.8, 0.0), 4000, 1)

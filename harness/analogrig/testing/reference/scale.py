@@ -154,7 +154,7 @@ class ReferenceScale:
         if stage is BlockStage.CORRELATION and counts and self._is_cusum:
             self.correlation.follow(self._squares / BLOCK_N, self.noise_variance, BLOCK_N, armed=quiet_n == 0)
         elif stage is BlockStage.NOISE and counts:
-            self._follow(warm=quiet_n >= WARM_N)
+            self._follow(quiet_n)
         elif stage is BlockStage.CHANGE:
             self._count_high()
             return True
@@ -170,16 +170,16 @@ class ReferenceScale:
         if self._trial_n >= TRIAL_MAX_N or (self._trial_n >= TRIAL_N and since_n < self._trial_n):
             self.end_trial()
 
-    def _follow(self, *, warm: bool) -> None:
+    def _follow(self, quiet_n: int) -> None:
         """Let the noise variance and the dispersion follow the complete block."""
         mean = self._squares / BLOCK_N
         square = min((mean / self.noise_variance) ** 2, DISPERSION_MAX)
         self._dispersion += self._share * (square - self._dispersion)
-        if self.correlation.is_smooth:  # the squares have no peaks
+        if quiet_n or self.correlation.is_smooth:  # theta settles, or the squares have no peaks
             self._dispersion = 1.0
         mean = min(mean, GROWTH_MAX * self.noise_variance)
         self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), self._least)
-        least = SHARE_WARM if warm or self._share > SHARE_WARM else SHARE_MIN
+        least = SHARE_WARM if quiet_n >= WARM_N or self._share > SHARE_WARM else SHARE_MIN
         self._share = max(self._share / (1.0 + self._share), least)
 
     def _count_high(self) -> None:
