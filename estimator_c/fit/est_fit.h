@@ -3,8 +3,9 @@
 ///
 /// The model promises innovations that are white, have the declared variance, and depend on nothing that came before.
 /// The module tests this over blocks of EST_FIT_BLOCK_N samples. A kind of misfit is stated once two blocks in
-/// succession agree on it. If alarms were not justified, as the scale of est.h shows, one block suffices, and the kind
-/// with the most evidence is stated. Exactly one kind is stated, the likeliest cause.
+/// succession agree on it. Alarms that were not justified, as the scale of est.h shows, are evidence too: after two of
+/// them one block suffices, and the kind with the most evidence is stated. Exactly one kind is stated, the likeliest
+/// cause.
 /// harness/docs/background/estimator.md gives the statistics and their limits.
 ///
 /// The module is optional: est.c does not depend on it. It reads the state of the estimator, so both must be compiled
@@ -68,7 +69,8 @@ typedef struct {
     float    clear;      ///< of the innovations while no edge of u is in doubt
     float    doubted;    ///< of the other innovations
     float    squares;    ///< of the squares of all
-    float    fourths;    ///< of their fourth powers
+    float    fourths;    ///< of their squares, less limited, times the squares
+    float    along;      ///< of the products of successive innovations in `clear`
     uint16_t lost_n;     ///< samples without an innovation, or whose innovation is excluded
     uint16_t doubted_n;  ///< innovations in `doubted`
 } est_fit_moments_t;
@@ -81,6 +83,7 @@ typedef struct {
     float             drawn;      ///< of the squares of the innovations drawn for the regions
     float             explained;  ///< energy of these that the regions explain beyond chance
     float             repeated;   ///< energy of these that the regions of the block before explain
+    float             uneven;     ///< squared deviations of the energies of the regions, over their numbers
     uint16_t          moved_n;    ///< differences in `moved`
     uint16_t          drawn_n;    ///< innovations in `drawn`
 } est_fit_sums_t;
@@ -88,27 +91,39 @@ typedef struct {
 /// State of the watch. The fields are private; read est_fit_misfit().
 typedef struct {
     const est_config_t* config;
-    uint8_t             settling_n;                    ///< sums until the first block
-    uint8_t             slot;                          ///< samples of the present sum so far
-    uint8_t             sum_n;                         ///< sums of the block so far
-    uint8_t             excluded_n;                    ///< samples after an alarm that are still excluded
-    uint8_t             region;                        ///< of the state of the plant before the present sample
-    uint8_t             learnt_n;                      ///< samples in level and spread, limited
-    uint8_t             peak;                          ///< line with the largest power
-    uint8_t             last_peak;                     ///< the same in the block before
-    float               limit;                         ///< of an innovation [codes]
-    est_fit_moments_t   pending;                       ///< of the present sum
-    float               entered;                       ///< last complete sum
-    float               level;                         ///< mean of y [codes]
-    float               spread;                        ///< mean distance of y from its level [codes]
-    float               now[EST_FIT_LINES_N];          ///< resonators; during the evaluation the powers
-    float               before[EST_FIT_LINES_N];       ///< resonators, one step before
-    float               regions[EST_FIT_REGIONS_N];    ///< sums of the drawn innovations, by region
-    float               means[EST_FIT_REGIONS_N];      ///< mean of each region in the block before
-    uint8_t             regions_n[EST_FIT_REGIONS_N];  ///< innovations in each of them
+    uint8_t             settling_n;                     ///< sums until the first block
+    uint8_t             slot;                           ///< samples of the present sum so far
+    uint8_t             sum_n;                          ///< sums of the block so far
+    uint8_t             excluded_n;                     ///< samples after an alarm that are still excluded
+    uint8_t             region;                         ///< of the state of the plant before the present sample
+    uint8_t             learnt_n;                       ///< samples in level and spread, limited
+    uint8_t             peak;                           ///< line with the largest power
+    uint8_t             last_peak;                      ///< the same in the block before
+    uint8_t             counted_n;                      ///< innovations of the present sum that the regions contain
+    uint16_t            alarms_n;                       ///< alarms in the block; one that was not justified counts more
+    uint16_t            last_alarms_n;                  ///< the same in the block before
+    float               limit;                          ///< of an innovation [codes]
+    float               last;                           ///< innovation
+    float               counted;                        ///< part of pending.squares that the regions contain
+    est_fit_moments_t   pending;                        ///< of the present sum
+    float               entered;                        ///< last complete sum
+    float               level;                          ///< mean of y [codes]
+    float               spread;                         ///< mean distance of y from its level [codes]
+    float               now[EST_FIT_LINES_N];           ///< resonators; during the evaluation the powers
+    float               before[EST_FIT_LINES_N];        ///< resonators, one step before
+    float               regions[EST_FIT_REGIONS_N];     ///< sums of the drawn innovations, by region
+    float               means[EST_FIT_REGIONS_N];       ///< mean of each region in the block before
+    float               energies[EST_FIT_REGIONS_N];    ///< sums of the squares of all innovations, by region
+    uint16_t            energies_n[EST_FIT_REGIONS_N];  ///< innovations in each of these
+    uint8_t             regions_n[EST_FIT_REGIONS_N];   ///< innovations in each of `regions`
     est_fit_sums_t      sums;
     float               first_spread;    ///< at the end of the first block [codes]
     float               first_variance;  ///< of the innovations of the first block [codes^2]; 0: none yet
+    float               last_variance;   ///< the same of the block before
+    float               last_power;      ///< of the peak in the block before
+    float               inflation;       ///< of the scale at the end of the block before, over its limit
+    float               noise;           ///< evidence for noise in the block that is evaluated; 1: twice what suffices
+    float               last_noise;      ///< the same in the block before
     est_misfit_t        found;           ///< in the block that is evaluated
     est_misfit_kind_t   candidate;       ///< found in the block before
     est_misfit_t        misfit;

@@ -137,6 +137,7 @@ def test_structure_below_the_declared_noise_does_no_harm(estimator: Estimator) -
 
 def test_noise_that_is_estimated_is_not_compared_with_the_setting(estimator: Estimator) -> None:
     steps = Steps()
+    steps.y += 5.0 * steps.rng.normal(0.0, 1.0, N)
     steps.innovation *= 5.0
     assert not steps.judged(estimator).cause.any()
 
