@@ -3,9 +3,9 @@
 ///
 /// The model promises innovations that are white, have the declared variance, and depend on nothing that came before.
 /// The module tests this over blocks of EST_FIT_BLOCK_N samples. A kind of misfit is stated once two blocks in
-/// succession agree on it. Alarms that were not justified, as the scale of est.h shows, are evidence too: after two of
-/// them one block suffices, and the kind with the most evidence is stated. Exactly one kind is stated, the likeliest
-/// cause.
+/// succession agree on it. Alarms are evidence of noise, most of all those that were not justified, as the scale of
+/// est.h shows. After two of these one block suffices, and the kind with the most evidence is stated. Exactly one kind
+/// is stated, the likeliest cause.
 /// harness/docs/background/estimator.md gives the statistics and their limits.
 ///
 /// The module is optional: est.c does not depend on it. It reads the state of the estimator, so both must be compiled
@@ -48,12 +48,12 @@ extern "C" {
 /// Causes of a poor fit. EST_MISFIT_SLOW_PLANT replaces EST_MISFIT_EXCITATION if the poles are too close to 1 for the
 /// resolution of the codes.
 typedef enum {
-    EST_MISFIT_NONE       = 0,
-    EST_MISFIT_DRIFT      = 1,  ///< y drifts: the innovations have a mean
-    EST_MISFIT_HUM        = 2,  ///< a periodic disturbance of y
-    EST_MISFIT_EDGES      = 3,  ///< the position of the edges of u between two samples varies
-    EST_MISFIT_NONLINEAR  = 4,  ///< the response depends on the level of y, or the order of the model is too low
-    EST_MISFIT_NOISE      = 5,  ///< the noise is larger than declared, correlated, or not of one variance
+    EST_MISFIT_NONE      = 0,
+    EST_MISFIT_DRIFT     = 1,  ///< y drifts: the innovations have a mean
+    EST_MISFIT_HUM       = 2,  ///< a periodic disturbance of y
+    EST_MISFIT_EDGES     = 3,  ///< the position of the edges of u between two samples varies
+    EST_MISFIT_NONLINEAR = 4,  ///< the response depends on the level of y, or the order of the model is too low
+    EST_MISFIT_NOISE = 5,  ///< the noise is larger than declared, correlated, has outliers, or more than one variance
     EST_MISFIT_SLOW_PLANT = 6,  ///< the plant hardly moves between two samples
     EST_MISFIT_EXCITATION = 7,  ///< u is too small for a change of the mass to be seen
 } est_misfit_kind_t;
@@ -132,11 +132,11 @@ typedef struct {
 /// Prepare for the first sample of an estimator with this configuration. The configuration is not copied; it must
 /// stay unchanged. Returns false iff na is not 2; the test of the excitation then does not apply and the state is
 /// unusable. The test needs the cumulative sum and EST_WITH_ROBUSTNESS, and EST_MISFIT_EDGES needs EST_EDGES_MAY_SLIP;
-/// otherwise these are not found. Cost: constant. RAM: 0.4 kB. May be called from an interrupt.
+/// otherwise these are not found. Cost: constant. RAM: 0.5 kB. May be called from an interrupt.
 EST_RESULT_USED bool est_fit_init(est_fit_watch_t* self, const est_config_t* config);
 
-/// Enter the result of an est_step(); to be called after every step. Cost: typically 56
-/// instructions on a Cortex-M4F, 83 on average, at most 215 (make cost). May be called from an interrupt.
+/// Enter the result of an est_step(); to be called after every step. Cost: typically 62
+/// instructions on a Cortex-M4F, 98 on average, at most 245 (make cost). May be called from an interrupt.
 void est_fit_enter(est_fit_watch_t* self, const est_t* estimator, est_step_t step);
 
 /// Present misfit. Cost: constant. May be called from an interrupt.
