@@ -63,7 +63,7 @@ static const uint16_t BLOCK_N = EST_FIT_BLOCK_N;
 /// limited. EXCESS: variance over the declared one. RISE: variance over that of the block before.
 #define COLOUR 6.8F
 #define ALONG 85.0F
-#define UNEVEN 172.0F
+#define UNEVEN 140.0F
 #define GAUSSIAN 2.9F
 #define TAILS 1.15F
 #define EXCESS 5.0F
@@ -525,7 +525,8 @@ work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const
     if ((self->slot >= DRAWS_FROM) && (step.status == EST_UPDATED) && (self->excluded_n == 0U) && counts) {
         draw(self, estimator, z, step.innovation);
     }
-    count_energy(self, counts && estimator->settled);
+    // an edge of a generator that drifts leaves a response to it
+    count_energy(self, counts && estimator->settled && (estimator->doubt_n == 0U));
     if ((step.status == EST_UPDATED) || (step.status == EST_GATHERING)) {
         find_region(self, estimator);
     }

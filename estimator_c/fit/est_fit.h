@@ -113,7 +113,7 @@ typedef struct {
     float               before[EST_FIT_LINES_N];        ///< resonators, one step before
     float               regions[EST_FIT_REGIONS_N];     ///< sums of the drawn innovations, by region
     float               means[EST_FIT_REGIONS_N];       ///< mean of each region in the block before
-    float               energies[EST_FIT_REGIONS_N];    ///< sums of the squares of all innovations, by region
+    float               energies[EST_FIT_REGIONS_N];    ///< sums of the squares of clear innovations, by region
     uint16_t            energies_n[EST_FIT_REGIONS_N];  ///< innovations in each of these
     uint8_t             regions_n[EST_FIT_REGIONS_N];   ///< innovations in each of `regions`
     est_fit_sums_t      sums;

@@ -111,11 +111,6 @@ def _impulses(codes: float, share: float) -> Callable[[Array, np.random.Generato
     return lambda y, rng: y + codes * rng.choice([-1.0, 1.0], y.shape) * (rng.random(y.shape) < share)
 
 
-def _along_slope(part: float) -> Callable[[Array, np.random.Generator], Array]:
-    """White noise whose standard deviation is this part of the step from sample to sample: jitter of the clock."""
-    return lambda y, rng: y + part * np.gradient(y, axis=1) * rng.normal(0.0, 1.0, y.shape)
-
-
 def _popcorn(codes: float, dwell_n: float) -> Callable[[Array, np.random.Generator], Array]:
     """Jumps between two levels, this much either side, after ``dwell_n`` samples on average."""
     return lambda y, rng: y + codes * (-1.0) ** np.cumsum(rng.random(y.shape) < 1.0 / dwell_n, axis=1)
@@ -139,7 +134,6 @@ CONDITIONS = {
     "noise, 2 LSB autoregressive 0.9": Condition("noise", share=0.8, disturb=_coloured(2.0, 0.9)),
     "noise, 0.1 % of the displacement": Condition("noise", disturb=_proportional(0.001)),
     "noise, 8 LSB on 1 % of the samples": Condition("noise", disturb=_impulses(8.0, 0.01)),
-    "noise, 1 % of the steps of the displacement": Condition("noise", disturb=_along_slope(0.01)),
     "noise, jumps of 3 LSB after 200 samples": Condition("noise", share=0.9, disturb=_popcorn(1.5, 200.0)),
     "hum, 1 LSB, 50 Hz": Condition("hum", disturb=_hum(1.0, 50.0 / 20e3)),
     "hum, 1 LSB, 150 Hz": Condition("hum", disturb=_hum(1.0, 150.0 / 20e3)),
