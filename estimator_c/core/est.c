@@ -2,6 +2,7 @@
 
 #include "est.h"
 #include "est_assert.h"
+#include "est_correlation.h"
 #include "est_edges.h"
 #include "est_equation.h"
 #include "est_scale.h"
@@ -44,16 +45,14 @@
 #define BRIDGED_MAX 8U
 #define BRIDGE_PRECISION 0.6F
 
-EST_SHARED void increment(uint16_t* const counter) {
+EST_SHARED void increment_long(uint32_t* const counter) {
     const uint32_t next = *counter + (uint32_t)1U;
-    *counter            = (uint16_t)(next - (next >> 16U));
+    if (next > 0U) {  // cppcheck F5
+        *counter = next;
+    }
 }
 
-EST_SHARED void increment_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
-
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
-
-EST_SHARED bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
@@ -130,42 +129,44 @@ static inline uint8_t count_past(const est_config_t* const config) {
 /// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
 /// u(k), or the reverse. Every parameter becomes less certain.
 static void follow_slip(est_t* const self, const bool late) {
+    (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
     const uint_fast8_t last = (uint_fast8_t)(self->config->nb - 1U);
     float* const       b    = &self->theta[self->config->na];
-    (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
     est_delta_to_plain(b, last);
     if (late) {
-        shift(b, self->config->nb, 0.0F);
+        shift(b, (uint_fast8_t)(last + 1U), 0.0F);
     } else {
         *append(b, &b[1], last) = 0.0F;
     }
     est_delta_from_plain(b, last);
-    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
+    est_factors_inflate(self, SLIP_DOUBT);
 }
 
-#if EST_WITH_ROBUSTNESS
 /// Compute theta in the plain form of est.h, after the first coefficient of A.
-EST_SHARED void compute_plain(const est_t* const self, const est_shape_t shape, float* const plain) {
-    float* const b = &plain[shape.na + 1U];
-    plain[0]       = 1.0F;
+EST_SHARED void compute_plain(const est_t* const self, const est_shape_t given, float* const plain) {
+    plain[0] = 1.0F;
     (void)append(&plain[1], self->theta, EST_THETA_MAX);
+    const est_shape_t shape = est_shape_here(self->config, given);
+    float* const      b     = &plain[shape.na + 1U];
+#if EST_WITH_ROBUSTNESS
     if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
         b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
     }
-    if (est_delta_applies(self->config)) {
+#endif
+    if (est_delta_applies(self)) {
         est_delta_to_plain(plain, shape.na);
         est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
     }
 }
-#endif
 
 /// Compute the estimate of A, contracted: 1, c[0], ... With noise on the output, the noise of the equations is coloured
 /// by A (thesis section 3.5).
-EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const out) {
-    float factor = 1.0F;
-    *out         = 1.0F;
+EST_SHARED void contract_a(const est_t* const self, const est_shape_t shape, float* const out) {
+    const uint_fast8_t na     = est_shape_here(self->config, shape).na;
+    float              factor = 1.0F;
+    *out                      = 1.0F;
     (void)append(&out[1], self->theta, na);
-    if (est_delta_applies(self->config)) {
+    if (est_delta_applies(self)) {
         est_delta_to_plain(out, na);
     }
     EST_UNROLL
@@ -175,9 +176,10 @@ EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float
     }
 }
 
-EST_SHARED void refresh_prefilter(est_t* const self, const uint_fast8_t na) {
-    float a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
-    contract_a(self, na, a);
+EST_SHARED void refresh_prefilter(est_t* const self, const est_shape_t shape) {
+    const uint_fast8_t na                 = est_shape_here(self->config, shape).na;
+    float              a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
+    contract_a(self, shape, a);
     self->refresh_in = self->config->refresh_n;
     if (est_whitener_accepts(&a[1], EST_NA_MAX)) {
         est_whitener_set(&self->whitener, &a[1], na);
@@ -188,14 +190,14 @@ EST_SHARED void refresh_prefilter(est_t* const self, const uint_fast8_t na) {
 /// Complete the work that the last step left.
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
-        est_factors_reset(&self->factors, self->config);
+        est_factors_reset(self);
         if (EST_WITH_ADAPTATION) {
             self->refresh_in = self->config->refresh_n;
         }
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
-        refresh_prefilter(self, est_shape_of(self->config).na);
+        refresh_prefilter(self, est_shape_of(self->config));
     } else {
         // the last step left no work
     }
@@ -211,6 +213,15 @@ EST_INLINE void forget_residuals(est_t* const self) {
 #endif
 }
 
+/// Forget the last innovations: the next one does not follow them.
+EST_INLINE void forget_innovations(est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    est_correlation_forget(&self->correlation);
+#else
+    (void)self;
+#endif
+}
+
 /// Count one sample towards the next complete equation. The step has time for the work that an alarm or a slip left,
 /// because it has no equation of its own.
 static void gather(est_t* const self) {
@@ -219,6 +230,7 @@ static void gather(est_t* const self) {
     renew(self);
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
+        forget_innovations(self);
         forget_residuals(self);
         self->settled = false;
         increment(&self->counters.restarts);
@@ -227,19 +239,17 @@ static void gather(est_t* const self) {
 
 /// Declare the samples so far unknown: the next equation must not use them.
 EST_SHARED void forget_samples(est_t* const self) {
-    if (self->known) {
-        self->known     = false;
-        self->pending_n = count_past(self->config);
-        if (EST_WITH_EDGES) {
-            self->doubt_n = 0U;
-        }
+    self->known     = false;
+    self->pending_n = count_past(self->config);
+    if (EST_WITH_EDGES) {
+        self->doubt_n = 0U;
     }
 }
 
 /// Set theta to zero.
-static void clear_theta(est_t* const self) {
+EST_SHARED void clear_theta(est_t* const self) {
     clear(self->theta, EST_THETA_MAX);
-    if (est_delta_applies(self->config)) {
+    if (est_delta_applies(self)) {
         self->theta[0] = 1.0F;  // the first coefficient of A, which is no parameter
         est_delta_from_plain(self->theta, self->config->na);
         *append(self->theta, &self->theta[1], self->config->na) = 0.0F;
@@ -251,7 +261,7 @@ static void clear_theta(est_t* const self) {
 EST_INLINE void subtract_reference(est_t* const self, float* const u, float* const y) {
 #if EST_WITH_ROBUSTNESS
     if (est_shape_of(self->config).offset > 0U) {
-        if ((self->counters.updated == 0U) && est_delta_applies(self->config)) {
+        if ((self->counters.updated == 0U) && est_delta_applies(self)) {
             self->reference_u = *u;
             self->reference_y = *y;
         }
@@ -266,7 +276,7 @@ EST_INLINE void subtract_reference(est_t* const self, float* const u, float* con
 }
 
 /// True iff the code is finite and within +-EST_CODE_LIMIT.
-static bool is_plausible(const float code) { return within(code, -EST_CODE_LIMIT, EST_CODE_LIMIT); }
+static bool is_plausible(const float code) { return est_magnitude(code) <= EST_CODE_LIMIT; }
 
 /// True iff the code is within the range of the converter. False for NaN and the infinities.
 static bool in_range(const est_config_t* const config, const float code) {
@@ -302,7 +312,7 @@ EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
 
 /// Innovation of the last equation, with the present theta.
 static float last_innovation(const est_t* const self) {
-    const uint_fast8_t count = est_theta_count(self);
+    const uint_fast8_t count = EST_FOR_SIZE ? EST_THETA_MAX : est_theta_count(self);  // the rest is zero
     float              out   = self->whitener.past[0].x[0];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < count; i++) {
@@ -312,10 +322,15 @@ static float last_innovation(const est_t* const self) {
 }
 #endif
 
+/// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
+EST_SHARED bool other_reading_leads(const est_t* const self) {
+    return (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger);
+}
+
 /// Enter an edge into the doubt. It joins the doubt about earlier edges if another reading of these leads; otherwise it
 /// begins a new doubt.
 static void doubt_edge(est_t* const self) {
-    if ((self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+    if (other_reading_leads(self)) {
         return;  // MISRA D4
     }
     const float step = self->u[0] - self->u[1];
@@ -382,7 +397,7 @@ static void enter_edge(est_t* const self) {
 /// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
 static bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return (self->pending_n == 0U) && (self->trigger.quiet_n == 0U) && (self->same_n == 0U) &&
+    return (((uint32_t)self->pending_n + self->trigger.quiet_n + self->same_n) == 0U) &&
            (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
            (est_shape_of(self->config).nc == 0U);
 #else
@@ -445,12 +460,9 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
 #if EST_WITH_ROBUSTNESS
     est_edges_compare(&self->edges, e, effect);
     if ((self->doubt_n >= EST_DOUBT_N) && est_edges_displaced(&self->edges)) {
-        self->edges_vary      = true;
-        self->scale.inflation = 1.0F;
-        if (self->scale.share > 0.0F) {
-            self->scale.share = EST_SHARE_WARM;
-        }
-        est_scale_restart(&self->scale, self->noise_variance);
+        self->edges_vary  = true;
+        self->correlation = (est_correlation_t){ .work = 0U };
+        est_scale_forgive(self);
     }
 #else
     (void)self;
@@ -461,16 +473,15 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
 
 /// Enter the innovation under the other readings of the edges in doubt. They are compared with theta before the doubt,
 /// because the estimate has followed the recorded reading since.
-EST_INLINE est_finding_t judge_readings(est_t* const                self,
-                                        const est_shape_t           shape,
-                                        const est_equation_t* const equation,
-                                        const float                 weight) {
-    const float e = (self->doubt_n > 1U) ? est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape))
-                                         : equation->innovation;  // theta has not changed yet
-    const est_shares_t shares = est_edges_shares(self, shape);
-    watch_edges(self, e, shares.early - shares.late);
-    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - shares.early, e - shares.late,
-                                     weight, self->doubt_n >= EST_DOUBT_N);
+EST_INLINE void
+judge_readings(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float weight) {
+    const bool  same = !EST_FOR_SIZE && (self->doubt_n <= 1U);  // theta has not changed yet
+    const float e =
+        same ? equation->innovation : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
+    float share[EST_OTHER_READINGS];
+    est_edges_shares(self, shape, share);
+    watch_edges(self, e, share[0] + share[1]);
+    est_trigger_enter_readings(&self->trigger, e, share, weight);
 }
 
 /// Store the residual of an equation after its update: it replaces e in the next equations (thesis section 3.5).
@@ -504,7 +515,7 @@ static bool remembers_edge(const est_t* const self) {
 /// taken at the next sample, which has no equation.
 EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
     float a[EST_NA_MAX + 1U];
-    contract_a(self, shape.na, a);
+    contract_a(self, shape, a);
     const float moved = distance(&self->whitener, &a[1], shape.na);
     if (moved < REFRESH_STEP) {
         self->renewal    = EST_RENEWAL_NONE;
@@ -521,13 +532,13 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
 /// reading of the edges leads, because theta may have followed an edge that was misread. A doubt alone does not suspend
 /// it: with edges in quick succession it never ends.
 EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
-    if (EST_WITH_EDGES && (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+    if (EST_WITH_EDGES && other_reading_leads(self)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self, shape);
     } else if (self->renewal == EST_RENEWAL_PREFILTER) {
         self->renewal = EST_RENEWAL_NONE;
-        refresh_prefilter(self, shape.na);
+        refresh_prefilter(self, shape);
     } else if (remembers_edge(self)) {
         self->renewal = EST_RENEWAL_COMPARE;
     } else {
@@ -542,9 +553,9 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 static void put_on_trial(est_t* const self, const bool overflown) {
 #if EST_WITH_ROBUSTNESS
     if (self->scale.trial_n > 0U) {
-        est_scale_conclude(&self->scale, self->noise_variance);
+        est_scale_conclude(self);
     }
-    if (!overflown && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
+    if (!overflown && self->cusum) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
@@ -566,7 +577,7 @@ static void raise_alarm(est_t* const self, est_step_t* const step) {
     if (overflown) {
         step->statistic = FLT_MAX;
         if (EST_WITH_ADAPTATION) {  // P may have overflowed with the residuals in its regressors
-            est_factors_reset(&self->factors, self->config);
+            est_factors_reset(self);
         }
     }
     self->renewal = EST_RENEWAL_RESET;
@@ -590,18 +601,20 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
     } else {
         increment_long(&self->counters.missing);
     }
-    const bool bridged = can_bridge(self);
+    if (!can_bridge(self)) {
+        self->known = false;
+    }
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->doubt_n++;
-        if (!bridged || (self->doubt_n >= EST_DOUBT_N)) {  // the last sample of a doubt decides and must be good
+        if (!self->known || (self->doubt_n >= EST_DOUBT_N)) {  // the last sample of a doubt decides and must be good
+            self->doubt_n = 0U;
             if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
                 note_slip(self);
             }
-            self->doubt_n = 0U;
         }
     }
 #if EST_WITH_ROBUSTNESS
-    if (bridged && self->known) {
+    if (self->known) {
         self->bridged_n++;
         shift_u(self, self->u[0]);
         *y = self->y[0];
@@ -615,14 +628,10 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
     return false;
 }
 
-/// Update everything an equation determines besides theta.
-static void adapt(est_t* const self, const est_shape_t shape, const float* const x) {
-    const est_config_t* const config = self->config;
-    if (config->random_walk > 0.0F) {
-        est_factors_walk(&self->factors, config->random_walk, est_shape_count(shape));
-        est_factors_inflate(&self->factors, config, 1.0F);
-    }
-    store_residual(self, x);
+/// Let every parameter become less certain: the random walk of the configuration.
+static void walk(est_t* const self) {
+    est_factors_walk(&self->factors, self->config->random_walk, est_theta_count(self));
+    est_factors_inflate(self, 1.0F);
 }
 
 /// Weight of a squared innovation of unit precision in the cumulative sum.
@@ -640,7 +649,7 @@ EST_INLINE float weight_of(const est_t* const self) {
 static void find_hidden_change(est_t* const self) {
     est_scale_t* const scale = &self->scale;
     est_scale_count_high(scale, self->noise_variance);
-    if ((self->trigger.quiet_n > 0U) || (self->config->trigger.kind != EST_TRIGGER_CUSUM) || (scale->share <= 0.0F)) {
+    if ((self->trigger.quiet_n > 0U) || !self->cusum || (scale->share <= 0.0F)) {
         scale->high_n = 0U;
     } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
         scale->high_n           = 0U;
@@ -650,23 +659,45 @@ static void find_hidden_change(est_t* const self) {
     }
 }
 
+/// Let the correlation of the innovations follow a complete block.
+static void follow_correlation(est_t* const self) {
+    if (self->cusum && (self->correlation.work > 0U)) {
+        const float share = (self->trigger.quiet_n > 0U) ? EST_PARTIAL_WARM : EST_PARTIAL_SHARE;
+        est_correlation_follow(&self->correlation, &self->scale, self->noise_variance, share);
+    }
+}
+
+/// Let the noise variance follow a complete block.
+static void follow_noise(est_t* const self) {
+    const est_scale_t* const scale = &self->scale;
+    const bool               warm  = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
+    est_scale_follow(self, warm ? EST_SHARE_MIN : EST_SHARE_WARM, est_correlation_smooth(&self->correlation));
+}
+
 /// Update the scale after a block. A block that ends with a large statistic may contain a change and is discarded.
-/// Two steps, so that none is long.
+/// Several steps, so that none is long.
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    if (!scale->followed) {
-        if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
-            const bool warm = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
-            self->noise_variance =
-                est_scale_follow(scale, self->noise_variance, EST_NOISE_LEAST * self->config->noise_variance,
-                                 warm ? EST_SHARE_MIN : EST_SHARE_WARM);
+    const bool counts = (scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling));
+    if (scale->stage == EST_STAGE_CORRELATION) {
+        if (counts) {
+            follow_correlation(self);
         }
-        scale->followed = true;
-    } else {
+    } else if (scale->stage == EST_STAGE_NOISE) {
+        if (counts) {
+            follow_noise(self);
+        }
+    } else if (scale->stage == EST_STAGE_CHANGE) {
         find_hidden_change(self);
+        if (self->cusum) {
+            est_correlation_restart(&self->correlation);
+        }
+    } else {
         est_scale_relax(scale);
-        est_scale_restart(scale, self->noise_variance);
+        est_scale_restart(self);
+        return;  // MISRA D4
     }
+    scale->stage++;
 }
 
 /// Continue the trial of the last alarm by one equation.
@@ -675,7 +706,7 @@ try_alarm(est_t* const self, const est_shape_t shape, const est_equation_t* cons
     const float old = est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     const float e   = equation->innovation;
     if (!est_scale_try(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
-        est_scale_conclude(&self->scale, self->noise_variance);
+        est_scale_conclude(self);
     }
 }
 #endif
@@ -711,7 +742,7 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
         if (EST_FOR_SIZE) {
-            est_factors_inflate(&self->factors, self->config, 1.0F);
+            est_factors_inflate(self, 1.0F);
         } else {
             est_factors_scale(&self->factors, self->config, shape, 1.0F);
         }
@@ -723,7 +754,8 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
 EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
     float* const past = self->whitener.past[0].x;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        (void)est_edges_shares(self, shape);
+        float share[EST_OTHER_READINGS];
+        est_edges_shares(self, shape, share);
     }
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -732,9 +764,36 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     self->y[0] -= innovation;
 }
 
+/// Enter an innovation into the statistic. `term`: of the cumulative sum, `weight`: of a squared innovation in it;
+/// `precision`: reciprocal of the innovation's variance [1 / noise variance]; `held`: the statistic is held at zero.
+EST_INLINE void enter_innovation(
+    est_t* const self, const float e, const float term, const float weight, const float precision, const bool held) {
+    est_trigger_t* const trigger = &self->trigger;
+    const float          share   = est_trigger_share(held);
+#if EST_WITH_ROBUSTNESS
+    est_correlation_t* const correlation = &self->correlation;
+    if (correlation->work == 0U) {
+        trigger->statistic = est_trigger_sum(trigger->statistic, share * term);
+        return;  // the usual step; MISRA D4
+    }
+    if (correlation->work != EST_WORK_OTHER_TRIGGER) {
+        if (self->scale.left_n > 0U) {
+            self->scale.product += precision * est_correlation_product(correlation, e);
+        }
+        trigger->statistic =
+            est_correlation_read(correlation, e, trigger->statistic, share * term, share * weight, precision);
+        return;  // MISRA D4
+    }
+#else
+    (void)weight;
+#endif
+    est_trigger_enter(trigger, &self->config->trigger, e, self->noise_variance / precision, share * term, held);
+}
+
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
-    est_equation_t            equation;
+    float                     x[EST_THETA_MAX + 2U];  // the last one is spare: gcc warns of an access that never is
+    est_equation_t            equation = { .x = x };
     float                     weight_min;
     if (self->settled) {
         equation.variance = 1.0F;
@@ -754,21 +813,22 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         return;  // MISRA D4
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
-    if (EST_WITH_ADAPTATION && self->adaptive) {
-        adapt(self, shape, equation.x);
+    if (EST_WITH_ADAPTATION) {
+        if (!same_bits(config->random_walk, 0.0F)) {  // shorter than a comparison
+            walk(self);
+        }
+        store_residual(self, equation.x);
     }
-    const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
+    const bool  held   = est_trigger_holds(&self->trigger);
     const float weight = precision * weight_of(self);
     const float term   = est_trigger_term(equation.innovation, weight);
-    const float share  = held ? 0.0F : 1.0F;  // a theta that overflows raises an alarm all the same
-    est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, self->noise_variance / precision,
-                      share * term, held);
-    step->innovation      = equation.innovation;
-    step->statistic       = self->trigger.statistic;
-    est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
+    enter_innovation(self, equation.innovation, term, weight, precision, held);
+    step->innovation = equation.innovation;
+    step->statistic  = self->trigger.statistic;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        finding = judge_readings(self, shape, &equation, share * weight);
+        judge_readings(self, shape, &equation, est_trigger_share(held) * weight);
     }
+    const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->doubt_n);
     if (finding == EST_ALARM) {
         raise_alarm(self, step);
         return;  // MISRA D4
@@ -806,12 +866,9 @@ static void dispatch_equation(est_t* const self, const float y, est_step_t* cons
 
 // ---------------------------------------------          API           ---------------------------------------------
 
-/// Copy the configuration. Without this function gcc emits one store for each field.
-EST_SHARED est_config_t copy_config(const est_config_t* const config) { return *config; }
-
 est_config_t est_config_default(void) {
     static const est_config_t config = EST_CONFIG_DEFAULT;
-    return copy_config(&config);
+    return config;
 }
 
 bool est_init(est_t* const self, const est_config_t* const config) {
@@ -820,17 +877,18 @@ bool est_init(est_t* const self, const est_config_t* const config) {
         return false;  // MISRA D4
     }
     *self                = (est_t){ .config = config };
-    self->adaptive       = EST_WITH_ADAPTATION && needs_adaptation(config);
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
 #if EST_WITH_ROBUSTNESS
-    est_scale_init(&self->scale, config);
+    self->cusum = config->trigger.kind == EST_TRIGGER_CUSUM;
+    est_scale_init(self);
+    self->correlation.work = self->cusum ? 0U : EST_WORK_OTHER_TRIGGER;
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);
-    self->pending_n = count_past(config);
-    est_factors_reset(&self->factors, config);
-    est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
+    forget_samples(self);
+    est_factors_reset(self);
+    self->trigger.quiet_n = config->trigger.warm_up_n;
     return true;
 }
 
@@ -886,9 +944,8 @@ float est_variance(const est_t* const self, const uint8_t index) {
     float             factor[EST_THETA_MAX + 1U];  // 0 for the first coefficient of A, then those of theta
     clear(factor, EST_THETA_MAX + 1U);
     factor[index + 1U] = 1.0F;
-    if (est_delta_applies(self->config)) {
-        est_delta_difference(factor, shape.na);
-        est_delta_difference(&factor[shape.na + 1U], (uint_fast8_t)(shape.nb - 1U));
+    if (est_delta_applies(self)) {
+        est_delta_difference_both(factor, shape.na, shape.nb);
     }
 #if EST_WITH_ROBUSTNESS
     if (est_is_offset(shape, index)) {  // see compute_plain()
@@ -896,7 +953,8 @@ float est_variance(const est_t* const self, const uint8_t index) {
         factor[shape.na + shape.nb] -= self->reference_u;
     }
 #endif
-    return est_factors_variance(&self->factors, est_shape_count(shape), &factor[1]);
+    const uint_fast8_t count = EST_FOR_SIZE ? EST_THETA_MAX : est_shape_count(shape);  // the rest is zero
+    return est_factors_variance(&self->factors, count, &factor[1]);
 }
 
 float est_noise_variance(const est_t* const self) {
@@ -907,7 +965,7 @@ float est_noise_variance(const est_t* const self) {
 float est_scale(const est_t* const self) {
     EST_ASSERT(self != NULL);
 #if EST_WITH_ROBUSTNESS
-    return self->noise_variance * self->scale.inflation;
+    return self->noise_variance * est_scale_factor(&self->scale);
 #else
     return self->noise_variance;
 #endif
@@ -927,11 +985,11 @@ bool est_invariants_hold(const est_t* const self) {
     if ((self == NULL) || (self->config == NULL) || !est_config_valid(self->config)) {
         return false;  // MISRA D4
     }
-    for (uint_fast8_t i = 0U; i < est_theta_count(self); i++) {
-        if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !within(self->theta[i], -FLT_MAX, FLT_MAX)) {
+    for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
+        if (!(est_magnitude(self->theta[i]) <= FLT_MAX) || !within(self->factors.d[i], FLT_MIN, FLT_MAX)) {
             return false;  // MISRA D4
         }
     }
-    return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) &&
-           within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, FLT_MIN, FLT_MAX);
+    return within(self->noise_variance, FLT_MIN, FLT_MAX) && within(self->trigger.statistic, 0.0F, FLT_MAX) &&
+           within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F);
 }

@@ -376,11 +376,13 @@ typedef struct {
     est_past_t past[EST_THETA_MAX + 1U];  ///< one for each element of the equation
 } est_whitener_t;
 
-/// Effect of the recent edges of u if they had come one sample early or late. Private to est_edges.h.
+/// Readings of the recent edges other than the recorded one: one sample early, one sample late.
+#define EST_OTHER_READINGS 2U
+
+/// Effect of the recent edges of u under the other readings. Private to est_edges.h.
 typedef struct {
-    est_past_t early;                 ///< their share in the whitened equations
-    est_past_t late;                  ///< the same for late edges
-    float      theta[EST_THETA_MAX];  ///< theta before the first of these edges, or before an alarm on trial
+    est_past_t past[EST_OTHER_READINGS];  ///< their share in the whitened equations
+    float      theta[EST_THETA_MAX];      ///< theta before the first of these edges, or before an alarm on trial
 #if EST_WITH_ROBUSTNESS
     float along;   ///< sum of innovation times the effect of a displaced edge, since the edge
     float span;    ///< sum of that effect squared
@@ -388,9 +390,6 @@ typedef struct {
     float misfit;  ///< evidence that each edge is displaced otherwise
 #endif
 } est_edges_t;
-
-/// Readings of the recent edges other than the recorded one: one sample early, one sample late.
-#define EST_OTHER_READINGS 2U
 
 /// State of a trigger. Private to est_trigger.h.
 typedef struct {
@@ -402,16 +401,27 @@ typedef struct {
 
 /// Scale of the innovations and the trial of the last alarm. Private to est_scale.h.
 typedef struct {
-    uint8_t left_n;    ///< equations left in this block; 0: it is complete, or an alarm is on trial
-    bool    followed;  ///< the noise variance contains this block
-    uint8_t trial_n;   ///< equations since the alarm on trial; 0: none is
-    uint8_t high_n;    ///< steps of high blocks
-    float   weight;    ///< of a squared innovation in the cumulative sum
-    float   sum;    ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
-    float   share;  ///< share of this block in the noise variance
-    float   inflation;  ///< factor for what the model does not explain
-    float   credit;     ///< alarms that may be justified without being plain
+    uint8_t left_n;   ///< equations left in this block; 0: it is complete, or an alarm is on trial
+    uint8_t stage;    ///< of the update after a complete block
+    uint8_t trial_n;  ///< equations since the alarm on trial; 0: none is
+    uint8_t high_n;   ///< steps of high blocks
+    float   weight;   ///< of a squared innovation in the cumulative sum
+    float   sum;      ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
+    float   product;  ///< sum of this block's products of innovations at one lag: see est_correlation.h
+    float   share;    ///< share of this block in the noise variance
+    float   inflation;   ///< factor for what the model does not explain
+    float   dispersion;  ///< mean of the squared mean squares of the blocks [noise variances^2]
+    float   credit;      ///< alarms that may be justified without being plain
 } est_scale_t;
+
+/// Serial correlation of the innovations. Private to est_correlation.h.
+typedef struct {
+    uint8_t work;        ///< of each step of this block; 0: none
+    uint8_t turn;        ///< blocks so far
+    float   last[2];     ///< innovations of the last two equations, newest first [codes]
+    float   partial[2];  ///< partial correlations at lags 1 and 2
+    float   lead;        ///< sum of the first reading less that of the second
+} est_correlation_t;
 
 /// Work that a step leaves to the next one. Private.
 typedef enum {
@@ -427,23 +437,24 @@ typedef enum {
 /// below 128 bytes fits a short Thumb instruction.
 typedef struct {
     const est_config_t* config;
-    uint8_t             same_n;     ///< samples of constant y since an edge of u
-    uint8_t             pending_n;  ///< samples needed before the next equation is complete
-    bool                adaptive;   ///< residuals, random walk or noise variance need an update
-    est_renewal_t       renewal;    ///< work left by the last step
-    bool                known;      ///< the previous sample is known; if not, pending_n > 0
-    bool                settled;    ///< the gains of the whitener are c, and its variance is 1
-    uint8_t             doubt_n;    ///< samples since the first edge in doubt, inclusive; 0: no doubt
+    uint16_t            edge_age_n;  ///< samples since the last edge of u
+    uint8_t             same_n;      ///< samples of constant y since an edge of u
+    uint8_t             pending_n;   ///< samples needed before the next equation is complete
+    est_renewal_t       renewal;     ///< work left by the last step
+    bool                known;       ///< the previous sample is known; if not, pending_n > 0
+    bool                settled;     ///< the gains of the whitener are c, and its variance is 1
+    uint8_t             doubt_n;     ///< samples since the first edge in doubt, inclusive; 0: no doubt
 #if EST_WITH_ROBUSTNESS
+    bool    cusum;       ///< the trigger is the cumulative sum
     bool    edges_vary;  ///< edges come anywhere, against the configuration
     uint8_t bridged_n;   ///< samples before the next one that were predicted
 #endif
     uint16_t refresh_in;  ///< equations until C is compared with A; 0: never
-    uint16_t edge_age_n;  ///< samples since the last edge of u
 #if EST_WITH_ROBUSTNESS
-    est_scale_t scale;
-    float       reference_u;  ///< codes of the first sample, subtracted from all if the offset is estimated
-    float       reference_y;
+    est_scale_t       scale;
+    est_correlation_t correlation;
+    float             reference_u;  ///< codes of the first sample, subtracted from all if the offset is estimated
+    float             reference_y;
 #endif
     est_trigger_t  trigger;
     est_counters_t counters;

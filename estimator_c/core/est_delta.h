@@ -16,8 +16,13 @@
 
 /// True iff this configuration uses the delta form: with the cumulative sum. The other triggers keep the parameters and
 /// the prior of the thesis.
-EST_INLINE bool est_delta_applies(const est_config_t* const config) {
-    return EST_WITH_ROBUSTNESS && (config->trigger.kind == EST_TRIGGER_CUSUM);
+EST_INLINE bool est_delta_applies(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return self->cusum;
+#else
+    (void)self;
+    return false;
+#endif
 }
 
 /// Replace order + 1 consecutive values, newest first, by D^order x(k), D^(order-1) x(k-1), ..., x(k-order).
@@ -31,27 +36,28 @@ EST_ROBUST_SHARED void est_delta_difference(float* const x, const uint_fast8_t o
     }
 }
 
-/// Coefficients of the values from those of these differences: the transpose of the above. The first is the same in
-/// both forms.
-EST_ROBUST_SHARED void est_delta_to_plain(float* const x, const uint_fast8_t order) {
+/// Replace y(k), y(k-1), ..., u(k-nk), ... by their differences, and a gradient in plain coefficients likewise.
+EST_ROBUST_SHARED void est_delta_difference_both(float* const x, const uint_fast8_t na, const uint_fast8_t nb) {
+    est_delta_difference(x, na);
+    est_delta_difference(&x[na + 1U], (uint_fast8_t)(nb - 1U));
+}
+
+/// Add to each coefficient `factor` times the one before it: n passes, each over one coefficient more than the last.
+EST_ROBUST_SHARED void est_delta_add(float* const x, const uint_fast8_t order, const float factor) {
     EST_UNROLL
     for (uint_fast8_t n = 1U; n <= (EST_WITH_ROBUSTNESS ? order : 0U); n++) {
         EST_UNROLL
         for (uint_fast8_t i = n; i > 0U; i--) {
-            x[i] -= x[i - 1U];
+            x[i] += factor * x[i - 1U];
         }
     }
 }
 
+/// Coefficients of the values from those of these differences: the transpose of the above. The first is the same in
+/// both forms.
+EST_INLINE void est_delta_to_plain(float* const x, const uint_fast8_t order) { est_delta_add(x, order, -1.0F); }
+
 /// The inverse of est_delta_to_plain().
-EST_ROBUST_SHARED void est_delta_from_plain(float* const x, const uint_fast8_t order) {
-    EST_UNROLL
-    for (uint_fast8_t n = EST_WITH_ROBUSTNESS ? order : 0U; n > 0U; n--) {
-        EST_UNROLL
-        for (uint_fast8_t i = 1U; i <= n; i++) {
-            x[i] += x[i - 1U];
-        }
-    }
-}
+EST_INLINE void est_delta_from_plain(float* const x, const uint_fast8_t order) { est_delta_add(x, order, 1.0F); }
 
 #endif  // EST_DELTA_H_INCLUDED

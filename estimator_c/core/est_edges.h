@@ -58,42 +58,43 @@ est_edges_begin(est_edges_t* const self, const est_config_t* const config, const
     const float before = (config->nk == 0U) ? (theta[config->na] * step) : 0.0F;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        self->early.x[i] = ((i == 0U) || EST_WITH_ROBUSTNESS) ? before : 0.0F;  // its differences are equal to it
-        self->late.x[i]  = 0.0F;
+        self->past[0].x[i] = ((i == 0U) || EST_WITH_ROBUSTNESS) ? before : 0.0F;  // its differences are equal to it
+        self->past[1].x[i] = 0.0F;
     }
     (void)append(self->theta, theta, EST_THETA_MAX);
 }
 
-/// Shares of early and of late edges in an equation, whitened.
-typedef struct {
-    float early;
-    float late;
-} est_shares_t;
-
 /// Compute what early edges, and late edges, would have added to the present equation, whitened. With an early edge u
 /// changes in the sample before it was recorded, with a late one in the sample after. u since the beginning of the
-/// doubt is therefore shifted by one sample against y, including its noise.
-EST_ROBUST_SHARED est_shares_t est_edges_shares(est_t* const self, const est_shape_t shape) {
-    est_edges_t* const edges     = &self->edges;
-    float              early_raw = 0.0F;
-    float              late_raw  = 0.0F;
+/// doubt is therefore shifted by one sample against y, including its noise. share[0] is that of early edges, share[1]
+/// that of late ones with the opposite sign.
+EST_ROBUST_SHARED void est_edges_shares(est_t* const self, const est_shape_t of, float* const share) {
+    const est_shape_t  shape = est_shape_here(self->config, of);
+    est_edges_t* const edges = &self->edges;
+    share[0]                 = 0.0F;
+    share[1]                 = 0.0F;
     if (self->edge_age_n < ((uint32_t)shape.nb + shape.nk)) {
         const float* const u = self->u;
         float              b[EST_NB_MAX];
         (void)append(b, &edges->theta[shape.na], shape.nb);
         est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
         EST_UNROLL
-        for (uint_fast8_t j = 0U; j < shape.nb; j++) {
-            const uint_fast8_t lag = (uint_fast8_t)(shape.nk + j);
-            late_raw -= b[j] * ((lag < self->doubt_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
-            if (lag > 0U) {
-                early_raw += b[j] * ((lag <= self->doubt_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
+        for (uint_fast8_t reading = 0U; reading < EST_OTHER_READINGS; reading++) {
+            float sum = 0.0F;
+            EST_UNROLL
+            for (uint_fast8_t j = 0U; j < shape.nb; j++) {
+                const uint_fast8_t lag = (uint_fast8_t)(shape.nk + j + reading);
+                if ((lag > 0U) && (lag <= self->doubt_n)) {
+                    sum += b[j] * (u[lag - 1U] - u[lag]);
+                }
             }
+            share[reading] = sum;
         }
     }
-    const float* const gain = est_filter_of(&self->whitener);
-    const float        late = est_filter(gain, &edges->late, late_raw);
-    return (est_shares_t){ .early = est_filter(gain, &edges->early, early_raw), .late = late };
+    EST_UNROLL
+    for (uint_fast8_t reading = 0U; reading < EST_OTHER_READINGS; reading++) {
+        share[reading] = est_filter(est_filter_of(&self->whitener), &edges->past[reading], share[reading]);
+    }
 }
 
 #endif  // EST_EDGES_H_INCLUDED

@@ -11,26 +11,22 @@
 #include "est_whitener.h"
 
 typedef struct {
-    float x[EST_THETA_MAX + 1U];  ///< y(k), followed by the regressor phi in the order of theta
-    float innovation;             ///< prediction error of y(k) [codes]
-    float variance;               ///< variance of the equation's noise [noise variances]
+    float* x;           ///< y(k), followed by the regressor phi in the order of theta
+    float  innovation;  ///< prediction error of y(k) [codes]
+    float  variance;    ///< variance of the equation's noise [noise variances]
 } est_equation_t;
 
 /// Fill x from the stored samples.
 EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const x) {
-    const bool   delta  = est_delta_applies(self->config);
     float* const inputs = append(&x[1], self->y, shape.na);
+    float*       out    = append(inputs, &self->u[shape.nk], shape.nb);
     x[0]                = y;
-    if (delta) {
-        est_delta_difference(x, shape.na);
+    if (est_delta_applies(self)) {
+        est_delta_difference_both(x, shape.na, shape.nb);
     }
     EST_UNROLL
     for (uint_fast8_t i = 1U; i <= shape.na; i++) {
         x[i] = -x[i];
-    }
-    float* out = append(inputs, &self->u[shape.nk], shape.nb);
-    if (delta) {
-        est_delta_difference(inputs, (uint_fast8_t)(shape.nb - 1U));
     }
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
@@ -64,15 +60,10 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
     const uint_fast8_t count = est_shape_count(shape);
-    float* const       x     = equation->x;          // cppcheck F2
-    float              gain[EST_NA_MAX] EST_ZEROED;  // MISRA D2
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        gain[i] = est_filter_of(whitener)[i];
-    }
+    float* const       x     = equation->x;
     EST_UNROLL
     for (uint_fast8_t j = 0U; j <= count; j++) {
-        x[j] = est_filter(gain, &whitener->past[j], x[j]);
+        x[j] = est_filter(est_filter_of(whitener), &whitener->past[j], x[j]);
     }
     equation->innovation = est_equation_residual(x, theta, count);
 }

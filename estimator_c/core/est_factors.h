@@ -37,33 +37,35 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
 }
 
 /// est_factors_scale() with the shape of the configuration.
-EST_SHARED void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
-    est_factors_scale(self, config, est_shape_of(config), factor);
+EST_SHARED void est_factors_inflate(est_t* const self, const float factor) {
+    est_factors_scale(&self->factors, self->config, est_shape_of(self->config), factor);
 }
 
-static inline void est_factors_reset(est_factors_t* const self, const est_config_t* const config) {
-    self->weight = 1.0F;
+static inline void est_factors_reset(est_t* const self) {
+    self->factors.weight = 1.0F;
     for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
-        self->d[j] = EST_VARIANCE_MAX;
+        self->factors.d[j] = EST_VARIANCE_MAX;
     }
-    clear(self->upper, EST_UPPER_N);
-    est_factors_inflate(self, config, 1.0F);  // limits each d to its prior
+    clear(self->factors.upper, EST_UPPER_N);
+    est_factors_inflate(self, 1.0F);  // limits each d to its prior
 }
 
 /// P := P + variance e e' with e the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.
 static inline void walk_row(est_factors_t* const self, const uint_fast8_t row, const float variance) {
-    float a[EST_THETA_MAX] = { 0.0F };  // MISRA D2
-    float c                = variance;
-    a[row]                 = 1.0F;
-    for (uint_fast8_t j = (uint_fast8_t)(row + 1U); j > 0U; j--) {
-        float* const column = &self->upper[((j - 1U) * (j - 2U)) / 2U];
-        const float  s      = a[j - 1U];
-        const float  before = self->d[j - 1U];
-        const float  d      = before + (c * s * s);
-        const float  b      = (c * s) / d;
+    float a[EST_THETA_MAX];
+    float c = variance;
+    clear(a, EST_THETA_MAX);
+    a[row] = 1.0F;
+    for (uint_fast8_t left = (uint_fast8_t)(row + 1U); left > 0U; left--) {
+        const uint_fast8_t j      = (uint_fast8_t)(left - 1U);
+        float* const       column = &self->upper[(j * (j - 1U)) / 2U];
+        const float        s      = a[j];
+        const float        before = self->d[j];
+        const float        d      = before + (c * s * s);
+        const float        b      = (c * s) / d;
         c *= before / d;
-        self->d[j - 1U] = d;
-        for (uint_fast8_t i = 0U; (i + 1U) < j; i++) {
+        self->d[j] = d;
+        for (uint_fast8_t i = 0U; i < j; i++) {
             a[i] -= s * column[i];
             column[i] += b * a[i];
         }

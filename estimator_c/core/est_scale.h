@@ -13,6 +13,12 @@
 /// was before the change.
 #define EST_BLOCK_N 32U
 
+/// Stages of the update after a block, one a step: the correlation of the innovations follows it, the noise variance
+/// does, a hidden change is found; then the next block begins.
+#define EST_STAGE_CORRELATION 0U
+#define EST_STAGE_NOISE 1U
+#define EST_STAGE_CHANGE 2U
+
 /// Smallest share of a new block in the noise variance: a memory of 1,000 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
 #define EST_SHARE_MIN 0.032F
@@ -27,6 +33,12 @@
 
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
 #define EST_MARGIN 2.0F
+
+/// Dispersion of the blocks, mean of their squared mean squares in noise variances, beyond which the scale grows, and
+/// factor. That of Gaussian innovations is 1.06; noise whose variance varies has more. Largest value of one block.
+#define EST_DISPERSED 1.15F
+#define EST_DISPERSION_GAIN 2.0F
+#define EST_DISPERSION_MAX 10.0F
 
 /// Smallest noise variance that is followed, in configured ones: quantisation alone, with the default. The innovations of
 /// a plant without noise come in bursts.
@@ -70,19 +82,42 @@
 
 #if EST_WITH_ROBUSTNESS
 
-/// Begin a block. The scale determines the weight of a squared innovation in the cumulative sum.
-EST_SHARED void est_scale_restart(est_scale_t* const self, const float noise_variance) {
-    self->weight   = EST_CUSUM_GAIN / (noise_variance * self->inflation * (1.0F + (EST_MARGIN * self->share)));
-    self->sum      = 0.0F;
-    self->left_n   = EST_BLOCK_N;
-    self->followed = false;
+/// Factor of the noise variance in the scale.
+EST_SHARED float est_scale_factor(const est_scale_t* const self) {
+    return self->inflation * (1.0F + (EST_DISPERSION_GAIN * est_max(self->dispersion - EST_DISPERSED, 0.0F)));
 }
 
-static inline void est_scale_init(est_scale_t* const self, const est_config_t* const config) {
-    self->inflation = 1.0F;
-    self->share     = config->noise_estimated ? 1.0F : 0.0F;
-    self->credit    = EST_CREDIT_MAX;
-    est_scale_restart(self, config->noise_variance);
+/// Begin a block. The scale determines the weight of a squared innovation in the cumulative sum.
+EST_SHARED void est_scale_restart(est_t* const estimator) {
+    est_scale_t* const self = &estimator->scale;
+    self->weight =
+        EST_CUSUM_GAIN / (estimator->noise_variance * est_scale_factor(self) * (1.0F + (EST_MARGIN * self->share)));
+    self->sum     = 0.0F;
+    self->product = 0.0F;
+    self->left_n  = EST_BLOCK_N;
+    self->stage   = 0U;
+}
+
+static inline void est_scale_init(est_t* const estimator) {
+    est_scale_t* const self = &estimator->scale;
+    self->inflation         = 1.0F;
+    self->dispersion        = 1.0F;
+    if (estimator->config->noise_estimated) {
+        self->share = 1.0F;
+    }
+    self->credit = EST_CREDIT_MAX;
+    est_scale_restart(estimator);
+}
+
+/// Begin anew with another model of the edges: the innovations so far are those of the wrong one.
+static inline void est_scale_forgive(est_t* const estimator) {
+    est_scale_t* const self = &estimator->scale;
+    self->inflation         = 1.0F;
+    self->dispersion        = 1.0F;
+    if (self->share > 0.0F) {
+        self->share = EST_SHARE_WARM;
+    }
+    est_scale_restart(estimator);
 }
 
 /// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
@@ -95,14 +130,24 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
     return true;
 }
 
-/// Noise variance after a complete block, at least `least`. `share_least`: smallest share of the next block.
-static inline float
-est_scale_follow(est_scale_t* const self, const float noise_variance, const float least, const float share_least) {
-    const float mean    = (self->sum * EST_MEAN_SQUARE) / self->weight;
-    const float limited = est_min(mean, EST_GROWTH_MAX * noise_variance);
-    const float noise   = noise_variance + (self->share * (limited - noise_variance));
-    self->share         = est_max(self->share / (1.0F + self->share), share_least);
-    return est_max(noise, least);
+/// Mean square of the innovations of a complete block.
+static inline float est_scale_mean(const est_scale_t* const self) {
+    return (self->sum * EST_MEAN_SQUARE) / self->weight;
+}
+
+/// Let the noise variance and the dispersion follow a complete block. `share_least`: smallest share of the next block.
+/// `smooth`: the squares have no peaks, and their dispersion does not count.
+static inline void est_scale_follow(est_t* const estimator, const float share_least, const bool smooth) {
+    est_scale_t* const self    = &estimator->scale;
+    const float        before  = estimator->noise_variance;
+    const float        mean    = est_scale_mean(self);
+    const float        ratio   = mean / before;
+    const float        square  = est_min(ratio * ratio, EST_DISPERSION_MAX);
+    const float        limited = est_min(mean, EST_GROWTH_MAX * before);
+    const float        noise   = before + (self->share * (limited - before));
+    self->dispersion           = smooth ? 1.0F : (self->dispersion + (self->share * (square - self->dispersion)));
+    self->share                = est_max(self->share / (1.0F + self->share), share_least);
+    estimator->noise_variance  = est_max(noise, EST_NOISE_LEAST * estimator->config->noise_variance);
 }
 
 /// Count a complete block if it is high.
@@ -131,18 +176,20 @@ static inline void est_scale_begin_trial(est_scale_t* const self) {
 }
 
 /// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
-EST_SHARED void est_scale_conclude(est_scale_t* const self, const float noise_variance) {
-    const bool  justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
-    const float cost      = ((self->sum * self->weight) > EST_PLAIN) ? 0.0F : 1.0F;
-    if (justified && (self->credit >= cost)) {
-        self->credit -= cost;
+EST_SHARED void est_scale_conclude(est_t* const estimator) {
+    est_scale_t* const self      = &estimator->scale;
+    const bool         justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
+    if (justified && ((self->sum * self->weight) > EST_PLAIN)) {
+        // a plain one costs no credit
+    } else if (justified && (self->credit >= 1.0F)) {
+        self->credit -= 1.0F;
     } else if (self->inflation < EST_INFLATION_MAX) {
         self->inflation *= EST_INFLATION_STEP;
     } else {
         // the scale is large enough
     }
     self->trial_n = 0U;
-    est_scale_restart(self, noise_variance);
+    est_scale_restart(estimator);
 }
 
 /// Enter one equation into the trial of an alarm: the squared errors of the old and the new estimate, the latter

@@ -31,7 +31,7 @@
 
 /// Functions with several callers. They are inline too, except in a build for size: its code would grow by a seventh.
 /// With EST_WITH_EDGES=0 most of them have one caller left, and gcc decides.
-#if EST_FOR_SIZE && EST_WITH_EDGES
+#if (EST_FOR_SIZE && EST_WITH_EDGES) || (defined(__GNUC__) && !defined(__OPTIMIZE__))
 #define EST_SHARED static __attribute__((noinline, unused))
 #elif EST_FOR_SIZE
 #define EST_SHARED static inline
@@ -40,7 +40,7 @@
 #endif
 
 /// Loops over the parameters and over small constants. A build for size keeps them as loops.
-#if (defined(__clang__) || (defined(__GNUC__) && (__GNUC__ >= 8))) && (defined(EST_FIXED_NA) || !EST_FOR_SIZE)
+#if (defined(__clang__) || (defined(__GNUC__) && (__GNUC__ >= 8))) && !EST_FOR_SIZE
 #define EST_UNROLL _Pragma("GCC unroll 8")
 #else
 #define EST_UNROLL
@@ -108,6 +108,15 @@ EST_SHARED float est_min(const float a, const float b) { return (a < b) ? a : b;
 /// The larger number; the second one if either is NaN.
 EST_SHARED float est_max(const float a, const float b) { return (a > b) ? a : b; }
 
+/// Count one up, to UINT16_MAX.
+EST_SHARED void increment(uint16_t* const counter) {
+    const uint32_t next = *counter + (uint32_t)1U;
+    *counter            = (uint16_t)(next - (next >> 16U));
+}
+
+/// True iff the number is in the range. False for NaN.
+EST_SHARED bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
+
 /// Orders of the model.
 typedef struct {
     uint8_t na;
@@ -131,6 +140,17 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
                           .nk     = config->nk,
                           .nc     = (EST_WITH_ADAPTATION && (EST_NC_MAX > 0U)) ? config->nc : 0U,
                           .offset = config->offset ? 1U : 0U };
+#endif
+}
+
+/// The shape, read anew in a build for size, where that is shorter than to pass it.
+EST_INLINE est_shape_t est_shape_here(const est_config_t* const config, const est_shape_t shape) {
+#if EST_FOR_SIZE
+    (void)shape;
+    return est_shape_of(config);
+#else
+    (void)config;
+    return shape;
 #endif
 }
 

@@ -19,7 +19,7 @@ static inline bool est_trigger_config_valid(const est_trigger_config_t* const co
         (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
         ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
-    return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
+    return known && reset && within(config->ceiling, FLT_MIN, EST_CEILING_LIMIT);
 }
 
 typedef enum {
@@ -33,7 +33,8 @@ static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t
     self->statistic = 0.0F;
     self->quiet_n   = quiet_n;
     if (EST_WITH_TRIGGERS) {
-        self->mean_n = 0U;
+        self->mean_n   = 0U;
+        self->rival[0] = 0.0F;
     }
 }
 
@@ -59,13 +60,11 @@ static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
 /// was a slip: the recorded reading has passed the ceiling, and another reading explained the innovations. Otherwise
 /// the statistic continues from the best reading. At its term, by contrast, a doubt has seen the whole effect of an
 /// edge, and the recorded reading continues.
-EST_ROBUST_SHARED bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
+static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
         return true;  // MISRA D4
     }
-    if (est_trigger_in_doubt(self)) {
-        self->statistic = est_trigger_best_rival(self);
-    }
+    self->statistic = est_min(est_trigger_best_rival(self), self->statistic);
     return false;
 }
 
@@ -99,25 +98,28 @@ EST_INLINE float est_trigger_term(const float innovation, const float weight) {
 /// Add one term to a cumulative sum.
 EST_SHARED float est_trigger_sum(const float before, const float term) {
     const float sum = before + (term - EST_CUSUM_DRIFT);
-    return (sum <= 0.0F) ? 0.0F : sum;
+    return est_max(0.0F, sum);
 }
 
-/// Enter the innovation under the other readings of the edges in doubt; the statistic already contains the recorded
-/// one. The plant has changed only if no reading explains the innovations, or if theta has overflowed. `expires`: the
-/// doubt has reached its term.
-static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
-                                                      const float          ceiling,
-                                                      const float          early,
-                                                      const float          late,
-                                                      const float          weight,
-                                                      const bool           expires) {
-    self->rival[0] = est_trigger_sum(self->rival[0], est_trigger_term(early, weight));
-    self->rival[1] = est_trigger_sum(self->rival[1], est_trigger_term(late, weight));
+/// Enter the innovation under the other readings of the edges in doubt. `share`: as from est_edges_shares().
+static inline void est_trigger_enter_readings(est_trigger_t* const self,
+                                              const float          innovation,
+                                              const float* const   share,
+                                              const float          weight) {
+    self->rival[0] = est_trigger_sum(self->rival[0], est_trigger_term(innovation - share[0], weight));
+    self->rival[1] = est_trigger_sum(self->rival[1], est_trigger_term(innovation + share[1], weight));
+}
+
+/// Judge all readings of the edges, after the innovation was entered into each. The plant has changed only if no reading
+/// explains the innovations, or if theta has overflowed. `doubt_n`: duration of the doubt so far, at most EST_DOUBT_N.
+EST_INLINE est_finding_t est_trigger_find(const est_trigger_t* const self,
+                                          const float                ceiling,
+                                          const uint_fast8_t         doubt_n) {
     if (self->statistic < ceiling) {
         return EST_QUIET;  // MISRA D4
     }
-    if ((est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
-        return expires ? EST_SLIP : EST_QUIET;  // MISRA D4
+    if (EST_WITH_EDGES && (doubt_n > 0U) && (est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
+        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_QUIET;  // MISRA D4
     }
     return EST_ALARM;
 }
@@ -126,8 +128,7 @@ static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
 static inline float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
     const float  term = absolute ? est_magnitude(innovation) : innovation;
     float* const mean = &self->rival[0];
-    *mean             = (self->mean_n == 0U) ? 0.0F : *mean;
-    self->mean_n      = (uint16_t)(self->mean_n + ((self->mean_n < UINT16_MAX) ? 1U : 0U));
+    increment(&self->mean_n);
     *mean += (term - *mean) / (float)self->mean_n;
     return est_magnitude(*mean);
 }
@@ -156,13 +157,16 @@ static inline float est_trigger_other_statistic(est_trigger_t* const            
 }
 
 /// True iff the statistic is held at zero. Counts down the innovations of the hold.
-EST_INLINE bool est_trigger_holds(est_trigger_t* const self, const est_trigger_kind_t kind) {
+EST_INLINE bool est_trigger_holds(est_trigger_t* const self) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
         return true;  // MISRA D4
     }
-    return kind == EST_TRIGGER_NONE;
+    return false;
 }
+
+/// Share of a term that counts. A theta that overflows raises an alarm although the statistic is held at zero.
+EST_INLINE float est_trigger_share(const bool held) { return held ? 0.0F : 1.0F; }
 
 /// Enter one innovation [codes] as recorded, with its variance [codes^2] and its term in the cumulative sum. The term is
 /// zero while the statistic is held.
@@ -172,10 +176,10 @@ EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
                                   const float                       variance,
                                   const float                       term,
                                   const bool                        held) {
-    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && !held) {
+    if (EST_WITH_TRIGGERS && (config->kind > EST_TRIGGER_NONE) && (config->kind != EST_TRIGGER_CUSUM) && !held) {
         self->statistic = est_trigger_other_statistic(self, config, innovation, variance);
     } else {
-        self->statistic = est_trigger_sum(self->statistic, term);
+        self->statistic = est_trigger_sum(self->statistic, est_trigger_share(config->kind == EST_TRIGGER_NONE) * term);
     }
 }
 

@@ -27,7 +27,7 @@ EST_SHARED bool est_whitener_accepts(const float* const c, const uint_fast8_t na
     EST_UNROLL
     for (uint_fast8_t order = na; order > 0U; order--) {
         const float k = a[order - 1U];
-        if (!((k > -REFLECTION_MAX) && (k < REFLECTION_MAX))) {
+        if (!(est_magnitude(k) < REFLECTION_MAX)) {
             return false;  // MISRA D4
         }
         const float rest = 1.0F - (k * k);
@@ -78,7 +78,7 @@ EST_SHARED void est_whitener_set(est_whitener_t* const self, const float* const 
 static inline void est_whitener_restart(est_whitener_t* const self) {
     clear(self->precision, EST_NA_MAX);
     for (uint_fast8_t j = 0U; j <= EST_THETA_MAX; j++) {
-        clear(self->past[j].x, EST_NA_MAX);
+        self->past[j] = (est_past_t){ { 0.0F } };
     }
 }
 

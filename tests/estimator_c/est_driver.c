@@ -23,7 +23,7 @@ static void set_theta(const double* theta) {
     for (unsigned i = 0; i < est_theta_count(&self); i++) {
         self.theta[i] = (float)theta[i];
     }
-    if (est_delta_applies(&config)) {
+    if (est_delta_applies(&self)) {
         float a[] = { 1.0F, self.theta[0], self.theta[1] };
         est_delta_from_plain(a, 2U);
         self.theta[0] = a[1];

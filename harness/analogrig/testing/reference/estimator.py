@@ -25,7 +25,6 @@ from analogrig.testing.reference.regression import (
     to_delta,
     to_plain,
 )
-from analogrig.testing.reference.scale import WARM_N
 from analogrig.testing.reference.trigger import Meaning, ReferenceTrigger
 
 DOUBT_N = 12
@@ -198,7 +197,8 @@ class ReferenceEstimator:
     @property
     def is_doubtful(self) -> bool:
         """True if rounding may have decided a threshold: of A and C, of the edges, of the trigger or its scale."""
-        return self._is_doubtful or self.trigger.is_doubtful or self.trigger.scale.is_doubtful
+        scale = self.trigger.scale
+        return self._is_doubtful or self.trigger.is_doubtful or scale.is_doubtful or scale.correlation.is_doubtful
 
     @property
     def slips(self) -> int:
@@ -253,6 +253,7 @@ class ReferenceEstimator:
         if self.pending:
             return self._stepped(self.trigger.statistic, SteppedFlag.GATHERING)
         self.whitener.restart()
+        self.trigger.scale.correlation.forget()
         self.residuals = [0.0] * self.config.nc
         self.settled = False
         self.counters["restarts"] += 1
@@ -385,6 +386,8 @@ class ReferenceEstimator:
         self._adapt(equation)
         expires = self.doubt is not None and self.doubt.age_n >= DOUBT_N
         decision = self.trigger.enter(innovation, variance, readings, expires=expires)
+        if expires:
+            self._watch_edges()
         self.deviation = math.sqrt(variance * self.trigger.noise_variance)
         step = self._stepped(self.trigger.statistic, 0, innovation, alarm=decision is Meaning.ALARM)
         if decision is Meaning.ALARM:
@@ -406,7 +409,7 @@ class ReferenceEstimator:
             self._residual(equation, scale.old) ** 2 if scale.is_on_trial else 0.0,
             self.since_n,
             waits=self.refresh is not Refresh.WAITS,
-            warm=self.trigger.quiet_n >= WARM_N,
+            quiet_n=self.trigger.quiet_n,
             excess=self.trigger.excess,
         )
         if is_end:
@@ -437,8 +440,6 @@ class ReferenceEstimator:
         early, late = self._enter_readings(self.doubt)
         innovation = self._residual(equation, self.doubt.theta)
         self.displacement.enter(innovation, early - late)
-        if self.doubt.age_n >= DOUBT_N:
-            self._watch_edges()
         return innovation - early, innovation - late
 
     def _enter_readings(self, doubt: Doubt) -> tuple[float, float]:

@@ -266,7 +266,7 @@ class Work:
         """``kept``: samples from three before the earliest onset to the alarm."""
         self._plant, self._habits, self._onsets_n = plant, habits, onsets_n
         self._force_zero = estimator.config.force_zero
-        self._nats = 0.5 / (estimator.trigger.noise_variance * estimator.trigger.scale.inflation)
+        self._nats = 0.5 / (estimator.trigger.noise_variance * estimator.trigger.scale.factor)
         self._residuals = [kept[2][2], kept[1][2]]  # whitened, newest first
         self._force = [u - self._force_zero for u, _, _ in kept[2::-1]]  # newest first
         self._displacement = [y - plant.rest for _, y, _ in kept[2::-1]]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from enum import Enum
+
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.testing.reference.correlation import ReferenceCorrelation
 from analogrig.testing.reference.regression import Vector
 
 BLOCK_N = 32
@@ -20,11 +23,23 @@ TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
 JUSTIFIED, CREDIT_MAX, CREDIT_PER_BLOCK = 4.0, 4.0, BLOCK_N / 5000.0
 PLAIN = 64.0 * (TRIAL_N - TRIAL_BEGIN_N)
 """Squared errors of the old estimate, in expected variances, beyond which a justified alarm is plain."""
+DISPERSED, DISPERSION_GAIN, DISPERSION_MAX = 1.15, 2.0, 10.0
+"""Mean of the squared mean squares of blocks, in noise variances, beyond which the scale grows, factor, and largest
+value of a block."""
 NOISE_LEAST = 0.07
 """Smallest noise variance that is followed, in configured ones."""
 
 NEAR = 0.003
 """Relative distance from a threshold at which rounding may decide."""
+
+
+class Stage(Enum):
+    """Stage of the update after a block, one an equation."""
+
+    CORRELATION = 0
+    NOISE = 1
+    CHANGE = 2
+    END = 3
 
 
 class ReferenceScale:
@@ -33,9 +48,12 @@ class ReferenceScale:
     def __init__(self, config: EstimatorConfig) -> None:
         self.noise_variance = config.noise_variance
         self.inflation, self._credit = 1.0, CREDIT_MAX
+        self._is_cusum = config.trigger == "cusum"
         self._share = 1.0 if config.noise_estimated else 0.0
         """Share of the next block in the noise variance; 0: it is not followed."""
+        self._dispersion = 1.0
         self._trial_n, self._balance, self._energy = 0, 0.0, 0.0
+        self.correlation = ReferenceCorrelation()
         self.high_n = 0
         """Steps of high blocks."""
         self._old: Vector = []
@@ -55,12 +73,23 @@ class ReferenceScale:
         """Estimate before the alarm on trial."""
         return self._old
 
+    @property
+    def factor(self) -> float:
+        """Factor of the noise variance for what the model does not explain."""
+        return self.inflation * (1.0 + DISPERSION_GAIN * max(self._dispersion - DISPERSED, 0.0))
+
+    @property
+    def is_open(self) -> bool:
+        """True if the block is not complete."""
+        return self._left_n > 0
+
     def _apply(self) -> None:
-        self.expected = self.noise_variance * self.inflation * (1.0 + MARGIN * self._share)
+        self.expected = self.noise_variance * self.factor * (1.0 + MARGIN * self._share)
         """Variance that the trigger expects."""
 
     def _restart(self) -> None:
-        self._squares, self._left_n, self._is_followed = 0.0, BLOCK_N, False
+        self._squares, self._left_n, self._stage = 0.0, BLOCK_N, Stage.CORRELATION
+        self.correlation.restart_products()
 
     def begin_trial(self, old: Vector) -> None:
         """Compare the estimate ``old`` with those that follow. An earlier trial ends."""
@@ -85,19 +114,21 @@ class ReferenceScale:
 
     def forgive(self) -> None:
         """Begin anew with another model of the edges."""
-        self.inflation = 1.0
+        self.inflation = self._dispersion = 1.0
         self._share = SHARE_WARM if self._share else 0.0
+        self.is_doubtful |= self.correlation.is_doubtful
+        self.correlation = ReferenceCorrelation()
         self._restart()
         self._apply()
 
-    def enter(self, square: float, old_square: float, since_n: int, *, waits: bool, warm: bool, excess: float) -> bool:
-        """Enter one equation. Return true iff a block ends with it.
+    def enter(self, square: float, old_square: float, since_n: int, *, waits: bool, quiet_n: int, excess: float) -> bool:
+        """Enter one equation. Return true iff a hidden change is to be found with it.
 
         :param square: of its innovation, over the predicted variance in noise variances.
         :param old_square: of its innovation with the estimate on trial.
         :param since_n: samples since an edge.
         :param waits: the step has other work.
-        :param warm: the trigger will not be armed soon.
+        :param quiet_n: innovations before the trigger is armed.
         :param excess: statistic over half the ceiling.
         """
         if self._left_n:
@@ -105,11 +136,28 @@ class ReferenceScale:
             self._squares += square
         elif self._trial_n:
             self._try(square, old_square, since_n)
-        elif not waits and self._is_followed:
-            self._relax()
-            return True
         elif not waits:
-            self._follow(warm=warm, excess=excess)
+            return self._renew(quiet_n, excess)
+        return False
+
+    def _renew(self, quiet_n: int, excess: float) -> bool:
+        """Do one stage of the update after a block. Return true iff it is that of a hidden change.
+
+        A block whose sum is half way to an alarm is discarded.
+        """
+        stage, counts = self._stage, self._share > 0.0 and excess < 1.0
+        if stage in (Stage.CORRELATION, Stage.NOISE):
+            self.is_doubtful |= self._share > 0.0 and abs(excess - 1.0) < NEAR
+        self._stage = Stage(min(stage.value + 1, Stage.END.value))
+        if stage is Stage.CORRELATION and counts and self._is_cusum:
+            self.correlation.follow(self._squares / BLOCK_N, self.noise_variance, BLOCK_N, armed=quiet_n == 0)
+        elif stage is Stage.NOISE and counts:
+            self._follow(warm=quiet_n >= WARM_N)
+        elif stage is Stage.CHANGE:
+            self._count_high()
+            return True
+        elif stage is Stage.END:
+            self._relax()
         return False
 
     def _try(self, square: float, old_square: float, since_n: int) -> None:
@@ -120,26 +168,28 @@ class ReferenceScale:
         if self._trial_n >= TRIAL_MAX_N or (self._trial_n >= TRIAL_N and since_n < self._trial_n):
             self.end_trial()
 
-    def _follow(self, *, warm: bool, excess: float) -> None:
-        """Let the noise variance follow the complete block, unless its sum is half way to an alarm."""
-        self._is_followed = True
-        if not self._share:
-            return
-        self.is_doubtful |= abs(excess - 1.0) < NEAR
-        if excess < 1.0:
-            mean = min(self._squares / BLOCK_N, GROWTH_MAX * self.noise_variance)
-            self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), self._least)
-            least = SHARE_WARM if warm or self._share > SHARE_WARM else SHARE_MIN
-            self._share = max(self._share / (1.0 + self._share), least)
+    def _follow(self, *, warm: bool) -> None:
+        """Let the noise variance and the dispersion follow the complete block."""
+        mean = self._squares / BLOCK_N
+        square = min((mean / self.noise_variance) ** 2, DISPERSION_MAX)
+        self._dispersion += self._share * (square - self._dispersion)
+        if self.correlation.is_smooth:  # the squares have no peaks
+            self._dispersion = 1.0
+        mean = min(mean, GROWTH_MAX * self.noise_variance)
+        self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), self._least)
+        least = SHARE_WARM if warm or self._share > SHARE_WARM else SHARE_MIN
+        self._share = max(self._share / (1.0 + self._share), least)
 
-    def _relax(self) -> None:
-        """Count a high block. Let the inflation decrease, and the number of alarms that may be justified increase."""
+    def _count_high(self) -> None:
         height = self._squares / BLOCK_N / (HIGH * self.noise_variance)
         self.is_doubtful |= abs(height - 1.0) < NEAR
         if height < 1.0:
             self.high_n = max(self.high_n - 1, 0)
         elif self.high_n < HIGH_LIMIT:
             self.high_n += HIGH_STEP
+
+    def _relax(self) -> None:
+        """Let the inflation decrease, and the number of alarms that may be justified increase."""
         self.inflation = max(self.inflation * INFLATION_DECAY, 1.0)
         self._credit = min(self._credit + CREDIT_PER_BLOCK, CREDIT_MAX)
         self._restart()

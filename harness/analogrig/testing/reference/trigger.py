@@ -5,10 +5,8 @@ from __future__ import annotations
 from enum import Enum
 
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.testing.reference.correlation import cusum
 from analogrig.testing.reference.scale import HIGH_LIMIT, ReferenceScale
-
-GAIN, DRIFT = 0.4945, 1.1305
-"""Terms of the sum: GAIN z^2 - DRIFT, a multiple of the log-likelihood ratio of a variance 7.1 times as large."""
 
 NEAR = 0.003
 """Distance from the ceiling at which rounding may decide, relative to the ceiling and 1."""
@@ -88,6 +86,8 @@ class ReferenceTrigger:
         elif self.scale.high_n >= HIGH_LIMIT and not is_doubted:
             self.scale.high_n = 0
             self.statistic = 2.0 * self._ceiling
+        if self._config.trigger == "cusum":
+            self.scale.correlation.restart()
 
     def enter(
         self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
@@ -97,16 +97,17 @@ class ReferenceTrigger:
         :param readings: innovations under the other readings of the edges in doubt; None without doubt.
         :param expires: the doubt ends with this sample.
         """
-        if self.quiet_n:
+        trigger, held = self._config.trigger, self.quiet_n > 0
+        if trigger == "cusum":
+            self._enter_cusum(innovation, variance, readings, held=held)
+        if held:
             self.quiet_n -= 1
             return Meaning.QUIET
-        trigger = self._config.trigger
         if trigger == "none":
             return Meaning.QUIET
         if trigger == "cusum":
-            decision = self._enter_cusum(innovation, variance * self.scale.expected, readings, expires=expires)
             self._note_doubt()
-            return decision
+            return self._decide(is_doubted=readings is not None, expires=expires)
         self.statistic = abs(innovation)
         if trigger == "mean-between-faults":  # thesis 4.4.3
             self._mean_n += 1
@@ -119,18 +120,19 @@ class ReferenceTrigger:
         self.is_doubtful |= abs(self.statistic - self._ceiling) < NEAR * (1.0 + self._ceiling)
 
     def _enter_cusum(
-        self, innovation: float, variance: float, readings: tuple[float, float] | None, *, expires: bool
-    ) -> Meaning:
-        self.statistic = _cusum(self.statistic, innovation, variance)
-        if readings is not None:
-            self.rivals = [_cusum(g, e, variance) for g, e in zip(self.rivals, readings, strict=True)]
+        self, innovation: float, variance: float, readings: tuple[float, float] | None, *, held: bool
+    ) -> None:
+        scale = self.scale
+        self.statistic = scale.correlation.enter(
+            innovation, self.statistic, variance, scale.expected, counts=scale.is_open, held=held
+        )
+        if readings is not None and not held:
+            expected = variance * scale.expected
+            self.rivals = [cusum(g, e, expected) for g, e in zip(self.rivals, readings, strict=True)]
+
+    def _decide(self, *, is_doubted: bool, expires: bool) -> Meaning:
         if self.statistic < self._ceiling:
             return Meaning.QUIET
-        if readings is None or min(self.rivals) >= self._ceiling:
+        if not is_doubted or min(self.rivals) >= self._ceiling:
             return Meaning.ALARM
         return Meaning.SLIP if expires else Meaning.QUIET
-
-
-def _cusum(before: float, innovation: float, variance: float) -> float:
-    """Cumulative sum of the terms, at least zero."""
-    return max(0.0, before + GAIN * innovation * innovation / variance - DRIFT)
