@@ -299,9 +299,15 @@ static float weigh_nonlinearity(const est_fit_watch_t* const self) {
     return maximum(growth, state / REGIONS);
 }
 
-/// Inflation of the scale over its limit: alarms were not justified.
+/// Inflation of the scale over its limit: alarms were not justified. The dispersion of the blocks, which est_scale()
+/// contains too, is no evidence of that.
 static float scale_misfit(const est_t* const estimator) {
-    return est_scale(estimator) / (INFLATION_MISFIT * est_noise_variance(estimator));
+#if EST_WITH_ROBUSTNESS
+    return estimator->scale.inflation / INFLATION_MISFIT;
+#else
+    (void)estimator;
+    return 0.0F;
+#endif
 }
 
 /// Evidence for noise in the block: of correlation, of more than one variance, of outliers, and of excess.
