@@ -87,16 +87,12 @@ static bool codes_valid(const est_config_t* const config) {
            ((uint32_t)config->edge_instants <= (uint32_t)EST_EDGES_ANYWHERE);
 }
 
-static bool needs_adaptation(const est_config_t* const config) {
-    return (est_shape_of(config).nc > 0U) || (config->random_walk > 0.0F);
-}
-
 /// True iff this build supports the configuration.
 static bool is_supported(const est_config_t* const config) {
     return same_shape(requested_shape(config), est_shape_of(config)) &&
            (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
            (EST_WITH_ROBUSTNESS || !config->noise_estimated) &&
-           (EST_WITH_ADAPTATION || (!needs_adaptation(config) && (config->refresh_n == 0U))) &&
+           (EST_WITH_ADAPTATION || ((config->random_walk <= 0.0F) && (config->refresh_n == 0U))) &&
            (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
 }
 
@@ -134,7 +130,7 @@ static void follow_slip(est_t* const self, const bool late) {
     float* const       b    = &self->theta[self->config->na];
     est_delta_to_plain(b, last);
     if (late) {
-        shift(b, (uint_fast8_t)(last + 1U), 0.0F);
+        shift(b, self->config->nb, 0.0F);
     } else {
         *append(b, &b[1], last) = 0.0F;
     }
@@ -397,7 +393,7 @@ static void enter_edge(est_t* const self) {
 /// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
 static bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return (((uint32_t)self->pending_n + self->trigger.quiet_n + self->same_n) == 0U) &&
+    return (((uint32_t)self->pending_n | self->trigger.quiet_n | self->same_n) == 0U) &&
            (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
            (est_shape_of(self->config).nc == 0U);
 #else

@@ -29,8 +29,9 @@
 #define EST_INLINE static inline
 #endif
 
-/// Functions with several callers. They are inline too, except in a build for size: its code would grow by a seventh.
-/// With EST_WITH_EDGES=0 most of them have one caller left, and gcc decides.
+/// Functions with several callers. They are inline too, except in a build for size, whose code would grow by a seventh,
+/// and in one without optimisation, whose stack would double. With EST_WITH_EDGES=0 most of them have one caller left,
+/// and gcc decides.
 #if (EST_FOR_SIZE && EST_WITH_EDGES) || (defined(__GNUC__) && !defined(__OPTIMIZE__))
 #define EST_SHARED static __attribute__((noinline, unused))
 #elif EST_FOR_SIZE

@@ -59,6 +59,9 @@ NEAR = 0.03
 NEAR_SETTLED, NEAR_LIMITED = 0.5, 0.1
 """The same of the excess of the noise variance over 1, when the whitening may begin anew, and when P is limited."""
 
+ROUNDED = 1e-7
+"""Relative rounding of the sums that the noise variance of the whitening is the difference of."""
+
 NEAR_SUM = 0.01
 """The same of the evidence that edges are displaced."""
 
@@ -416,6 +419,12 @@ class ReferenceEstimator:
             self.trigger.find_hidden_change(is_doubted=self.doubt is not None)
 
     @property
+    def _rounded(self) -> float:
+        """Rounding of the noise variance in float32: C with zeros near 1 amplifies it."""
+        c = [1.0, *self.whitener.c]
+        return ROUNDED * dot(c, c) / max(abs(sum(c)), ROUNDED)
+
+    @property
     def _from_settling(self) -> float:
         """Distance from where the whitening counts as settled, relative to the excess of the noise variance."""
         return abs((self.variance - 1.0) / (SETTLED - 1.0) - 1.0)
@@ -501,7 +510,8 @@ class ReferenceEstimator:
         if step <= REFRESH_STEP:
             self.equations = -1
             return
-        self._is_doubtful |= step <= REFRESH_STRIDE and self._from_settling < NEAR_SETTLED
+        near = max(NEAR_SETTLED * (SETTLED - 1.0), self._rounded)
+        self._is_doubtful |= step <= REFRESH_STRIDE and abs(self.variance - SETTLED) < near
         self.refresh = Refresh.TAKES
         if step > REFRESH_STRIDE or not self.settled:  # the whitening restarts with the new C
             self.pending = 1
