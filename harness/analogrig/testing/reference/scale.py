@@ -121,7 +121,9 @@ class ReferenceScale:
         self._restart()
         self._apply()
 
-    def enter(self, square: float, old_square: float, since_n: int, *, waits: bool, quiet_n: int, excess: float) -> bool:
+    def enter(
+        self, square: float, old_square: float, since_n: int, *, waits: bool, quiet_n: int, excess: float
+    ) -> bool:
         """Enter one equation. Return true iff a hidden change is to be found with it.
 
         :param square: of its innovation, over the predicted variance in noise variances.
