@@ -39,8 +39,9 @@ extern "C" {
 #define EST_FIT_SUMS_N (2U * EST_FIT_LINES_N)
 #define EST_FIT_BLOCK_N (EST_FIT_SUMS_N * EST_FIT_SUM_N)
 
-/// Number of sums before the first block, in which the estimate settles.
-#define EST_FIT_SETTLING_N 14U
+/// Number of sums before the first block, in which the estimate settles. They are a block that is too short to state
+/// anything, and EST_FIT_SUM_N more samples.
+#define EST_FIT_SETTLING_N 13U
 
 /// Regions of the state of the plant: four levels of y, each falling, resting or rising.
 #define EST_FIT_REGIONS_N 12U
@@ -64,34 +65,29 @@ typedef struct {
     float             frequency;  ///< of the line [cycles per sample]; 0 unless the kind is EST_MISFIT_HUM
 } est_misfit_t;
 
-/// Sums of innovations. Private.
-typedef struct {
-    float    clear;      ///< of the innovations while no edge of u is in doubt
-    float    doubted;    ///< of the other innovations
-    float    squares;    ///< of the squares of all
-    float    fourths;    ///< of their squares, less limited, times the squares
-    float    along;      ///< of the products of successive innovations in `clear`
-    uint16_t lost_n;     ///< samples without an innovation, or whose innovation is excluded
-    uint16_t doubted_n;  ///< innovations in `doubted`
-} est_fit_moments_t;
-
 /// Sums over a block. Private.
 typedef struct {
-    est_fit_moments_t all;
-    float             power;      ///< of the squares of the sums over EST_FIT_SUM_N samples
-    float             moved;      ///< of the squares of the whitened second difference of y, as predicted
-    float             drawn;      ///< of the squares of the innovations drawn for the regions
-    float             explained;  ///< energy of these that the regions explain beyond chance
-    float             repeated;   ///< energy of these that the regions of the block before explain
-    float             uneven;     ///< squared deviations of the energies of the regions, over their numbers
-    uint16_t          moved_n;    ///< differences in `moved`
-    uint16_t          drawn_n;    ///< innovations in `drawn`
+    float    total;      ///< of the innovations; of the clear ones up to the last sum
+    float    squares;    ///< of their squares
+    float    fourths;    ///< of their squares, less limited, times the squares
+    float    along;      ///< of the products of successive clear innovations: those while no edge of u is in doubt
+    float    power;      ///< of the squares of the sums of the clear ones over EST_FIT_SUM_N samples
+    float    counted;    ///< part of `squares` that the regions contain
+    float    moved;      ///< of the squares of the whitened second difference of y, as predicted
+    float    drawn;      ///< of the squares of the innovations drawn for the regions
+    float    explained;  ///< energy of these that the regions explain beyond chance
+    float    repeated;   ///< energy of these that the regions of the block before explain
+    float    uneven;     ///< squared deviations of the energies of the regions, over their numbers
+    uint16_t lost_n;     ///< samples without an innovation, or whose innovation is excluded
+    uint16_t doubted_n;  ///< innovations that are not clear
+    uint16_t counted_n;  ///< innovations in `counted`
+    uint16_t moved_n;    ///< differences in `moved`
+    uint16_t drawn_n;    ///< innovations in `drawn`
 } est_fit_sums_t;
 
 /// State of the watch. The fields are private; read est_fit_misfit().
 typedef struct {
     const est_config_t* config;
-    uint8_t             settling_n;                     ///< sums until the first block
     uint8_t             slot;                           ///< samples of the present sum so far
     uint8_t             sum_n;                          ///< sums of the block so far
     uint8_t             excluded_n;                     ///< samples after an alarm that are still excluded
@@ -99,13 +95,11 @@ typedef struct {
     uint8_t             learnt_n;                       ///< samples in level and spread, limited
     uint8_t             peak;                           ///< line with the largest power
     uint8_t             last_peak;                      ///< the same in the block before
-    uint8_t             counted_n;                      ///< innovations of the present sum that the regions contain
     uint16_t            alarms_n;                       ///< alarms in the block; one that was not justified counts more
     uint16_t            last_alarms_n;                  ///< the same in the block before
     float               limit;                          ///< of an innovation [codes]
     float               last;                           ///< innovation
-    float               counted;                        ///< part of pending.squares that the regions contain
-    est_fit_moments_t   pending;                        ///< of the present sum
+    float               sum;                            ///< of the clear innovations since the last complete sum
     float               entered;                        ///< last complete sum
     float               level;                          ///< mean of y [codes]
     float               spread;                         ///< mean distance of y from its level [codes]
@@ -135,8 +129,8 @@ typedef struct {
 /// otherwise these are not found. Cost: constant. RAM: 0.5 kB. May be called from an interrupt.
 EST_RESULT_USED bool est_fit_init(est_fit_watch_t* self, const est_config_t* config);
 
-/// Enter the result of an est_step(); to be called after every step. Cost: typically 62
-/// instructions on a Cortex-M4F, 98 on average, at most 245 (make cost). May be called from an interrupt.
+/// Enter the result of an est_step(); to be called after every step. Cost: typically 63
+/// instructions on a Cortex-M4F, 101 on average, at most 217 (make cost). May be called from an interrupt.
 void est_fit_enter(est_fit_watch_t* self, const est_t* estimator, est_step_t step);
 
 /// Present misfit. Cost: constant. May be called from an interrupt.

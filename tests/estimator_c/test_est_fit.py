@@ -311,6 +311,15 @@ def test_block_with_few_innovations_states_nothing(estimator: Estimator) -> None
     assert not steps.judged(estimator, status=status).cause.any()
 
 
+def test_blocks_with_few_innovations_withdraw_nothing(estimator: Estimator) -> None:
+    steps = Steps(6000)
+    fits_from = SETTLING_N + 2 * PERIOD_N
+    steps.innovation[:fits_from] += 1.0
+    gaps = np.where(steps.at % 8 == 7, GATHERING, MISSING)
+    status = np.where((steps.at < fits_from) | (steps.at % 8 == 0), UPDATED, gaps)
+    assert final(steps.judged(estimator, status=status)) == "drift"
+
+
 def test_orders_without_a_mass_are_refused(estimator: Estimator) -> None:
     assert estimator.init(na=1, nb=1, c=(0.0, 0.0))
     assert not estimator.can_watch_fit()

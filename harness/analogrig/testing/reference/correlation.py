@@ -78,9 +78,7 @@ class ReferenceCorrelation:
         left = (1.0 - first**2) * (1.0 - second**2)
         spread = 1.0 + LEVERAGE * (1.0 - 1.0 / variance)
         one = cusum(statistic + max(self._lead, 0.0), e, variance * scale)
-        other = cusum(
-            statistic + max(-self._lead, 0.0), forward - second * backward, variance * scale * left * spread
-        )
+        other = cusum(statistic + max(-self._lead, 0.0), forward - second * backward, variance * scale * left * spread)
         self._lead = one - other
         return min(one, other)
 
