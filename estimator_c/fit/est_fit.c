@@ -7,28 +7,26 @@
 #include <stddef.h>
 
 /// Samples of a sum that have work beside adding an innovation: the first ones enter the last sum into the resonators,
-/// several each. Of every four from DRAWS_FROM on, one finds the region of the next, which draws its innovation.
+/// several each. One of every four finds the region of the next four; from DRAWS_FROM on it draws its innovation.
 #define ENTERED_N 8U
 #define ENTERED_END (EST_FIT_LINES_N / ENTERED_N)
 #define DRAWS_FROM 8U
 #define DRAWS_PERIOD 4U
+#define DRAWS_TURN 2U
 
 /// Samples of the evaluation: the lines, several each, and the regions one by one; the causes one by one; the
 /// conclusion.
 #define EVALUATED_N 2U
 #define EVALUATED_END (ENTERED_END + EST_FIT_REGIONS_N)
-#define CAUSES_N 5U
-#define CONCLUSION (EVALUATED_END + CAUSES_N)
+#define CONCLUSION (EVALUATED_END + 5U)
 
 /// Innovations in a block below which nothing is stated: with many missing samples the estimate is less certain, and
 /// the innovations are larger.
 #define ENOUGH_N 400.0F
 
-/// Limit of an innovation in standard deviations, squared.
+/// Limit of an innovation in standard deviations, squared; and of one factor in its fourth power, over that limit.
 #define CLIP 9.0F
-
-/// Innovations of a block, of which some may be lost.
-static const uint16_t BLOCK_N = EST_FIT_BLOCK_N;
+#define OUTLIER 11.0F
 
 /// Memory of the level of y [draws].
 #define LEVEL_N 128U
@@ -40,39 +38,68 @@ static const uint16_t BLOCK_N = EST_FIT_BLOCK_N;
 #define LEVEL_BOUND 0.7F
 #define MOVES 0.05F
 
-/// Innovations in a region, and in all regions of a block, below which they explain nothing.
+/// Innovations in a region, and in all regions of a block, below which they explain nothing. The third: innovations in
+/// a region below which its energy is not compared.
 #define REGION_MIN 4U
 #define DRAWN_MIN 64U
+#define ENERGY_MIN 8U
 
 /// Limits of the statistics. DRIFT: squared mean of the innovations over its variance. LINE: power of a line over its
-/// mean. REGIONS: share of the energy of the innovations that
-/// the state of the plant explains. COLOUR: variance of the sums over that of white innovations. KURTOSIS: of the
-/// limited innovations; Gaussian ones have 2.9. EXCESS: variance over the declared one. INFORMATION: on a change of
-/// the mass, see weigh_lack().
+/// mean. REGIONS: share of the energy of the innovations that the state of the plant explains. INFORMATION: on a change
+/// of the mass, see weigh_lack().
 #define DRIFT 40.0F
 #define LINE 22.0F
-#define REGIONS 0.2F
-#define COLOUR 4.0F
-#define KURTOSIS 3.3F
-#define EXCESS 2.5F
+#define REGIONS 0.27F
 #define INFORMATION 60.0F
 #define INFORMATION_MIN 1.0e-3F
 
-/// A line is hum if its share of the power of the sums exceeds the first, and its share of the energy of the
-/// innovations that of the regions by the second: the response of a plant that is not linear has peaks too.
-#define LINE_SHARE 0.6F
-#define REGIONS_HUM 2.0F
+/// Limits of the statistics of noise, which two blocks share. COLOUR: variance of the sums over that of white
+/// innovations. ALONG: squared correlation of successive innovations over its variance. UNEVEN: squared deviations of
+/// the energies of the regions, in squared variances. TAILS: kurtosis above that of innovations that are GAUSSIAN and
+/// limited. EXCESS: variance over the declared one. RISE: variance over that of the block before.
+#define COLOUR 6.8F
+#define ALONG 85.0F
+#define UNEVEN 140.0F
+#define GAUSSIAN 2.9F
+#define TAILS 1.15F
+#define EXCESS 5.0F
+#define RISE 1.55F
 
-/// Growth of the spread of y since the first block with which a growth of the innovations is not linear.
+/// Evidence for noise that either block needs, as a change of the plant disturbs only one. Beside ALARMED_N alarms less
+/// suffices, by the factor ALARMED for each alarm. One that was not justified counts UNJUSTIFIED_N more.
+#define NOISE_EACH 0.4F
+#define ALARMED 0.45F
+#define ALARMED_N 3U
+#define UNJUSTIFIED_N 2U
+
+/// A line is hum if its share of the power of the sums exceeds LINE_SHARE, and its share of the energy of the
+/// innovations that of the regions by REGIONS_HUM: the response of a plant that is not linear has peaks too. Between two
+/// lines, some of its power is in others; BETWEEN makes up for it. In the LOW_LINES_N lowest lines noise that jumps has
+/// peaks, and LOW_SHARE applies. The power of a line is steady if neither block has more than STEADY times the other's.
+/// A mean is drift if its share exceeds MEAN_SHARE: noise of low frequency has means too.
+#define LINE_SHARE 0.66F
+#define LOW_SHARE 0.79F
+#define LOW_LINES_N 3U
+#define BETWEEN 0.25F
+#define REGIONS_HUM 2.0F
+#define STEADY 2.0F
+#define MEAN_SHARE 0.85F
+
+/// Strength of a dependence on the state of the plant from which on that is the cause of lines and of correlation; and
+/// its least ratio to the variance of the sums, because coloured noise seems to depend on the state.
+#define DEPENDENT 0.3F
+#define DEPENDENT_COLOUR 0.06F
+
+/// Growth of the spread of y since the first block with which a growth of the innovations is not linear, and that
+/// growth.
 #define GROWTH 1.5F
+#define GROWN 2.5F
 
 /// 1 + a1 + a2 below which the plant hardly moves between two samples.
 #define SLOW 0.0035F
 
 /// Inflation of the scale from which the model is known not to fit: two alarms that were not justified.
 #define INFLATION_MISFIT 8.0F
-
-EST_SHARED float maximum(const float a, const float b) { return (a > b) ? a : b; }
 
 /// a / b; 0 unless b is positive.
 EST_SHARED float quotient(const float a, const float b) {
@@ -87,6 +114,17 @@ EST_SHARED float quotient(const float a, const float b) {
 static float improve_root(const float root, const float x) { return 0.5F * (root + (x / root)); }
 
 // ---------------------------------------------        SIGNALS         ---------------------------------------------
+
+/// Add the energy of the innovations since the last call to the present region, unless `counts` is false.
+static void count_energy(est_fit_watch_t* const self, const bool counts) {
+    const uint32_t n = (EST_FIT_SUM_N * self->sum_n) + self->slot + 1U - self->sums.lost_n;
+    if (counts) {
+        self->energies[self->region] += self->sums.squares - self->sums.counted;
+        self->energies_n[self->region] = (uint16_t)(self->energies_n[self->region] + n - self->sums.counted_n);
+    }
+    self->sums.counted   = self->sums.squares;
+    self->sums.counted_n = (uint16_t)n;
+}
 
 /// Find the region of the state of the plant before the next sample, and follow the level of y.
 static void find_region(est_fit_watch_t* const self, const est_t* const estimator) {
@@ -173,9 +211,12 @@ static float power_at(const est_fit_watch_t* const self, const uint32_t line) {
 }
 
 /// Power of the larger neighbour of the peak.
-static float neighbour_power(const est_fit_watch_t* const self) {
-    return maximum(power_at(self, self->peak + 1U), power_at(self, self->peak - 1U));
+EST_SHARED float neighbour_power(const est_fit_watch_t* const self) {
+    return est_max(power_at(self, self->peak + 1U), power_at(self, self->peak - 1U));
 }
+
+/// Power of the peak, which may lie between two lines.
+EST_SHARED float peak_power(const est_fit_watch_t* const self) { return self->now[self->peak] + neighbour_power(self); }
 
 /// Frequency of the line at the peak, from the powers of the peak and its larger neighbour [cycles per sample].
 static float find_frequency(const est_fit_watch_t* const self) {
@@ -187,7 +228,7 @@ static float find_frequency(const est_fit_watch_t* const self) {
     }
     const float beside = share / (1.0F + share);
     const float line   = (float)self->peak + (upwards ? beside : -beside);
-    return line / (float)BLOCK_N;
+    return line / (float)EST_FIT_BLOCK_N;
 }
 
 // ---------------------------------------------         CAUSES         ---------------------------------------------
@@ -197,44 +238,51 @@ static float declared_variance(const est_fit_watch_t* const self) {
 }
 
 /// Number of innovations in the block.
-static float count_of(const est_fit_watch_t* const self) { return (float)BLOCK_N - (float)self->sums.all.lost_n; }
+EST_SHARED float count_of(const est_fit_watch_t* const self) {
+    return (float)EST_FIT_BLOCK_N - (float)self->sums.lost_n;
+}
 
-static float variance_of(const est_fit_watch_t* const self) { return self->sums.all.squares / count_of(self); }
+EST_SHARED float variance_of(const est_fit_watch_t* const self) { return self->sums.squares / count_of(self); }
 
 /// Variance to which the statistics relate: that of the innovations, or the declared one if that is more. The
 /// structure of innovations that are smaller than promised does no harm.
-static float reference_variance(const est_fit_watch_t* const self) {
-    return maximum(variance_of(self), declared_variance(self));
+EST_SHARED float reference_variance(const est_fit_watch_t* const self) {
+    return est_max(variance_of(self), declared_variance(self));
 }
 
 /// Number of innovations in the spectrum.
-static float clear_count_of(const est_fit_watch_t* const self) {
-    return count_of(self) - (float)self->sums.all.doubted_n;
+EST_SHARED float clear_count_of(const est_fit_watch_t* const self) {
+    return count_of(self) - (float)self->sums.doubted_n;
 }
 
 /// Energy in the spectrum at that variance.
-static float clear_energy_of(const est_fit_watch_t* const self) {
+EST_SHARED float clear_energy_of(const est_fit_watch_t* const self) {
     return reference_variance(self) * clear_count_of(self);
 }
 
 /// Share of the energy of the drawn innovations that is explained.
-static float share_of(const est_fit_watch_t* const self, const float explained) {
+EST_SHARED float share_of(const est_fit_watch_t* const self, const float explained) {
     return quotient(explained, reference_variance(self) * (float)self->sums.drawn_n);
 }
 
+/// Weigh a mean that is more than a part of a broad spectrum.
 static float weigh_drift(const est_fit_watch_t* const self) {
-    const float sum = self->sums.all.clear + self->sums.all.doubted;
-    return quotient(sum * sum, reference_variance(self) * count_of(self) * DRIFT);
+    const float sum    = self->sums.total;
+    const float beyond = (float)EST_FIT_SUMS_N * (self->sums.power - clear_energy_of(self));
+    const float weight = quotient(sum * sum, reference_variance(self) * count_of(self) * DRIFT);
+    return ((sum * sum) > (MEAN_SHARE * beyond)) ? weight : 0.0F;
 }
 
 /// Weigh a line that is neither a harmonic of the excitation nor the peak of a broad spectrum.
 static float weigh_hum(const est_fit_watch_t* const self) {
-    const float power  = self->now[self->peak] + neighbour_power(self);  // it may lie between two lines
+    const float power  = peak_power(self);
     const float energy = clear_energy_of(self);
     const float line   = quotient(power, energy);
     const float share  = quotient(line, 0.5F * clear_count_of(self));
-    const float part   = quotient(power, (float)EST_FIT_LINES_N * (self->sums.power - energy));
-    const bool  is_hum = (part > LINE_SHARE) && (share > (REGIONS_HUM * share_of(self, self->sums.explained)));
+    const float whole  = power + (BETWEEN * neighbour_power(self));
+    const float part   = quotient(whole, (float)EST_FIT_LINES_N * (self->sums.power - energy));
+    const float least  = (self->peak <= LOW_LINES_N) ? LOW_SHARE : LINE_SHARE;
+    const bool  is_hum = (part > least) && (share > (REGIONS_HUM * share_of(self, self->sums.explained)));
     const float weight = line / LINE;
     return is_hum ? weight : 0.0F;
 }
@@ -242,124 +290,186 @@ static float weigh_hum(const est_fit_watch_t* const self) {
 /// Weigh innovations that have grown with y since the first block, or that the state of the plant explains.
 static float weigh_nonlinearity(const est_fit_watch_t* const self) {
     const bool  grows  = self->spread > (GROWTH * self->first_spread);
-    const float growth = grows ? quotient(variance_of(self), EXCESS * self->first_variance) : 0.0F;
+    const float growth = grows ? quotient(variance_of(self), GROWN * self->first_variance) : 0.0F;
     const float state  = (self->sums.drawn_n >= DRAWN_MIN) ? share_of(self, self->sums.repeated) : 0.0F;
-    return maximum(growth, state / REGIONS);
+    return est_max(growth, state / REGIONS);
 }
 
-static float weigh_noise(const est_fit_watch_t* const self) {
-    const float variance = variance_of(self);
-    const float colour   = quotient(self->sums.power, clear_energy_of(self) * COLOUR);
-    const float kurtosis = quotient(self->sums.all.fourths, self->sums.all.squares * variance * KURTOSIS);
-    const float excess   = quotient(variance, declared_variance(self) * EXCESS);
-    return maximum(maximum(colour, kurtosis), excess);
+/// Inflation of the scale over its limit: alarms were not justified. The dispersion of the blocks, which est_scale()
+/// contains too, is no evidence of that.
+static float scale_misfit(const est_t* const estimator) {
+#if EST_WITH_ROBUSTNESS
+    return estimator->scale.inflation / INFLATION_MISFIT;
+#else
+    (void)estimator;
+    return 0.0F;
+#endif
 }
+
+/// Evidence for noise in the block: of correlation, of more than one variance, of outliers, and of excess.
+static float find_noise(const est_fit_watch_t* const self) {
+    const est_fit_sums_t* const sums     = &self->sums;
+    const float                 variance = variance_of(self);
+    const float                 level    = reference_variance(self);
+    const float                 along    = quotient(sums->along * sums->along, clear_energy_of(self) * level * ALONG);
+    const float                 uneven   = sums->uneven / (level * level * UNEVEN);
+    const float                 kurtosis = sums->fourths / (sums->squares * variance);
+    const float                 tails    = (kurtosis - GAUSSIAN) / TAILS;
+    const float                 excess   = quotient(variance, declared_variance(self) * EXCESS);
+    return est_max(est_max(along, uneven), est_max(tails, excess));
+}
+
+/// Weigh noise over this block and the one before. Correlation over EST_FIT_SUM_N samples may be in one block alone. In
+/// the first block that states nothing yet.
+static float weigh_noise(est_fit_watch_t* const self, const est_t* const estimator) {
+    if (scale_misfit(estimator) > (2.0F * self->inflation)) {
+        self->alarms_n = (uint16_t)(self->alarms_n + UNJUSTIFIED_N);
+    }
+    const float    colour   = quotient(self->sums.power, clear_energy_of(self) * COLOUR);
+    const float    rise     = quotient(variance_of(self), self->last_variance * RISE);
+    const uint32_t alarms_n = (uint32_t)self->alarms_n + self->last_alarms_n;
+    self->noise             = est_max(colour, find_noise(self));
+    const float sum         = self->noise + self->last_noise;
+    const bool  in_both     = (self->noise >= NOISE_EACH) && (self->last_noise >= NOISE_EACH);
+    const float alone       = in_both ? sum : 0.0F;
+    const float shared      = (alarms_n >= ALARMED_N) ? (ALARMED * (float)alarms_n * sum) : alone;
+    const bool  before      = (self->candidate == EST_MISFIT_NOISE) && (self->misfit.kind == EST_MISFIT_NONE);
+    return est_max(est_max(colour, before ? self->last_noise : rise), shared);
+}
+
+/// True iff the plant hardly moves between two samples.
+static bool is_slow(const est_t* const estimator) { return estimator->theta[1] < SLOW; }  // 1 + a1 + a2
 
 /// Weigh the lack of information on a change of the mass. It scales the second difference of y, whitened.
 static float weigh_lack(const est_fit_watch_t* const self) {
     const float information = quotient(self->sums.moved, reference_variance(self) * (float)self->sums.moved_n);
-    return INFORMATION / maximum(information, INFORMATION_MIN);
+    return INFORMATION / est_max(information, INFORMATION_MIN);
 }
 
-/// Inflation of the scale over its limit: alarms were not justified.
-static float scale_misfit(const est_t* const estimator) {
-    return est_scale(estimator) / (INFLATION_MISFIT * est_noise_variance(estimator));
-}
-
-/// Weigh one cause. The model fits as far as it is concerned unless its strength exceeds 1. A slow plant may hide a
-/// change for long, but lack of excitation is no news unless alarms were false.
-static est_misfit_t weigh_cause(const est_fit_watch_t* const self, const est_t* const estimator, const uint32_t cause) {
-    const bool   slow = estimator->theta[1] < SLOW;  // 1 + a1 + a2
-    est_misfit_t out  = { .kind = EST_MISFIT_NONE, .strength = 0.0F, .frequency = 0.0F };
-    switch (cause) {
-    case 0U:
-        out.kind     = EST_MISFIT_DRIFT;
-        out.strength = weigh_drift(self);
-        break;
-    case 1U:
-        out.kind     = EST_MISFIT_NONLINEAR;
-        out.strength = weigh_nonlinearity(self);
-        break;
-    case 2U:
-        out.kind     = EST_MISFIT_HUM;
-        out.strength = weigh_hum(self);
-        break;
-    case 3U:
-        out.kind     = EST_MISFIT_NOISE;
-        out.strength = weigh_noise(self);
-        break;
-    default:
-        out.kind     = slow ? EST_MISFIT_SLOW_PLANT : EST_MISFIT_EXCITATION;
-        out.strength = (slow && (scale_misfit(estimator) <= 1.0F)) ? 0.0F : weigh_lack(self);
-        break;
+/// Weigh the cause at this place in CAUSES. The model fits as far as it is concerned unless its strength exceeds 1. A
+/// slow plant may hide a change for long, but lack of excitation is no news unless alarms were false.
+static float weigh_cause(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t place) {
+    float out = 0.0F;
+    if (place == 0U) {
+        out = weigh_drift(self);
+    } else if (place == 1U) {
+        out = weigh_nonlinearity(self);
+    } else if (place == 2U) {
+        out = weigh_hum(self);
+    } else if (place == 3U) {
+        out = weigh_noise(self, estimator);
+    } else if (!is_slow(estimator) || (scale_misfit(estimator) > 1.0F)) {
+        out = weigh_lack(self);
+    } else {
+        // hidden, but not by a misfit
     }
     return out;
 }
 
-/// Test one cause, unless the block has too few innovations or an earlier cause is found. The first one beyond its
-/// limit counts; until then, the strongest one.
-static void test_cause(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t cause) {
-    const bool enough = (count_of(self) >= ENOUGH_N) && (self->sums.all.squares > 0.0F);
-    if (enough && (self->found.strength <= 1.0F)) {
-        const est_misfit_t weighed = weigh_cause(self, estimator, cause);
-        if (weighed.strength > self->found.strength) {
-            self->found = weighed;
-        }
+/// Test one cause. The first one beyond its limit counts; until then, the strongest one.
+static void test_cause(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t place) {
+    static const est_misfit_kind_t CAUSES[] = {
+        EST_MISFIT_DRIFT, EST_MISFIT_NONLINEAR, EST_MISFIT_HUM, EST_MISFIT_NOISE, EST_MISFIT_EXCITATION,
+    };
+    const float strength = weigh_cause(self, estimator, place);
+    if ((self->found.strength <= 1.0F) && (strength > self->found.strength)) {
+        self->found.kind     = CAUSES[place];
+        self->found.strength = strength;
     }
 }
 
 // ---------------------------------------------         BLOCKS         ---------------------------------------------
 
 static void begin_block(est_fit_watch_t* const self) {
-    self->sums  = (est_fit_sums_t){ .power = 0.0F };
+    self->sums  = (est_fit_sums_t){ .lost_n = 0U };
     self->found = (est_misfit_t){ .kind = EST_MISFIT_NONE };
     self->sum_n = 0U;
 }
 
-/// True iff the peak of the spectrum is where it was in the block before, or beside it.
+/// True iff the peak of the spectrum is where it was in the block before, or beside it, and its power is comparable.
 static bool is_steady(const est_fit_watch_t* const self) {
-    return (self->peak <= (self->last_peak + 1U)) && (self->last_peak <= (self->peak + 1U));
+    const float power = peak_power(self);
+    return (self->peak <= (self->last_peak + 1U)) && (self->last_peak <= (self->peak + 1U)) &&
+           (power <= (STEADY * self->last_power)) && (self->last_power <= (STEADY * power));
 }
 
-/// Complete what was found. A line that is elsewhere in the next block is noise. If the scale is inflated, the model
-/// does not fit, whatever the cause.
-static void complete(est_fit_watch_t* const self, const float inflation) {
-    est_misfit_t* const found = &self->found;
+/// True iff the innovations depend on the state of the plant, though less than EST_MISFIT_NONLINEAR alone needs.
+static bool is_dependent(const est_fit_watch_t* const self) {
+    const float colour = quotient(self->sums.power, clear_energy_of(self));
+    return weigh_nonlinearity(self) > est_max(DEPENDENT, DEPENDENT_COLOUR * colour);
+}
+
+/// Complete what was found. A line that is another in the next block is noise. Lines and correlation that depend on
+/// the state of the plant are no disturbance. If the scale is inflated, the model does not fit, whatever the cause.
+static void complete(est_fit_watch_t* const self, const est_t* const estimator) {
+    const float         inflation = scale_misfit(estimator);
+    est_misfit_t* const found     = &self->found;
     if ((found->strength <= 1.0F) && (inflation <= 1.0F)) {
         *found = (est_misfit_t){ .kind = EST_MISFIT_NONE };
     } else {
-        found->strength = maximum(found->strength, inflation);
+        found->strength = est_max(found->strength, inflation);
     }
-    if ((found->kind == EST_MISFIT_HUM) && (self->candidate == EST_MISFIT_HUM) && !is_steady(self)) {
+    if ((found->kind == EST_MISFIT_HUM) && (self->candidate != EST_MISFIT_NONE) && !is_steady(self)) {
         found->kind = EST_MISFIT_NOISE;
+    }
+    if (((found->kind == EST_MISFIT_HUM) || (found->kind == EST_MISFIT_NOISE)) && is_dependent(self)) {
+        found->kind = EST_MISFIT_NONLINEAR;
     }
     if (found->kind == EST_MISFIT_HUM) {
         found->frequency = find_frequency(self);
     }
+    if ((found->kind == EST_MISFIT_EXCITATION) && is_slow(estimator)) {
+        found->kind = EST_MISFIT_SLOW_PLANT;
+    }
 }
 
-/// State what was found if the block before agrees that there is a misfit or none, or if the evidence suffices.
-static void conclude(est_fit_watch_t* const self, const est_t* const estimator) {
-    const float inflation = scale_misfit(estimator);
-    complete(self, inflation);
-    const est_misfit_t found    = self->found;
-    const bool         again    = (found.kind == EST_MISFIT_NONE) == (self->candidate == EST_MISFIT_NONE);
-    const bool         compared = found.kind == EST_MISFIT_NONLINEAR;  // with the block before
-    if (!edges_vary(estimator) && (again || compared || (inflation > 1.0F))) {
-        self->misfit = found;
-    }
-    self->candidate = found.kind;
-    self->last_peak = self->peak;
-    if (self->first_variance <= 0.0F) {
-        self->first_variance = variance_of(self);
+/// Keep what the next block is compared with.
+static void keep(est_fit_watch_t* const self, const est_t* const estimator) {
+    self->candidate     = self->found.kind;
+    self->last_peak     = self->peak;
+    self->last_power    = peak_power(self);
+    self->last_variance = variance_of(self);
+    self->last_noise    = self->noise;
+    self->last_alarms_n = self->alarms_n;
+    self->inflation     = scale_misfit(estimator);
+    self->noise         = 0.0F;
+    self->alarms_n      = 0U;
+    if (!(self->first_variance > 0.0F)) {
+        self->first_variance = self->last_variance;
         self->first_spread   = self->spread;
     }
 }
 
-/// Add the energy that a region explains beyond chance, and clear it for the next block.
+/// State what was found if the block before agrees that there is a misfit or none, or if the evidence suffices. That
+/// of non-linearity and of noise is of two blocks already.
+static void conclude(est_fit_watch_t* const self, const est_t* const estimator) {
+    complete(self, estimator);
+    const est_misfit_t found = self->found;
+    const bool         again = (found.kind == EST_MISFIT_NONE) == (self->candidate == EST_MISFIT_NONE);
+    const bool         compared =
+        (self->first_variance > 0.0F) && ((found.kind == EST_MISFIT_NONLINEAR) || (found.kind == EST_MISFIT_NOISE));
+    if (!edges_vary(estimator) && (again || compared || (scale_misfit(estimator) > 1.0F))) {
+        self->misfit = found;
+    }
+    keep(self, estimator);
+}
+
+/// True iff the block has enough innovations to state anything.
+static bool is_enough(const est_fit_watch_t* const self) {
+    return (count_of(self) >= ENOUGH_N) && (self->sums.squares > 0.0F);
+}
+
+/// Add the energy that a region explains beyond chance, and how its variance deviates; clear it for the next block.
 static void evaluate_region(est_fit_watch_t* const self, const uint32_t region) {
-    const uint8_t n    = self->regions_n[region];
-    const float   mean = (n >= REGION_MIN) ? (self->regions[region] / (float)n) : 0.0F;
+    const float energies_n = (float)self->energies_n[region];
+    const float deviation  = self->energies[region] - (energies_n * variance_of(self));
+    if (self->energies_n[region] >= ENERGY_MIN) {
+        self->sums.uneven += (deviation * deviation) / energies_n;
+    }
+    self->energies[region]   = 0.0F;
+    self->energies_n[region] = 0U;
+    const uint8_t n          = self->regions_n[region];
+    const float   mean       = ((n >= REGION_MIN) && is_enough(self)) ? (self->regions[region] / (float)n) : 0.0F;
     self->sums.explained += (self->regions[region] * mean) - (self->sums.drawn / (float)self->sums.drawn_n);
     self->sums.repeated += self->regions[region] * self->means[region];
     self->means[region]     = mean;
@@ -368,80 +478,139 @@ static void evaluate_region(est_fit_watch_t* const self, const uint32_t region) 
 }
 
 /// Do the share of the evaluation that falls to one of the samples after the block.
-static void evaluate(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t slot) {
-    if (slot < ENTERED_END) {
-        return;  // MISRA D4
-    }
-    if (slot < EVALUATED_END) {
+EST_SHARED void evaluate(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t slot) {
+    if ((slot >= ENTERED_END) && (slot < EVALUATED_END)) {
         const uint32_t turn = slot - ENTERED_END;
         for (uint32_t line = EVALUATED_N * turn; (line < (EVALUATED_N * (turn + 1U))) && (line < EST_FIT_LINES_N);
              line++) {
             evaluate_line(self, line);
         }
         evaluate_region(self, turn);
+    } else if ((slot < ENTERED_END) || (slot > CONCLUSION) || !is_enough(self)) {
+        // the last sum is not in the lines yet, the evaluation is complete, or there is nothing to state
     } else if (slot < CONCLUSION) {
         test_cause(self, estimator, slot - EVALUATED_END);
-    } else if (slot == CONCLUSION) {
-        conclude(self, estimator);
     } else {
-        // the evaluation is complete
+        conclude(self, estimator);
     }
 }
 
 /// Close a sum of the innovations: enter it into the block, and follow the noise.
 static void close_sum(est_fit_watch_t* const self, const est_t* const estimator) {
-    est_fit_moments_t* const all = &self->sums.all;
-    self->entered                = self->pending.clear;
-    self->limit                  = improve_root(self->limit, CLIP * est_noise_variance(estimator));
-    if (self->settling_n > 0U) {
-        self->settling_n--;
-    } else {
-        all->clear += self->pending.clear;
-        all->doubted += self->pending.doubted;
-        all->squares += self->pending.squares;
-        all->fourths += self->pending.fourths;
-        all->lost_n    = (uint16_t)(all->lost_n + self->pending.lost_n);
-        all->doubted_n = (uint16_t)(all->doubted_n + self->pending.doubted_n);
-        self->sums.power += self->entered * self->entered;
-        self->sum_n++;
-    }
+    self->entered = self->sum;
+    self->limit   = improve_root(self->limit, CLIP * est_noise_variance(estimator));
+    self->sums.power += self->sum * self->sum;
+    self->sums.total += self->sum;
+    self->sum = 0.0F;
+    self->sum_n++;
     if (edges_vary(estimator)) {
         self->misfit = (est_misfit_t){ .kind = EST_MISFIT_EDGES, .strength = 1.0F };
     }
 }
 
-/// Find the region of the next sample, or draw the innovation of this one: two of DRAWS_PERIOD samples.
+/// True iff the innovation counts.
+static bool is_used(const est_fit_watch_t* const self, const est_step_t step) {
+    return (step.status == EST_UPDATED) && (self->excluded_n == 0U);
+}
+
+/// Draw the innovation of this sample, count the energy of the last ones, and find the region of the next ones.
 static void
-work_on_draws(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step, const float z) {
-    if ((self->slot % DRAWS_PERIOD) == 0U) {
-        if ((step.status == EST_UPDATED) || (step.status == EST_GATHERING)) {
-            find_region(self, estimator);
-        }
-    } else if ((step.status == EST_UPDATED) && (self->excluded_n == 0U) && (self->settling_n == 0U)) {
+work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step, const float z) {
+    if (is_used(self, step) && (self->slot >= DRAWS_FROM)) {
         draw(self, estimator, z, step.innovation);
-    } else {
-        // nothing to draw
+    }
+    // an edge of a generator that drifts leaves a response to it
+    count_energy(self, estimator->settled && (estimator->doubt_n == 0U));
+    if ((step.status == EST_UPDATED) || (step.status == EST_GATHERING)) {
+        find_region(self, estimator);
     }
 }
 
-/// Do the part of the work that falls to this sample of a sum.
-static void work(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step, const float z) {
-    const uint32_t slot = self->slot;
-    const bool     full = self->sum_n >= EST_FIT_SUMS_N;
-    if (slot < ENTERED_END) {
+/// Limit an innovation beyond its limit. It counts as an outlier if nothing else explains it: no edge in doubt, no
+/// slip, and no gap of late.
+static float limit_innovation(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
+    const float limit  = self->limit * self->limit;
+    const float square = step.innovation * step.innovation;
+    const bool  clear  = (estimator->doubt_n == 0U) && estimator->settled && estimator->known;
+    if (clear || step.alarm) {
+        const float most = OUTLIER * limit;
+        self->sums.fourths += limit * (((square < most) ? square : most) - limit);
+    }
+    return (step.innovation < 0.0F) ? -self->limit : self->limit;
+}
+
+/// Enter an innovation into the sums. Return it, limited.
+static float enter_innovation(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
+    est_fit_sums_t* const sums = &self->sums;
+    float                 z    = step.innovation;
+    if (!(est_magnitude(z) <= self->limit)) {
+        z = limit_innovation(self, estimator, step);
+    }
+    const float square = z * z;
+    sums->squares += square;
+    sums->fourths += square * square;
+    if (estimator->doubt_n == 0U) {
+        self->sum += z;
+        sums->along += z * self->last;
+        self->last = z;
+    } else {
+        sums->total += z;
+        sums->doubted_n++;
+    }
+    return z;
+}
+
+/// Enter the last sum into some of the lines, if that falls to this sample of a sum.
+static void work_on_lines(est_fit_watch_t* const self) {
+    if (self->slot < ENTERED_END) {
         for (uint32_t i = 0U; i < ENTERED_N; i++) {
-            enter_line(self, (ENTERED_N * slot) + i);
+            enter_line(self, (ENTERED_N * self->slot) + i);
         }
     }
-    if (full) {
-        evaluate(self, estimator, slot);
-    } else if ((slot >= DRAWS_FROM) && ((slot % DRAWS_PERIOD) < 2U)) {
-        work_on_draws(self, estimator, step, z);
+}
+
+/// Enter a sample of the block.
+static void enter_sample(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
+    float z = 0.0F;
+    if (is_used(self, step)) {
+        z = enter_innovation(self, estimator, step);
     } else {
-        // only lines have work
+        self->sums.lost_n++;
     }
-    if (slot < (EST_FIT_SUM_N - 1U)) {
-        self->slot = (uint8_t)(slot + 1U);
+    if ((self->slot % DRAWS_PERIOD) == DRAWS_TURN) {
+        work_on_regions(self, estimator, step, z);
+    }
+}
+
+// ---------------------------------------------          API           ---------------------------------------------
+
+bool est_fit_init(est_fit_watch_t* const self, const est_config_t* const config) {
+    EST_ASSERT((self != NULL) && (config != NULL));
+    *self             = (est_fit_watch_t){ .config = config, .sum_n = EST_FIT_SUMS_N - EST_FIT_SETTLING_N };
+    self->sums.lost_n = (uint16_t)(EST_FIT_SUM_N * self->sum_n);
+    self->limit       = CLIP * config->noise_variance;
+    self->inflation   = 1.0F / INFLATION_MISFIT;
+    return config->na == 2U;
+}
+
+void est_fit_enter(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
+    EST_ASSERT((self != NULL) && (estimator != NULL));
+    const bool full = self->sum_n >= EST_FIT_SUMS_N;
+    work_on_lines(self);
+    if (full) {
+        evaluate(self, estimator, self->slot);
+    } else {
+        enter_sample(self, estimator, step);
+    }
+    if (self->excluded_n > 0U) {
+        self->excluded_n--;
+    }
+    if (step.alarm) {
+        self->excluded_n = EXCLUDED_N;
+        self->alarms_n++;
+    }
+    if (self->slot < (EST_FIT_SUM_N - 1U)) {
+        self->slot++;
         return;  // MISRA D4
     }
     self->slot = 0U;
@@ -450,43 +619,6 @@ static void work(est_fit_watch_t* const self, const est_t* const estimator, cons
     } else {
         close_sum(self, estimator);
     }
-    self->pending = (est_fit_moments_t){ .clear = 0.0F };
-}
-
-// ---------------------------------------------          API           ---------------------------------------------
-
-bool est_fit_init(est_fit_watch_t* const self, const est_config_t* const config) {
-    EST_ASSERT((self != NULL) && (config != NULL));
-    *self       = (est_fit_watch_t){ .config = config, .settling_n = EST_FIT_SETTLING_N };
-    self->limit = CLIP * config->noise_variance;
-    return config->na == 2U;
-}
-
-void est_fit_enter(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
-    EST_ASSERT((self != NULL) && (estimator != NULL));
-    float z = 0.0F;
-    if ((step.status == EST_UPDATED) && (self->excluded_n == 0U)) {
-        z = step.innovation;
-        if (!(est_magnitude(z) <= self->limit)) {
-            z = (z < 0.0F) ? -self->limit : self->limit;
-        }
-        const float square = z * z;
-        self->pending.squares += square;
-        self->pending.fourths += square * square;
-        if (estimator->doubt_n == 0U) {
-            self->pending.clear += z;
-        } else {
-            self->pending.doubted += z;
-            self->pending.doubted_n++;
-        }
-    } else {
-        self->pending.lost_n++;
-        self->excluded_n = (uint8_t)(self->excluded_n - ((self->excluded_n > 0U) ? 1U : 0U));
-    }
-    if (step.alarm) {
-        self->excluded_n = EXCLUDED_N;
-    }
-    work(self, estimator, step, z);
 }
 
 est_misfit_t est_fit_misfit(const est_fit_watch_t* const self) {

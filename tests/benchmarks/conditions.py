@@ -15,7 +15,18 @@ import numpy as np
 from analogrig_emulator import CARDS, COMPONENTS, NOMINAL, OP_AMP_GRADES, Card, Components, drawn_levels
 from tests.emulator.programs import program_of
 
-from .disturbances import backlash, drift, hum, impulses, missing, popcorn, proportional_noise, rising_noise, warming
+from .disturbances import (
+    backlash,
+    drift,
+    heavy_tails,
+    hum,
+    impulses,
+    missing,
+    popcorn,
+    proportional_noise,
+    rising_noise,
+    warming,
+)
 from .emulated import Emulated
 from .played import CARD, DISPLACEMENT, FORCE, Change, Played
 from .simulated import Simulated
@@ -201,7 +212,7 @@ OWN: Sequence[Condition] = (
         "jitter",
         "aperture jitter of 0.5 us",
         Emulated(SQUARE, dataclasses.replace(CARD, aperture_jitter_s=5e-7)),
-        ("edges",),
+        ("noise",),
     ),
     Condition("warming", "K falls by 2 % in 10,000 samples", Emulated(SQUARE, wander=warming(-0.02)), ("drift",)),
     Condition(
@@ -220,6 +231,18 @@ OWN: Sequence[Condition] = (
         "impulses",
         "impulses of 20 LSB on 0.1 % of the samples",
         Emulated(SQUARE, disturb=impulses(0.001, 20.0)),
+        ("noise",),
+    ),
+    Condition(
+        "impulses-1",
+        "impulses of 8 LSB on 1 % of the samples",
+        Emulated(SQUARE, disturb=impulses(0.01, 8.0)),
+        ("noise",),
+    ),
+    Condition(
+        "heavy-tails",
+        "noise of Student's t distribution, 3 degrees of freedom, 1 LSB",
+        Emulated(SQUARE, disturb=heavy_tails(3.0, 1.0)),
         ("noise",),
     ),
     Condition(

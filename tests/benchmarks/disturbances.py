@@ -47,6 +47,16 @@ def impulses(share: float, amplitude_lsb: float) -> Disturbance:
     return disturb
 
 
+def heavy_tails(degrees: float, deviation_lsb: float) -> Disturbance:
+    """White noise on the displacement, beside the card's, of Student's t distribution with this standard deviation."""
+
+    def disturb(lsb: Array, rng: np.random.Generator) -> Array:
+        lsb[:, DISPLACEMENT] += deviation_lsb * math.sqrt(1.0 - 2.0 / degrees) * rng.standard_t(degrees, len(lsb))
+        return lsb
+
+    return disturb
+
+
 def popcorn(amplitude_lsb: float, dwell_n: float) -> Disturbance:
     """Displacement that jumps between two levels, this much either side, after ``dwell_n`` samples on average."""
 

@@ -106,6 +106,16 @@ def _proportional(part: float) -> Callable[[Array, np.random.Generator], Array]:
     return lambda y, rng: y * (1.0 + part * rng.normal(0.0, 1.0, y.shape))
 
 
+def _impulses(codes: float, share: float) -> Callable[[Array, np.random.Generator], Array]:
+    """Impulses of either sign on this share of the samples."""
+    return lambda y, rng: y + codes * rng.choice([-1.0, 1.0], y.shape) * (rng.random(y.shape) < share)
+
+
+def _popcorn(codes: float, dwell_n: float) -> Callable[[Array, np.random.Generator], Array]:
+    """Jumps between two levels, this much either side, after ``dwell_n`` samples on average."""
+    return lambda y, rng: y + codes * (-1.0) ** np.cumsum(rng.random(y.shape) < 1.0 / dwell_n, axis=1)
+
+
 def _hum(codes: float, cycles: float) -> Callable[[Array, np.random.Generator], Array]:
     """A sine of this amplitude and of ``cycles`` per sample, at a phase of its own in each trial."""
 
@@ -123,6 +133,8 @@ def _drift(codes: float) -> Callable[[Array, np.random.Generator], Array]:
 CONDITIONS = {
     "noise, 2 LSB autoregressive 0.9": Condition("noise", share=0.8, disturb=_coloured(2.0, 0.9)),
     "noise, 0.1 % of the displacement": Condition("noise", disturb=_proportional(0.001)),
+    "noise, 8 LSB on 1 % of the samples": Condition("noise", disturb=_impulses(8.0, 0.01)),
+    "noise, jumps of 3 LSB after 200 samples": Condition("noise", share=0.9, disturb=_popcorn(1.5, 200.0)),
     "hum, 1 LSB, 50 Hz": Condition("hum", disturb=_hum(1.0, 50.0 / 20e3)),
     "hum, 1 LSB, 150 Hz": Condition("hum", disturb=_hum(1.0, 150.0 / 20e3)),
     "hum, 3 LSB, 50 Hz": Condition("hum", disturb=_hum(3.0, 50.0 / 20e3)),

@@ -310,12 +310,16 @@ def test_diagnosis_leaves_the_estimates_alone(idle: Device, device: Device) -> N
 # ---- misfits
 
 
+ZERO = 1000
+"""Code of no force and no displacement. At code 0 the converter would limit the noise, which is a misfit too."""
+
+
 def hum_codes(fits_from: int, samples: int) -> tuple[list[int], list[int]]:
-    """A plant whose displacement has hum until the sample ``fits_from``."""
+    """A plant whose displacement has hum until the sample ``fits_from``. The converter limits neither signal."""
     (u, *_), (disturbed, *_) = misfits.CONDITIONS["hum, 3 LSB, 50 Hz"].play(1, samples, seed=2)
     (_, *_), (undisturbed, *_) = misfits.Condition("none").play(1, samples, seed=2)
     y = np.where(np.arange(samples) < fits_from, disturbed, undisturbed)
-    return [np.clip(np.round(codes), 0, 65535).astype(int).tolist() for codes in (u, y)]  # type: ignore[return-value]
+    return [(np.round(codes) + ZERO).astype(int).tolist() for codes in (u, y)]  # type: ignore[return-value]
 
 
 def misfits_of(device: Device, u: list[int], y: list[int]) -> list[Misfit]:

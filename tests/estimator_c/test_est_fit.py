@@ -137,6 +137,7 @@ def test_structure_below_the_declared_noise_does_no_harm(estimator: Estimator) -
 
 def test_noise_that_is_estimated_is_not_compared_with_the_setting(estimator: Estimator) -> None:
     steps = Steps()
+    steps.y += 5.0 * steps.rng.normal(0.0, 1.0, N)
     steps.innovation *= 5.0
     assert not steps.judged(estimator).cause.any()
 
@@ -152,6 +153,91 @@ def test_noise_whose_variance_follows_y_is_noise(estimator: Estimator) -> None:
     steps = Steps()
     steps.innovation *= np.where(steps.y > steps.y.mean(), 1.35, 0.4)
     assert final(steps.judged(estimator)) == "noise"
+
+
+@pytest.mark.parametrize(("since_edge", "cause"), [(30, "noise"), (5, "none")])
+def test_outliers_are_noise_unless_an_edge_is_in_doubt(estimator: Estimator, since_edge: int, cause: str) -> None:
+    steps = Steps()
+    steps.innovation[since_edge::200] = 6.0
+    assert final(steps.judged(estimator)) == cause
+
+
+@pytest.mark.parametrize("by", ["slope", "level"])
+def test_noise_whose_variance_depends_on_the_state_a_little_is_noise_in_time(estimator: Estimator, by: str) -> None:
+    steps = Steps(8000)
+    state = np.abs(np.diff(steps.y, prepend=0.0)) if by == "slope" else steps.y
+    steps.innovation *= np.where(state > np.quantile(state, 0.5), 1.2, 0.84)
+    causes = np.unique(steps.judged(estimator).cause)
+    assert [misfits.CAUSES[cause] for cause in causes] == ["none", "noise"]
+
+
+@pytest.mark.parametrize("correlation", [-0.5, 0.5])
+def test_correlation_of_successive_innovations_is_noise(estimator: Estimator, correlation: float) -> None:
+    steps = Steps()
+    steps.innovation += correlation * np.roll(steps.innovation, 1)
+    assert final(steps.judged(estimator)) == "noise"
+
+
+@pytest.mark.parametrize(("factor", "cause"), [(1.45, "noise"), (1.0 / 1.45, "none")])
+def test_noise_that_rises_from_block_to_block_is_noise(estimator: Estimator, factor: float, cause: str) -> None:
+    steps = Steps()
+    later = steps.at >= SETTLING_N + PERIOD_N
+    steps.innovation[later] *= factor
+    assert final(steps.judged(estimator)) == cause
+
+
+@pytest.mark.parametrize(
+    ("inflation", "alarms", "cause"),
+    [
+        (1.0, (), "none"),
+        (1.0, (600,), "none"),
+        (4.0, (), "none"),
+        (4.0, (600,), "noise"),
+        (1.0, (500, 600, 700), "noise"),
+    ],
+    ids=["none", "justified", "long ago", "not justified", "three"],
+)
+def test_alarms_are_evidence_for_noise(
+    estimator: Estimator, inflation: float, alarms: tuple[int, ...], cause: str
+) -> None:
+    """Outliers in a single block do not suffice: a change of the plant has some too."""
+    steps = Steps()
+    steps.innovation[SETTLING_N + PERIOD_N + 42 :: 100] = 6.0
+    assert final(steps.judged(estimator, inflation=inflation, alarms=alarms)) == cause
+
+
+@pytest.mark.parametrize("seed", [2, 10])
+def test_innovations_that_jump_between_two_levels_are_noise(estimator: Estimator, seed: int) -> None:
+    """Such noise has a mean and a peak in each block."""
+    steps = Steps(seed=seed)
+    steps.innovation += (-1.0) ** np.cumsum(steps.rng.random(N) < 1.0 / 150.0)
+    assert final(steps.judged(estimator)) == "noise"
+
+
+@pytest.mark.parametrize("amplitudes", [(2.0, 1.0), (1.0, 2.0)])
+def test_line_whose_power_varies_is_noise(estimator: Estimator, amplitudes: tuple[float, float]) -> None:
+    steps = Steps()
+    amplitude = np.where(steps.at < SETTLING_N + PERIOD_N, *amplitudes)
+    steps.innovation += amplitude * np.sin(2.0 * np.pi * 5.0 / BLOCK_N * steps.at)
+    assert final(steps.judged(estimator)) == "noise"
+
+
+def test_correlation_in_the_first_block_is_stated_after_the_second(estimator: Estimator) -> None:
+    steps = Steps()
+    first = SETTLING_N + BLOCK_N
+    for k in range(1, first):
+        steps.innovation[k] = 0.9 * steps.innovation[k - 1] + 0.44 * steps.innovation[k]
+    cause = steps.judged(estimator).cause[0]
+    assert misfits.CAUSES[cause[-1]] == "noise"
+    assert np.flatnonzero(cause)[0] > SETTLING_N + 2 * PERIOD_N - 6
+
+
+def test_correlation_that_depends_on_the_state_is_nonlinear(estimator: Estimator) -> None:
+    steps = Steps()
+    steps.innovation += 0.4 * np.roll(steps.innovation, 1)
+    between = np.abs(steps.y - steps.y.mean()) < 0.9 * steps.y.std()
+    steps.innovation += 0.9 * (between - between.mean())
+    assert final(steps.judged(estimator)) == "nonlinear"
 
 
 def test_small_force_is_lack_of_excitation(estimator: Estimator) -> None:
@@ -223,6 +309,15 @@ def test_block_with_few_innovations_states_nothing(estimator: Estimator) -> None
     steps.innovation *= 5.0
     status = np.where(steps.at % 8 == 0, UPDATED, np.where(steps.at % 8 == 7, GATHERING, MISSING))
     assert not steps.judged(estimator, status=status).cause.any()
+
+
+def test_blocks_with_few_innovations_withdraw_nothing(estimator: Estimator) -> None:
+    steps = Steps(6000)
+    fits_from = SETTLING_N + 2 * PERIOD_N
+    steps.innovation[:fits_from] += 1.0
+    gaps = np.where(steps.at % 8 == 7, GATHERING, MISSING)
+    status = np.where((steps.at < fits_from) | (steps.at % 8 == 0), UPDATED, gaps)
+    assert final(steps.judged(estimator, status=status)) == "drift"
 
 
 def test_orders_without_a_mass_are_refused(estimator: Estimator) -> None:

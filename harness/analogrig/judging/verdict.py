@@ -77,8 +77,8 @@ CURES: Mapping[str, str] = {
     "hum": "shield the sensor and its cable, or sample synchronously with the mains",
     "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card if it has its own',
     "nonlinear": "reduce the amplitude of the excitation, or raise the orders na and nb",
-    "noise": "shield or filter the output; without noise_estimated, set noise_variance as measured at rest; or raise"
-    " the orders na and nb",
+    "noise": "shield or filter the output, and use a sampling clock without jitter; without noise_estimated, set"
+    " noise_variance as measured at rest; or raise the orders na and nb",
     "slow plant": "lower the sample rate, or use a converter with more bits",
     "excitation": "raise the amplitude of the excitation",
 }
