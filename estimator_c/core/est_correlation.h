@@ -75,7 +75,8 @@ static inline float est_correlation_enter(est_correlation_t* const self,
     self->last[1]        = before;
     self->last[0]        = e;
     if (scale->left_n > 0U) {
-        scale->product += precision * (((self->work & EST_WORK_LAG_2) != 0U) ? (forward * backward) : (e * before));
+        const float product = ((self->work & EST_WORK_LAG_2) != 0U) ? (forward * backward) : (e * before);
+        scale->product += precision * product;
     }
     if (!est_correlation_reads(self)) {
         return est_trigger_sum(statistic, term);  // MISRA D4

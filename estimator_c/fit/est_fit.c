@@ -424,7 +424,7 @@ static void complete(est_fit_watch_t* const self, const est_t* const estimator) 
 }
 
 /// Keep what the next block is compared with.
-static void keep(est_fit_watch_t* const self, const est_t* const estimator) {
+static void keep_block(est_fit_watch_t* const self, const est_t* const estimator) {
     self->candidate     = self->found.kind;
     self->last_peak     = self->peak;
     self->last_power    = peak_power(self);
@@ -451,7 +451,7 @@ static void conclude(est_fit_watch_t* const self, const est_t* const estimator) 
     if (!edges_vary(estimator) && (again || compared || (scale_misfit(estimator) > 1.0F))) {
         self->misfit = found;
     }
-    keep(self, estimator);
+    keep_block(self, estimator);
 }
 
 /// True iff the block has enough innovations to state anything.
@@ -531,8 +531,8 @@ work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const
 static float limit_innovation(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
     const float limit  = self->limit * self->limit;
     const float square = step.innovation * step.innovation;
-    const bool  clear  = (estimator->doubt_n == 0U) && estimator->settled && estimator->known;
-    if (clear || step.alarm) {
+    const bool  judged = (estimator->doubt_n == 0U) && estimator->settled && estimator->known;
+    if (judged || step.alarm) {
         const float most = OUTLIER * limit;
         self->sums.fourths += limit * (((square < most) ? square : most) - limit);
     }
@@ -540,7 +540,7 @@ static float limit_innovation(est_fit_watch_t* const self, const est_t* const es
 }
 
 /// Enter an innovation into the sums. Return it, limited.
-static float enter_innovation(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
+static float add_innovation(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
     est_fit_sums_t* const sums = &self->sums;
     float                 z    = step.innovation;
     if (!(est_magnitude(z) <= self->limit)) {
@@ -573,7 +573,7 @@ static void work_on_lines(est_fit_watch_t* const self) {
 static void enter_sample(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
     float z = 0.0F;
     if (is_used(self, step)) {
-        z = enter_innovation(self, estimator, step);
+        z = add_innovation(self, estimator, step);
     } else {
         self->sums.lost_n++;
     }

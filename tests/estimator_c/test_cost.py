@@ -67,7 +67,7 @@ BEYOND = {
     "M4F, n = 6, edges may slip, fixed, worst": 708,
     "M3, n = 4, edges locked, worst": 8888,
     "M0, n = 4, edges locked, worst": 7820,
-    "M4F, code of the core at -Os, everything": 6400,
+    "M4F, code of the core at -Os, everything": 6408,
     "M4F, state: sizeof(est_t)": 412,
 }
 """Limits that the core still misses, with values not to exceed; one that it keeps must leave this list.

@@ -230,7 +230,7 @@ def test_theta_that_overflows_raises_an_alarm_while_there_is_a_second_reading(
     estimator: Estimator, warm_up_n: int
 ) -> None:
     read = 0
-    for seed in range(30):
+    for seed in range(120):
         assert estimator.init(**VAGUE | {"p0": 1e6, "offset": 0, "warm_up_n": warm_up_n, "ceiling": 1e9})
         u, y = barely_excited(seed, 2000, rest=1e-4, busy=0.2)
         for k in range(len(u)):
