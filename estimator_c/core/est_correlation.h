@@ -75,7 +75,10 @@ static inline float est_correlation_enter(est_correlation_t* const self,
     self->last[1]        = before;
     self->last[0]        = e;
     if (scale->left_n > 0U) {
-        const float product = ((self->work & EST_WORK_LAG_2) != 0U) ? (forward * backward) : (e * before);
+        float product = e * before;
+        if ((self->work & EST_WORK_LAG_2) != 0U) {
+            product = forward * backward;
+        }
         scale->product += precision * product;
     }
     if (!est_correlation_reads(self)) {

@@ -101,6 +101,9 @@
 /// Inflation of the scale from which the model is known not to fit: two alarms that were not justified.
 #define INFLATION_MISFIT 8.0F
 
+/// A count as a number.
+static float number(const uint32_t n) { return (float)n; }
+
 /// a / b; 0 unless b is positive.
 EST_SHARED float quotient(const float a, const float b) {
     float out = 0.0F;
@@ -228,7 +231,7 @@ static float find_frequency(const est_fit_watch_t* const self) {
     }
     const float beside = share / (1.0F + share);
     const float line   = (float)self->peak + (upwards ? beside : -beside);
-    return line / (float)EST_FIT_BLOCK_N;
+    return line / number(EST_FIT_BLOCK_N);
 }
 
 // ---------------------------------------------         CAUSES         ---------------------------------------------
@@ -239,7 +242,7 @@ static float declared_variance(const est_fit_watch_t* const self) {
 
 /// Number of innovations in the block.
 EST_SHARED float count_of(const est_fit_watch_t* const self) {
-    return (float)EST_FIT_BLOCK_N - (float)self->sums.lost_n;
+    return number(EST_FIT_BLOCK_N) - (float)self->sums.lost_n;
 }
 
 EST_SHARED float variance_of(const est_fit_watch_t* const self) { return self->sums.squares / count_of(self); }
@@ -268,7 +271,7 @@ EST_SHARED float share_of(const est_fit_watch_t* const self, const float explain
 /// Weigh a mean that is more than a part of a broad spectrum.
 static float weigh_drift(const est_fit_watch_t* const self) {
     const float sum    = self->sums.total;
-    const float beyond = (float)EST_FIT_SUMS_N * (self->sums.power - clear_energy_of(self));
+    const float beyond = number(EST_FIT_SUMS_N) * (self->sums.power - clear_energy_of(self));
     const float weight = quotient(sum * sum, reference_variance(self) * count_of(self) * DRIFT);
     return ((sum * sum) > (MEAN_SHARE * beyond)) ? weight : 0.0F;
 }
