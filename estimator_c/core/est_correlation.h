@@ -15,7 +15,7 @@
 
 /// Squared correlation beyond which they have none. Such innovations are the slow residual of a poor model: their
 /// squares have no peaks, while what an autoregression leaves of them has.
-#define EST_SMOOTH 0.77F
+#define EST_SMOOTH 0.62F
 
 /// Share of a block in a partial correlation, before the trigger is armed and later.
 #define EST_PARTIAL_WARM 0.5F

@@ -5,7 +5,7 @@ from __future__ import annotations
 GAIN, DRIFT = 0.4945, 1.1305
 """Terms of the sum: GAIN z^2 - DRIFT, a multiple of the log-likelihood ratio of a variance 7.1 times as large."""
 
-CORRELATED, SMOOTH = 0.012, 0.77
+CORRELATED, SMOOTH = 0.012, 0.62
 """Squares of the partial correlations from which on there is a second reading, and square of the first beyond which
 there is none."""
 
