@@ -380,7 +380,7 @@ static void enter_edge(est_t* const self) {
     }
     const est_edge_instants_t instants = edge_instants_of(self);
     if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) &&
-        (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
+        is_cusum(self->config)) {
         doubt_edge(self);
     } else if (instants == EST_EDGES_ANYWHERE) {
         self->pending_n = larger(self->pending_n, self->config->na);
@@ -551,7 +551,7 @@ static void put_on_trial(est_t* const self, const bool overflown) {
     if (self->scale.trial_n > 0U) {
         est_scale_conclude(self);
     }
-    if (!overflown && self->cusum) {
+    if (!overflown && is_cusum(self->config)) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
@@ -645,7 +645,7 @@ EST_INLINE float weight_of(const est_t* const self) {
 static void find_hidden_change(est_t* const self) {
     est_scale_t* const scale = &self->scale;
     est_scale_count_high(scale, self->noise_variance);
-    if ((self->trigger.quiet_n > 0U) || !self->cusum || (scale->share <= 0.0F)) {
+    if ((self->trigger.quiet_n > 0U) || !is_cusum(self->config) || (scale->share <= 0.0F)) {
         scale->high_n = 0U;
     } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
         scale->high_n           = 0U;
@@ -657,7 +657,7 @@ static void find_hidden_change(est_t* const self) {
 
 /// Let the correlation of the innovations follow a complete block.
 static void follow_correlation(est_t* const self) {
-    if (self->cusum && (self->correlation.work > 0U)) {
+    if (is_cusum(self->config) && (self->correlation.work > 0U)) {
         const float share = (self->trigger.quiet_n > 0U) ? EST_PARTIAL_WARM : EST_PARTIAL_SHARE;
         est_correlation_follow(&self->correlation, &self->scale, self->noise_variance, share);
     }
@@ -685,7 +685,7 @@ static void renew_scale(est_t* const self) {
         }
     } else if (scale->stage == EST_STAGE_CHANGE) {
         find_hidden_change(self);
-        if (self->cusum) {
+        if (is_cusum(self->config)) {
             est_correlation_restart(&self->correlation);
         }
     } else {
@@ -873,9 +873,8 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
 #if EST_WITH_ROBUSTNESS
-    self->cusum = config->trigger.kind == EST_TRIGGER_CUSUM;
     est_scale_init(self);
-    self->correlation.work = self->cusum ? 0U : EST_WORK_OTHER_TRIGGER;
+    self->correlation.work = is_cusum(config) ? 0U : EST_WORK_OTHER_TRIGGER;
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);
@@ -888,11 +887,12 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
-    float      y       = 0.0F;
-    est_step_t step    = { .status = examine(self, sample, &y), .alarm = false, .innovation = 0.0F };
-    step.statistic     = self->trigger.statistic;
-    const bool updated = step.status == EST_UPDATED;
-    if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status, &y))) {
+    float              y      = 0.0F;
+    const est_status_t status = examine(self, sample, &y);
+    est_step_t         step   = {
+                  .status = status, .alarm = false, .idle = false, .innovation = 0.0F, .statistic = self->trigger.statistic
+    };
+    if ((status == EST_UPDATED) || ((status != EST_GATHERING) && enter_gap(self, status, &y))) {
         dispatch_equation(self, y, &step);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);

@@ -361,6 +361,13 @@ typedef struct {
 #define EST_GAINS_KEPT 1U
 #endif
 
+/// Number of these gains: all but the last one, unless the filter uses them directly.
+#if EST_WITH_ROBUSTNESS
+#define EST_GAIN_COLUMNS EST_GAINS_KEPT
+#else
+#define EST_GAIN_COLUMNS EST_NA_MAX
+#endif
+
 /// Last whitened values of one signal, newest first; or the last one and its differences of order 1, 2, ... Private.
 typedef struct {
     float x[EST_NA_MAX];
@@ -369,10 +376,10 @@ typedef struct {
 /// Filter that whitens the noise of consecutive equations. Private to est_whitener.h.
 typedef struct {
     float c[EST_NA_MAX];
-    float gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< one row per equation, newest first
-    float precision[EST_NA_MAX];             ///< of the whitened equations, newest first; 0: no equation
+    float gain[EST_GAINS_KEPT][EST_GAIN_COLUMNS];  ///< one row per equation, newest first
+    float precision[EST_NA_MAX];                   ///< of the whitened equations, newest first; 0: no equation
 #if EST_WITH_ROBUSTNESS
-    float step[EST_NA_MAX];  ///< factors of the differences in est_past_t, from gain[0]
+    float step[EST_NA_MAX];  ///< factors of the differences in est_past_t, from the newest gains
 #endif
     est_past_t past[EST_THETA_MAX + 1U];  ///< one for each element of the equation
 } est_whitener_t;
@@ -446,7 +453,6 @@ typedef struct {
     bool                settled;     ///< the gains of the whitener are c, and its variance is 1
     uint8_t             doubt_n;     ///< samples since the first edge in doubt, inclusive; 0: no doubt
 #if EST_WITH_ROBUSTNESS
-    bool    cusum;       ///< the trigger is the cumulative sum
     bool    edges_vary;  ///< edges come anywhere, against the configuration
     uint8_t bridged_n;   ///< samples before the next one that were predicted
 #endif
