@@ -351,7 +351,7 @@ EST_INLINE est_edge_instants_t edge_instants_of(const est_t* const self) {
 /// True while the last alarm is on trial: theta before the alarm occupies the place of theta before an edge.
 EST_INLINE bool is_on_trial(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return self->scale.trial_n > 0U;
+    return est_scale_on_trial(&self->scale);
 #else
     (void)self;
     return false;
@@ -370,10 +370,11 @@ static bool on_bridge(const est_t* const self) {
 
 static void enter_edge(est_t* const self) {
     if (on_bridge(self)) {
-        forget_samples(self);  // the instant of the edge is unknown
-        return;                // MISRA D4
+        increment(&self->edge_age_n);  // the instant of the edge is unknown
+        forget_samples(self);
+        return;  // MISRA D4
     }
-    const bool slope = self->edge_age_n <= SLOPE_N;
+    const bool slope = self->edge_age_n < SLOPE_N;
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
         return;  // MISRA D4
@@ -412,14 +413,15 @@ static est_status_t enter_input(est_t* const self, float u, float* const y) {
         increment(&self->counters.stuck);
         return EST_REFUSED;  // MISRA D4
     }
-    if (EST_KNOWS_EDGES) {
-        increment(&self->edge_age_n);
-    }
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->doubt_n = (self->doubt_n < EST_DOUBT_N) ? (uint8_t)(self->doubt_n + 1U) : 0U;
     }
     if (edge) {
         enter_edge(self);
+    } else if (EST_KNOWS_EDGES) {
+        increment(&self->edge_age_n);
+    } else {
+        // nothing depends on the age of edges
     }
 #if EST_WITH_ROBUSTNESS
     self->bridged_n = 0U;
@@ -548,7 +550,7 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 /// with the next one. An earlier trial ends.
 static void put_on_trial(est_t* const self, const bool overflown) {
 #if EST_WITH_ROBUSTNESS
-    if (self->scale.trial_n > 0U) {
+    if (est_scale_on_trial(&self->scale)) {
         est_scale_conclude(self);
     }
     if (!overflown && is_cusum(self->config)) {
@@ -663,37 +665,55 @@ static void follow_correlation(est_t* const self) {
     }
 }
 
-/// Let the noise variance follow a complete block.
-static void follow_noise(est_t* const self) {
-    const est_scale_t* const scale = &self->scale;
-    const bool               warm  = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
-    est_scale_follow(self, warm ? EST_SHARE_MIN : EST_SHARE_WARM, est_correlation_smooth(&self->correlation));
+/// Let the dispersion follow a complete block. That of squares without peaks does not count. Neither does it before
+/// the trigger is armed, while theta settles.
+static void follow_dispersion(est_t* const self) {
+    est_scale_t* const scale = &self->scale;
+    if ((self->trigger.quiet_n > 0U) || est_correlation_smooth(&self->correlation)) {
+        scale->dispersion = 1.0F;
+    } else {
+        est_scale_disperse(scale, self->noise_variance);
+    }
 }
 
-/// Update the scale after a block. A block that ends with a large statistic may contain a change and is discarded.
-/// Several steps, so that none is long.
+/// Let the noise variance follow a complete block.
+static void follow_noise(est_t* const self) {
+    const bool warm = (self->scale.share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
+    est_scale_follow(self, warm ? EST_SHARE_MIN : EST_SHARE_WARM);
+}
+
+/// Update the scale after a block, by one stage. A block that ends with a large statistic may contain a change and is
+/// discarded.
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    const bool counts = (scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling));
-    if (scale->stage == EST_STAGE_CORRELATION) {
-        if (counts) {
+    switch (scale->phase) {
+    case EST_PHASE_CORRELATION:
+        if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
             follow_correlation(self);
+        } else {
+            scale->phase = EST_PHASE_NOISE;
         }
-    } else if (scale->stage == EST_STAGE_NOISE) {
-        if (counts) {
-            follow_noise(self);
-        }
-    } else if (scale->stage == EST_STAGE_CHANGE) {
+        break;
+    case EST_PHASE_DISPERSION:
+        follow_dispersion(self);
+        break;
+    case EST_PHASE_NOISE:
+        follow_noise(self);
+        break;
+    case EST_PHASE_CHANGE:
         find_hidden_change(self);
+        break;
+    case EST_PHASE_WORK:
         if (is_cusum(self->config)) {
             est_correlation_restart(&self->correlation);
         }
-    } else {
+        break;
+    default:
         est_scale_relax(scale);
         est_scale_restart(self);
         return;  // MISRA D4
     }
-    scale->stage++;
+    scale->phase++;
 }
 
 /// Continue the trial of the last alarm by one equation.
@@ -717,7 +737,7 @@ EST_INLINE void watch_scale(est_t* const                self,
     if (est_scale_enter(&self->scale, term)) {
         return;  // MISRA D4
     }
-    if (self->scale.trial_n > 0U) {
+    if (est_scale_on_trial(&self->scale)) {
         try_alarm(self, shape, equation, precision);
     } else if (self->renewal == EST_RENEWAL_NONE) {
         renew_scale(self);

@@ -67,23 +67,19 @@ static inline float est_correlation_enter(est_correlation_t* const self,
                                           const float              term,
                                           const float              weight,
                                           const float              precision) {
-    const float first    = self->partial[0];
-    const float second   = self->partial[1];
-    const float before   = self->last[0];
-    const float forward  = e - (first * before);
-    const float backward = self->last[1] - (first * before);
-    self->last[1]        = before;
-    self->last[0]        = e;
-    if (scale->left_n > 0U) {
-        float product = e * before;
-        if ((self->work & EST_WORK_LAG_2) != 0U) {
-            product = forward * backward;
-        }
-        scale->product += precision * product;
-    }
+    const float before = self->last[0];
+    self->last[0]      = e;
     if (!est_correlation_reads(self)) {
+        est_scale_enter_product(scale, precision * (e * before));
         return est_trigger_sum(statistic, term);  // MISRA D4
     }
+    const float first    = self->partial[0];
+    const float second   = self->partial[1];
+    const float forward  = e - (first * before);
+    const float backward = self->last[1] - (first * before);
+    const bool  at_two   = (self->work & EST_WORK_LAG_2) != 0U;
+    self->last[1]        = before;
+    est_scale_enter_product(scale, precision * (at_two ? (forward * backward) : (e * before)));
     const float left   = (1.0F - (first * first)) * (1.0F - (second * second));  // of the variance
     const float spread = 1.0F + (EST_LEVERAGE * (1.0F - precision));
     const float one    = est_trigger_sum(statistic + est_max(self->lead, 0.0F), term);
