@@ -788,7 +788,10 @@ EST_INLINE void enter_innovation(
     const float          share   = est_trigger_share(held);
 #if EST_WITH_ROBUSTNESS
     est_correlation_t* const correlation = &self->correlation;
-    if (correlation->work == 0U) {
+    if (correlation->work == EST_WORK_LAG_1) {
+        est_correlation_multiply(correlation, &self->scale, e, precision);
+    }
+    if (correlation->work <= EST_WORK_LAG_1) {
         trigger->statistic = est_trigger_sum(trigger->statistic, share * term);
         return;  // the usual step; MISRA D4
     }

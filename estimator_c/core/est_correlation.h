@@ -57,6 +57,16 @@ static inline void est_correlation_forget(est_correlation_t* const self) {
     self->lead = 0.0F;
 }
 
+/// Enter one innovation into the products of the block at lag 1. `precision`: reciprocal of its variance [1 / noise
+/// variance].
+static inline void est_correlation_multiply(est_correlation_t* const self,
+                                            est_scale_t* const       scale,
+                                            const float              e,
+                                            const float              precision) {
+    est_scale_enter_product(scale, precision * (e * self->last[0]));
+    self->last[0] = e;
+}
+
 /// Enter one innovation into the products of the block and into both readings. `statistic`: their smaller sum so far;
 /// `term`: of the first reading; `weight`: of a squared innovation in the sums; `precision`: reciprocal of its variance
 /// [1 / noise variance]. Return the smaller sum.
@@ -67,19 +77,18 @@ static inline float est_correlation_enter(est_correlation_t* const self,
                                           const float              term,
                                           const float              weight,
                                           const float              precision) {
-    const float before = self->last[0];
-    self->last[0]      = e;
-    if (!est_correlation_reads(self)) {
-        est_scale_enter_product(scale, precision * (e * before));
-        return est_trigger_sum(statistic, term);  // MISRA D4
-    }
     const float first    = self->partial[0];
     const float second   = self->partial[1];
+    const float before   = self->last[0];
     const float forward  = e - (first * before);
     const float backward = self->last[1] - (first * before);
-    const bool  at_two   = (self->work & EST_WORK_LAG_2) != 0U;
     self->last[1]        = before;
-    est_scale_enter_product(scale, precision * (at_two ? (forward * backward) : (e * before)));
+    if ((self->work & EST_WORK_LAG_2) != 0U) {
+        est_scale_enter_product(scale, precision * (forward * backward));
+        self->last[0] = e;
+    } else {
+        est_correlation_multiply(self, scale, e, precision);
+    }
     const float left   = (1.0F - (first * first)) * (1.0F - (second * second));  // of the variance
     const float spread = 1.0F + (EST_LEVERAGE * (1.0F - precision));
     const float one    = est_trigger_sum(statistic + est_max(self->lead, 0.0F), term);
