@@ -643,75 +643,65 @@ EST_INLINE float weight_of(const est_t* const self) {
 
 #if EST_WITH_ROBUSTNESS
 
-/// Let the next innovation raise an alarm if the blocks of late were high.
-static void find_hidden_change(est_t* const self) {
+/// Let the next innovation raise an alarm if the blocks of late were high. `mean`: mean square of the newest one.
+static void find_hidden_change(est_t* const self, const float mean) {
     est_scale_t* const scale = &self->scale;
-    est_scale_count_high(scale, self->noise_variance);
-    if ((self->trigger.quiet_n > 0U) || !is_cusum(self->config) || (scale->share <= 0.0F)) {
+    if ((self->trigger.quiet_n > 0U) || (scale->share <= 0.0F)) {
         scale->high_n = 0U;
-    } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
+        return;  // MISRA D4
+    }
+    est_scale_count(scale, mean >= (EST_HIGH * self->noise_variance));
+    if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {  // a doubt comes first
         scale->high_n           = 0U;
         self->trigger.statistic = 2.0F * self->config->trigger.ceiling;
+    }
+}
+
+/// Let correlation and dispersion of the innovations follow a complete block of this mean square. The dispersion of
+/// squares without peaks does not count. Neither does it before the trigger is armed, while theta settles.
+static void follow_shape(est_t* const self, const float mean) {
+    const bool               armed       = self->trigger.quiet_n == 0U;
+    est_correlation_t* const correlation = &self->correlation;
+    est_scale_t* const       scale       = &self->scale;
+    if ((correlation->work & EST_WORK_LAGS) != 0U) {
+        est_correlation_follow(correlation, scale->product, mean, self->noise_variance,
+                               armed ? EST_PARTIAL_SHARE : EST_PARTIAL_WARM);
+    }
+    if (armed && !est_correlation_smooth(correlation)) {
+        est_scale_disperse(scale, mean / self->noise_variance);
     } else {
-        // nothing is hidden, or a doubt comes first
-    }
-}
-
-/// Let the correlation of the innovations follow a complete block.
-static void follow_correlation(est_t* const self) {
-    if (is_cusum(self->config) && (self->correlation.work > 0U)) {
-        const float share = (self->trigger.quiet_n > 0U) ? EST_PARTIAL_WARM : EST_PARTIAL_SHARE;
-        est_correlation_follow(&self->correlation, &self->scale, self->noise_variance, share);
-    }
-}
-
-/// Let the dispersion follow a complete block. That of squares without peaks does not count. Neither does it before
-/// the trigger is armed, while theta settles.
-static void follow_dispersion(est_t* const self) {
-    est_scale_t* const scale = &self->scale;
-    if ((self->trigger.quiet_n > 0U) || est_correlation_smooth(&self->correlation)) {
         scale->dispersion = 1.0F;
-    } else {
-        est_scale_disperse(scale, self->noise_variance);
     }
 }
 
-/// Let the noise variance follow a complete block.
-static void follow_noise(est_t* const self) {
+/// Let the noise variance follow a complete block of this mean square.
+static void follow_noise(est_t* const self, const float mean) {
     const bool warm = (self->scale.share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
-    est_scale_follow(self, warm ? EST_SHARE_MIN : EST_SHARE_WARM);
+    est_scale_follow(self, mean, warm ? EST_SHARE_MIN : EST_SHARE_WARM);
 }
 
 /// Update the scale after a block, by one stage. A block that ends with a large statistic may contain a change and is
 /// discarded.
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    switch (scale->phase) {
-    case EST_PHASE_CORRELATION:
-        if ((scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
-            follow_correlation(self);
-        } else {
-            scale->phase = EST_PHASE_NOISE;
-        }
-        break;
-    case EST_PHASE_DISPERSION:
-        follow_dispersion(self);
-        break;
-    case EST_PHASE_NOISE:
-        follow_noise(self);
-        break;
-    case EST_PHASE_CHANGE:
-        find_hidden_change(self);
-        break;
-    case EST_PHASE_WORK:
-        if (is_cusum(self->config)) {
-            est_correlation_restart(&self->correlation);
-        }
-        break;
-    default:
+    const float        mean  = est_scale_mean(scale);
+    const bool counts = (scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling));
+    if (scale->phase == EST_PHASE_END) {
         est_scale_relax(scale);
         est_scale_restart(self);
         return;  // MISRA D4
+    }
+    if (scale->phase == EST_PHASE_CHANGE) {
+        if (is_cusum(self->config)) {
+            find_hidden_change(self, mean);
+            est_correlation_restart(&self->correlation);
+        }
+    } else if (!counts) {
+        // the block is discarded
+    } else if (scale->phase == EST_PHASE_NOISE) {
+        follow_noise(self, mean);
+    } else {
+        follow_shape(self, mean);
     }
     scale->phase++;
 }

@@ -33,6 +33,7 @@
 /// Work of each step of a block: none, or products of innovations at lag 1 or 2, and the second reading.
 #define EST_WORK_LAG_1 1U
 #define EST_WORK_LAG_2 2U
+#define EST_WORK_LAGS 3U
 #define EST_WORK_READS 4U
 #define EST_WORK_OTHER_TRIGGER 8U  ///< none, for good: the trigger is not the cumulative sum
 
@@ -98,16 +99,17 @@ static inline float est_correlation_enter(est_correlation_t* const self,
     return est_min(one, other);
 }
 
-/// Improve the partial correlation of the lag of a complete block. `share`: of the block in the estimate.
+/// Improve the partial correlation of the lag of a complete block. `product`: sum of its products; `mean`: its mean
+/// square; `share`: of the block in the estimate.
 static inline void est_correlation_follow(est_correlation_t* const self,
-                                          const est_scale_t* const scale,
+                                          const float              product,
+                                          const float              mean,
                                           const float              noise_variance,
                                           const float              share) {
     const bool   second  = (self->work & EST_WORK_LAG_2) != 0U;
     float* const partial = &self->partial[second ? 1U : 0U];
     const float  left    = second ? (1.0F - (self->partial[0] * self->partial[0])) : 1.0F;
-    const float  mean    = est_scale_mean(scale);
-    const float  error   = (scale->product / (float)EST_BLOCK_N) - (EST_PARTIAL_LOAD * left * mean * *partial);
+    const float  error   = (product / (float)EST_BLOCK_N) - (EST_PARTIAL_LOAD * left * mean * *partial);
     const float  next    = *partial + ((share * error) / est_max(mean, noise_variance));
     *partial             = est_max(est_min(next, EST_PARTIAL_MAX), -EST_PARTIAL_MAX);
 }

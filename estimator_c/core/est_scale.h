@@ -14,16 +14,14 @@
 #define EST_BLOCK_N 32U
 
 /// Phases of the scale. During a block it is the number of equations. Then come the stages of the update, one a step,
-/// so that none is long: the correlation of the innovations follows the block, their dispersion and variance do, a
-/// hidden change is found, the next block is prepared and begins. During a trial the phase is EST_PHASE_TRIAL and the
-/// number of equations.
+/// so that none is long: correlation and dispersion of the innovations follow the block, the noise variance does, a
+/// hidden change is found, and the next block begins. During a trial the phase is EST_PHASE_TRIAL and the number of
+/// equations.
 #define EST_PHASE_CORRELATION EST_BLOCK_N
-#define EST_PHASE_DISPERSION (EST_BLOCK_N + 1U)
-#define EST_PHASE_NOISE (EST_BLOCK_N + 2U)
-#define EST_PHASE_CHANGE (EST_BLOCK_N + 3U)
-#define EST_PHASE_WORK (EST_BLOCK_N + 4U)
-#define EST_PHASE_END (EST_BLOCK_N + 5U)
-#define EST_PHASE_TRIAL (EST_BLOCK_N + 6U)
+#define EST_PHASE_NOISE (EST_BLOCK_N + 1U)
+#define EST_PHASE_CHANGE (EST_BLOCK_N + 2U)
+#define EST_PHASE_END (EST_BLOCK_N + 3U)
+#define EST_PHASE_TRIAL EST_PHASE_END
 
 /// Smallest share of a new block in the noise variance: a memory of 1,000 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
@@ -147,26 +145,24 @@ static inline float est_scale_mean(const est_scale_t* const self) {
     return (self->sum * EST_MEAN_SQUARE) / self->weight;
 }
 
-/// Let the dispersion follow a complete block.
-static inline void est_scale_disperse(est_scale_t* const self, const float noise_variance) {
-    const float ratio  = est_scale_mean(self) / noise_variance;
+/// Let the dispersion follow a complete block, whose mean square is `ratio` noise variances.
+static inline void est_scale_disperse(est_scale_t* const self, const float ratio) {
     const float square = est_min(ratio * ratio, EST_DISPERSION_MAX);
     self->dispersion += self->share * (square - self->dispersion);
 }
 
-/// Let the noise variance follow a complete block. `share_least`: smallest share of the next block.
-static inline void est_scale_follow(est_t* const estimator, const float share_least) {
-    est_scale_t* const self   = &estimator->scale;
-    const float        before = estimator->noise_variance;
-    const float        mean   = est_min(est_scale_mean(self), EST_GROWTH_MAX * before);
-    const float        noise  = before + (self->share * (mean - before));
-    self->share               = est_max(self->share / (1.0F + self->share), share_least);
-    estimator->noise_variance = est_max(noise, EST_NOISE_LEAST * estimator->config->noise_variance);
+/// Let the noise variance follow a complete block of this mean square. `share_least`: smallest share of the next block.
+static inline void est_scale_follow(est_t* const estimator, const float mean, const float share_least) {
+    est_scale_t* const self    = &estimator->scale;
+    const float        before  = estimator->noise_variance;
+    const float        limited = est_min(mean, EST_GROWTH_MAX * before);
+    const float        noise   = before + (self->share * (limited - before));
+    self->share                = est_max(self->share / (1.0F + self->share), share_least);
+    estimator->noise_variance  = est_max(noise, EST_NOISE_LEAST * estimator->config->noise_variance);
 }
 
-/// Count a complete block if it is high.
-static inline void est_scale_count_high(est_scale_t* const self, const float noise_variance) {
-    const bool high = (self->sum * EST_MEAN_SQUARE) >= (EST_HIGH * noise_variance * self->weight);
+/// Count a complete block, which is high or not.
+static inline void est_scale_count(est_scale_t* const self, const bool high) {
     if (high && (self->high_n < EST_HIGH_LIMIT)) {
         self->high_n = (uint8_t)(self->high_n + EST_HIGH_STEP);
     } else if (!high && (self->high_n > 0U)) {
