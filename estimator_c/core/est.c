@@ -646,7 +646,7 @@ EST_INLINE float weight_of(const est_t* const self) {
 /// Let the next innovation raise an alarm if the blocks of late were high. `mean`: mean square of the newest one.
 static void find_hidden_change(est_t* const self, const float mean) {
     est_scale_t* const scale = &self->scale;
-    if ((self->trigger.quiet_n > 0U) || (scale->share <= 0.0F)) {
+    if ((self->trigger.quiet_n > 0U) || !self->config->noise_estimated) {
         scale->high_n = 0U;
         return;  // MISRA D4
     }
@@ -684,19 +684,18 @@ static void follow_noise(est_t* const self, const float mean) {
 /// discarded.
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    const float        mean  = est_scale_mean(scale);
-    const bool counts = (scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling));
     if (scale->phase == EST_PHASE_END) {
         est_scale_relax(scale);
         est_scale_restart(self);
         return;  // MISRA D4
     }
+    const float mean = est_scale_mean(scale);
     if (scale->phase == EST_PHASE_CHANGE) {
         if (is_cusum(self->config)) {
             find_hidden_change(self, mean);
             est_correlation_restart(&self->correlation);
         }
-    } else if (!counts) {
+    } else if (!self->config->noise_estimated || (self->trigger.statistic >= (0.5F * self->config->trigger.ceiling))) {
         // the block is discarded
     } else if (scale->phase == EST_PHASE_NOISE) {
         follow_noise(self, mean);

@@ -117,7 +117,7 @@ static inline void est_scale_forgive(est_t* const estimator) {
     est_scale_t* const self = &estimator->scale;
     self->inflation         = 1.0F;
     self->dispersion        = 1.0F;
-    if (self->share > 0.0F) {
+    if (estimator->config->noise_estimated) {
         self->share = EST_SHARE_WARM;
     }
     est_scale_restart(estimator);
