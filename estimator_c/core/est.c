@@ -674,12 +674,6 @@ static void follow_shape(est_t* const self, const float mean) {
     }
 }
 
-/// Let the noise variance follow a complete block of this mean square.
-static void follow_noise(est_t* const self, const float mean) {
-    const bool warm = (self->scale.share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
-    est_scale_follow(self, mean, warm ? EST_SHARE_MIN : EST_SHARE_WARM);
-}
-
 /// Update the scale after a block, by one stage. A block that ends with a large statistic may contain a change and is
 /// discarded.
 static void renew_scale(est_t* const self) {
@@ -698,7 +692,7 @@ static void renew_scale(est_t* const self) {
     } else if (!self->config->noise_estimated || (self->trigger.statistic >= (0.5F * self->config->trigger.ceiling))) {
         // the block is discarded
     } else if (scale->phase == EST_PHASE_NOISE) {
-        follow_noise(self, mean);
+        est_scale_follow(self, mean);
     } else {
         follow_shape(self, mean);
     }

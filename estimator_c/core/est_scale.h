@@ -151,13 +151,14 @@ static inline void est_scale_disperse(est_scale_t* const self, const float ratio
     self->dispersion += self->share * (square - self->dispersion);
 }
 
-/// Let the noise variance follow a complete block of this mean square. `share_least`: smallest share of the next block.
-static inline void est_scale_follow(est_t* const estimator, const float mean, const float share_least) {
+/// Let the noise variance follow a complete block of this mean square.
+static inline void est_scale_follow(est_t* const estimator, const float mean) {
     est_scale_t* const self    = &estimator->scale;
     const float        before  = estimator->noise_variance;
     const float        limited = est_min(mean, EST_GROWTH_MAX * before);
     const float        noise   = before + (self->share * (limited - before));
-    self->share                = est_max(self->share / (1.0F + self->share), share_least);
+    const float        least   = (estimator->trigger.quiet_n < EST_WARM_N) ? EST_SHARE_MIN : EST_SHARE_WARM;
+    self->share                = est_max(self->share / (1.0F + self->share), least);
     estimator->noise_variance  = est_max(noise, EST_NOISE_LEAST * estimator->config->noise_variance);
 }
 

@@ -179,7 +179,7 @@ class ReferenceScale:
             self._dispersion = 1.0
         mean = min(mean, GROWTH_MAX * self.noise_variance)
         self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), self._least)
-        least = SHARE_WARM if quiet_n >= WARM_N or self._share > SHARE_WARM else SHARE_MIN
+        least = SHARE_WARM if quiet_n >= WARM_N else SHARE_MIN
         self._share = max(self._share / (1.0 + self._share), least)
 
     def _count_high(self) -> None:
