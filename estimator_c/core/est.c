@@ -689,12 +689,12 @@ static void renew_scale(est_t* const self) {
             find_hidden_change(self, mean);
             est_correlation_restart(&self->correlation);
         }
-    } else if (!self->config->noise_estimated || (self->trigger.statistic >= (0.5F * self->config->trigger.ceiling))) {
-        // the block is discarded
     } else if (scale->phase == EST_PHASE_NOISE) {
         est_scale_follow(self, mean);
-    } else {
+    } else if (self->config->noise_estimated && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
         follow_shape(self, mean);
+    } else {
+        scale->phase = EST_PHASE_NOISE;  // the block is discarded, and its noise variance with it
     }
     scale->phase++;
 }
