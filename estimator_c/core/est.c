@@ -380,8 +380,7 @@ static void enter_edge(est_t* const self) {
         return;  // MISRA D4
     }
     const est_edge_instants_t instants = edge_instants_of(self);
-    if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) &&
-        is_cusum(self->config)) {
+    if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) && is_cusum(self->config)) {
         doubt_edge(self);
     } else if (instants == EST_EDGES_ANYWHERE) {
         self->pending_n = larger(self->pending_n, self->config->na);
@@ -720,12 +719,13 @@ EST_INLINE void watch_scale(est_t* const                self,
     if (est_scale_enter(&self->scale, term)) {
         return;  // MISRA D4
     }
+    if (self->renewal != EST_RENEWAL_NONE) {
+        return;  // MISRA D4
+    }
     if (est_scale_on_trial(&self->scale)) {
         try_alarm(self, shape, equation, precision);
-    } else if (self->renewal == EST_RENEWAL_NONE) {
-        renew_scale(self);
     } else {
-        // the block waits
+        renew_scale(self);
     }
 #else
     (void)self;

@@ -409,13 +409,13 @@ typedef struct {
 
 /// Scale of the innovations and the trial of the last alarm. Private to est_scale.h.
 typedef struct {
-    uint8_t  phase;    ///< equations in this block; then the stage of the update, or that of the trial of an alarm
-    uint8_t  high_n;   ///< steps of high blocks
-    uint16_t credit_n; ///< blocks that justify alarms which are not plain
-    float    weight;   ///< of a squared innovation in the cumulative sum
-    float    sum;      ///< terms of this block; in a trial, squared errors of the old estimate less those of the new
-    float    product;  ///< sum of this block's products of innovations at one lag: see est_correlation.h
-    float    share;    ///< share of this block in the noise variance
+    uint8_t  phase;       ///< equations in this block; then the stage of the update, or that of the trial of an alarm
+    uint8_t  high_n;      ///< steps of high blocks
+    uint16_t credit_n;    ///< blocks that justify alarms which are not plain
+    float    weight;      ///< of a squared innovation in the cumulative sum
+    float    sum;         ///< terms of this block; in a trial, squared errors of the old estimate less those of the new
+    float    product;     ///< sum of this block's products of innovations at one lag: see est_correlation.h
+    float    share;       ///< share of this block in the noise variance
     float    inflation;   ///< factor for what the model does not explain
     float    dispersion;  ///< mean of the squared mean squares of the blocks [noise variances^2]
 } est_scale_t;

@@ -14,10 +14,9 @@
 #define EST_BLOCK_N 32U
 
 /// Phases of the scale. During a block it is the number of equations. Then come the stages of the update, one a step,
-/// so that none is long: correlation and dispersion of the innovations follow the block, the noise variance does, a
-/// hidden change is found, and the next block begins. During a trial the phase is EST_PHASE_TRIAL and the number of
-/// equations.
-#define EST_PHASE_CORRELATION EST_BLOCK_N
+/// so that none is long: correlation and dispersion of the innovations follow the block in phase EST_BLOCK_N, the noise
+/// variance follows it, a hidden change is found, and the next block begins. During a trial the phase is EST_PHASE_TRIAL
+/// and the number of equations.
 #define EST_PHASE_NOISE (EST_BLOCK_N + 1U)
 #define EST_PHASE_CHANGE (EST_BLOCK_N + 2U)
 #define EST_PHASE_END (EST_BLOCK_N + 3U)
@@ -211,7 +210,8 @@ EST_SHARED void est_scale_conclude(est_t* const estimator) {
 /// one.
 EST_INLINE bool
 est_scale_try(est_scale_t* const self, const float old_square, const float new_square, const uint_fast16_t edge_age_n) {
-    const uint_fast8_t n = (uint_fast8_t)(++self->phase - EST_PHASE_TRIAL);  // MISRA D3
+    self->phase++;
+    const uint32_t n = (uint32_t)self->phase - EST_PHASE_TRIAL;
     if (n > EST_TRIAL_BEGIN_N) {
         self->sum += old_square - (EST_JUSTIFIED * new_square);
     }
