@@ -28,7 +28,7 @@
 
 /// Increase of the variance of the second reading per unit of leverage, which is the part of an innovation's variance
 /// that is due to theta. What a poor model leaves is largest where the regressor is larger than those before.
-#define EST_LEVERAGE 20.0F
+#define EST_LEVERAGE 25.0F
 
 /// Work of each step of a block: none, or products of innovations at lag 1 or 2, and the second reading.
 #define EST_WORK_LAG_1 1U

@@ -31,8 +31,8 @@
 /// each other block takes one off; at the limit an alarm is due. It finds a change that an inflated scale hides: the
 /// residual of a misfit has peaks, a change lasts.
 #define EST_HIGH 5.0F
-#define EST_HIGH_STEP 2U
-#define EST_HIGH_LIMIT 6U
+#define EST_HIGH_STEP 3U
+#define EST_HIGH_LIMIT 7U
 
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
 #define EST_MARGIN 2.0F

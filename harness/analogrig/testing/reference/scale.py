@@ -14,7 +14,7 @@ BLOCK_N = 32
 SHARE_MIN, SHARE_WARM, WARM_N = 0.032, 0.25, 64
 """Smallest shares of a block in the noise variance, armed and before; equations before which it is armed."""
 
-HIGH, HIGH_STEP, HIGH_LIMIT = 5.0, 2, 6
+HIGH, HIGH_STEP, HIGH_LIMIT = 5.0, 3, 7
 """Mean square of a high block in noise variances that contain it, its step, and the count at which an alarm is due."""
 
 MARGIN, GROWTH_MAX = 2.0, 9.0
