@@ -719,13 +719,12 @@ EST_INLINE void watch_scale(est_t* const                self,
     if (est_scale_enter(&self->scale, term)) {
         return;  // MISRA D4
     }
-    if (self->renewal != EST_RENEWAL_NONE) {
-        return;  // MISRA D4
-    }
     if (est_scale_on_trial(&self->scale)) {
         try_alarm(self, shape, equation, precision);
-    } else {
+    } else if (self->renewal == EST_RENEWAL_NONE) {
         renew_scale(self);
+    } else {
+        // the block waits
     }
 #else
     (void)self;

@@ -497,9 +497,9 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// Bad data never fails and never enters the estimate: see est_status_t. Up to 8 samples in a row that are missing or
 /// refused are predicted, if C is that of the plant and u is the same before and after them; the next good sample then
 /// has its equation. After any other gap the equations begin anew, as after est_init().
-/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.45 times a
-/// typical one if edges may slip, 1.3 times otherwise.
-/// RAM: the state, and stack: on a Cortex-M 190 to 440 bytes, at -O0 2,500; on an AVR 390, at -O0 1,660 (make
+/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.35 times a
+/// typical one if edges may slip, 1.25 times otherwise.
+/// RAM: the state, and stack: on a Cortex-M 140 to 240 bytes, at -O0 2,510; on an AVR 380, at -O0 1,670 (make
 /// cost). May be called from an interrupt.
 est_step_t est_step(est_t* self, est_sample_t sample);
 

@@ -136,7 +136,7 @@ class ReferenceScale:
         if self._left_n:
             self._left_n -= 1
             self._squares += square
-        elif not waits and self._trial_n:
+        elif self._trial_n:
             self._try(square, old_square, since_n)
         elif not waits:
             return self._renew(quiet_n, excess)
