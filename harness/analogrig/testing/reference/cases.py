@@ -51,11 +51,16 @@ _SINGLE = {
     "B and K fall": {"B": 1500.0, "K": 17_500.0},
     "M and K rise": {"M": 60.0, "K": 28_500.0},
 }
+SUCCESSION = dataclasses.replace(
+    _scenario("small changes in close succession", dataclasses.replace(_FREE, phase=0.133), 800),
+    tweaks=tuple(PotChange(200 + 100 * n, {"K": 24_500.0 if n % 2 else 23_700.0}) for n in range(6)),
+)
 HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
 FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
 DISPLACED = _scenario("displaced edges", dataclasses.replace(_FREE, frequency_hz=211.3), 600)
+DISPLACED_LATER = _scenario("edges displaced later", dataclasses.replace(_FREE, frequency_hz=117.9, phase=0.133), 600)
 RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
 
 
@@ -238,6 +243,7 @@ CASES: Mapping[str, ReferenceCase] = {
     "edges become late, delayed": ReferenceCase(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
     "edges become early, delayed": ReferenceCase(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
     "edges anywhere": ReferenceCase(DISPLACED, _FIXED),
+    "edges anywhere after the warm-up": ReferenceCase(DISPLACED_LATER, {**_FIXED, "warm_up_n": 190}),
     "edges anywhere, known noise": ReferenceCase(DISPLACED, {**_FIXED, "noise_estimated": False}),
     "missing while in doubt": ReferenceCase(
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
@@ -288,6 +294,9 @@ CASES: Mapping[str, ReferenceCase] = {
         )
         for number, (name, changed) in enumerate(_SINGLE.items())
     },
+    "M falls at an edge": ReferenceCase(
+        _scenario("M falls at an edge", dataclasses.replace(_FREE, phase=0.968), 530, **_SINGLE["M falls"]), _ARMED
+    ),
     "M falls, one clock": ReferenceCase(
         _scenario("M falls, one clock", _SQUARE, 530, **_SINGLE["M falls"]),
         _ONE_CLOCK,
@@ -310,6 +319,9 @@ CASES: Mapping[str, ReferenceCase] = {
         for n in range(5, 9)
     },
     "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
+    "more alarms than may be justified": ReferenceCase(
+        SUCCESSION, {"warm_up_n": 100, "noise_estimated": False, "noise_variance": 6.0, "arl0": 1e3}
+    ),
     "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}
