@@ -60,7 +60,7 @@ FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
 DISPLACED = _scenario("displaced edges", dataclasses.replace(_FREE, frequency_hz=211.3), 600)
-DISPLACED_LATER = _scenario("edges displaced later", dataclasses.replace(_FREE, frequency_hz=117.9, phase=0.133), 600)
+DISPLACED_LATER = _scenario("edges displaced later", dataclasses.replace(_FREE, frequency_hz=117.9, phase=0.133), 720)
 RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
 
 
@@ -197,6 +197,11 @@ def _noisy_force(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG
     codes[360:420, U] = np.round(_noise(40.0)(codes[359:420, U].astype(np.float64)))
 
 
+def _noisy_at_last(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """A noise of the displacement once the edges are known to come anywhere."""
+    codes[590:, Y] = np.round(_noise(3.0)(codes[589:, Y].astype(np.float64)))
+
+
 FAULTS: Mapping[str, Spoil] = {
     "offset of the force": _fails(U, lambda codes: codes[1:] + 150.0),
     "gain of the force": _fails(U, lambda codes: 341.0 + 1.3 * (codes[1:] - 341.0)),
@@ -243,7 +248,7 @@ CASES: Mapping[str, ReferenceCase] = {
     "edges become late, delayed": ReferenceCase(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
     "edges become early, delayed": ReferenceCase(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
     "edges anywhere": ReferenceCase(DISPLACED, _FIXED),
-    "edges anywhere after the warm-up": ReferenceCase(DISPLACED_LATER, {**_FIXED, "warm_up_n": 190}),
+    "edges anywhere after the warm-up": ReferenceCase(DISPLACED_LATER, {**_FIXED, "warm_up_n": 190}, _noisy_at_last),
     "edges anywhere, known noise": ReferenceCase(DISPLACED, {**_FIXED, "noise_estimated": False}),
     "missing while in doubt": ReferenceCase(
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
@@ -314,6 +319,11 @@ CASES: Mapping[str, ReferenceCase] = {
     ),
     "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), _ARMED, leave_out_later),
     **{name: ReferenceCase(FAULTY, _ONE_CLOCK if "late" in name else _ARMED, spoil) for name, spoil in FAULTS.items()},
+    "stuck displacement that hardly moved": ReferenceCase(
+        dataclasses.replace(FAULTY, excitation=dataclasses.replace(_FREE, frequency_hz=100.0, high_v=0.2, phase=0.133)),
+        {"warm_up_n": 150, "stuck_n": 0, "arl0": 30.0},
+        FAULTS["stuck displacement"],
+    ),
     **{
         f"fault {n} samples after a gap": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump_after_gap(n))
         for n in range(5, 9)
@@ -322,7 +332,7 @@ CASES: Mapping[str, ReferenceCase] = {
     "more alarms than may be justified": ReferenceCase(
         SUCCESSION, {"warm_up_n": 100, "noise_estimated": False, "noise_variance": 6.0, "arl0": 1e3}
     ),
-    "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
+    "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40, "idle_n": 1}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}
     ),
