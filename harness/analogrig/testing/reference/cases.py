@@ -216,6 +216,13 @@ FAULTS: Mapping[str, Spoil] = {
 }
 """Faults of a channel, one at a time. Gains are counted from where the force is zero."""
 
+
+def _coarse_and_stuck(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """A displacement in steps of 6 codes, most of which repeat, and which gets stuck."""
+    codes[:, Y] = 6 * np.round(codes[:, Y] / 6)
+    FAULTS["stuck displacement"](codes, missing)
+
+
 _ARMED = {"warm_up_n": 150}
 """Plays are too short for the default."""
 
@@ -319,10 +326,10 @@ CASES: Mapping[str, ReferenceCase] = {
     ),
     "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), _ARMED, leave_out_later),
     **{name: ReferenceCase(FAULTY, _ONE_CLOCK if "late" in name else _ARMED, spoil) for name, spoil in FAULTS.items()},
-    "stuck displacement that hardly moved": ReferenceCase(
-        dataclasses.replace(FAULTY, excitation=dataclasses.replace(_FREE, frequency_hz=100.0, high_v=0.2, phase=0.133)),
-        {"warm_up_n": 150, "stuck_n": 0, "arl0": 30.0},
-        FAULTS["stuck displacement"],
+    "stuck displacement of coarse codes": ReferenceCase(
+        dataclasses.replace(FAULTY, excitation=dataclasses.replace(_FREE, frequency_hz=40.0, high_v=0.6, phase=0.7)),
+        {"warm_up_n": 150, "stuck_n": 0, "arl0": 100.0},
+        _coarse_and_stuck,
     ),
     **{
         f"fault {n} samples after a gap": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump_after_gap(n))
