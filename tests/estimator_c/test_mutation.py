@@ -51,7 +51,9 @@ def test_a_resumed_run_keeps_what_neither_core_nor_tests_have_made_doubtful(tmp_
 
 SESSION = """
 from estimator_c.evidence.mutate import Session
-Session(["-c", "/dev/null", "test_slow.py"], {}, lambda session: print(repr(session.first_failure())), deadline_s=1).run()
+Session(
+    ["-c", "/dev/null", "test_slow.py"], {}, lambda session: print(repr(session.first_failure())), deadline_s=1
+).run()
 """
 SLOW = """
 import time
