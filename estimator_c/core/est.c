@@ -748,7 +748,8 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
 }
 
 /// Predict a missing y: replace the one of an equation by that whose innovation is zero. With C close to A the next
-/// equations then lose nothing but the information of the missing sample.
+/// equations then lose nothing but the information of the missing sample. A model that is not stable can predict what
+/// no plant does; the equations then begin anew.
 EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
     float* const past = self->whitener.past[0].x;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
@@ -760,6 +761,9 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
         past[i] -= innovation;  // the differences contain y(k) with the factor 1
     }
     self->y[0] -= innovation;
+    if (!is_plausible(self->y[0])) {
+        forget_samples(self);
+    }
 }
 
 /// Enter an innovation into the statistic. `term`: of the cumulative sum, `weight`: of a squared innovation in it;

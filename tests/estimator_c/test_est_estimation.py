@@ -151,6 +151,23 @@ def test_gap_costs_only_its_own_samples(estimator: Estimator, gap_n: int) -> Non
     assert result.counters["restarts"] == 2
 
 
+def test_gap_that_an_unstable_model_would_bridge_with_absurd_codes_begins_the_equations_anew(
+    estimator: Estimator,
+) -> None:
+    """y(k) = 30 y(k-1) + u(k-1), held by u; the prediction grows thirtyfold a sample while u rests."""
+    n, gap_n = 400, 5
+    y = np.round(np.random.default_rng(1).normal(0.0, 300.0, n + 1))
+    u, y = y[1:] - 30.0 * y[:-1], y[:-1]
+    valid = np.ones(n)
+    valid[200 : 200 + gap_n] = 0
+    u[200 : 200 + gap_n + 1] = u[199]
+    assert estimator.init(**SETTINGS, c=(-1.6, 0.64), warm_up_n=0)
+    result = estimator.run(u, y, valid)
+    assert result.theta[199, 0] == pytest.approx(-30.0, abs=0.1)
+    assert (result.status[200 + gap_n : 202 + gap_n] == GATHERING).all()
+    assert np.abs(result.innovation).max() < 1e5
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.1e6], ids=str)
 @pytest.mark.parametrize("channel", ["u", "y"])
 def test_absurd_sample_is_counted_and_leaves_theta_untouched(estimator: Estimator, bad: float, channel: str) -> None:

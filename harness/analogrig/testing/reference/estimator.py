@@ -53,6 +53,9 @@ SLOPE_N = 5
 BRIDGED_MAX, BRIDGE_PRECISION = 8, 0.6
 """Longest gap that is bridged, and smallest precision of the whitening at which it is."""
 
+CODE_LIMIT = 1e6
+"""Code beyond which no sample is predicted."""
+
 NEAR = 0.03
 """Relative distance from a threshold at which rounding may decide that A has moved."""
 
@@ -358,6 +361,8 @@ class ReferenceEstimator:
         if self.doubt is not None:
             self._enter_readings(self.doubt)
         self.y = [self.y[0] - innovation, *self.y][: self.config.na]
+        if abs(self.y[0]) > CODE_LIMIT:
+            self._forget()
 
     # ---- equations
 
