@@ -61,7 +61,7 @@ LIMITED = [*STEPS, *(f"{name}, worst" for name in STEPS), *SIZES]
 
 BEYOND = {
     "M4F, n = 6, edges may slip, worst": 756,
-    "M4F, n = 6, edges may slip, fixed, worst": 683,
+    "M4F, n = 6, edges may slip, fixed, worst": 684,
     "M4F, code of the core at -Os, everything": 6308,
 }
 """Limits that the core still misses, with values not to exceed; one that it keeps must leave this list.
