@@ -3,6 +3,7 @@
 /// events, and a hash of all results. bit_exact.py compares the output between compilers and targets.
 
 #include "est.h"
+#include "est_correlation.h"
 #include "est_isolation.h"
 #include "plant.h"
 
@@ -15,6 +16,8 @@
 #define ISOLATION_CHANGE 300U
 #define ISOLATION_RUNS_N 36U
 
+#define LONG_RUNS_N 86U  ///< with disturbances
+
 typedef struct {
     uint64_t hash;
     uint32_t steps;
@@ -25,6 +28,7 @@ typedef struct {
     uint32_t missing;
     uint32_t refreshes;
     uint32_t diagnoses;
+    uint32_t readings;    ///< steps with a second reading
     uint32_t violations;  ///< steps after which est_invariants_hold() failed
 } record_t;
 
@@ -134,15 +138,18 @@ static est_sample_t sample_of(plant_t* const plant, const uint32_t k) {
     return sample;
 }
 
-static void enter_step(record_t* const self, const est_t* const estimator, const est_step_t step) {
+static void enter_outcome(record_t* const self, const est_step_t step) {
     enter_bits(self, (uint32_t)step.status | (step.alarm ? 16U : 0U) | (step.idle ? 32U : 0U));
     enter_number(self, step.innovation);
     enter_number(self, step.statistic);
+    self->steps++;
+}
+
+static void enter_theta(record_t* const self, const est_t* const estimator) {
     for (uint8_t i = 0U; i < est_theta_count(estimator); i++) {
         enter_number(self, est_theta(estimator, i));
     }
     self->violations += est_invariants_hold(estimator) ? 0U : 1U;
-    self->steps++;
 }
 
 static void enter_end(record_t* const self, const est_t* const estimator) {
@@ -189,7 +196,121 @@ static bool run(record_t* const self, const uint32_t number) {
             plant.mechanics = PLANT_FRONT_SOFT;
         }
         plant.reads_first = (config.edge_instants == EST_EDGES_MAY_SLIP) && ((k % 40U) >= 20U);
-        enter_step(self, &estimator, est_step(&estimator, sample_of(&plant, k)));
+        enter_outcome(self, est_step(&estimator, sample_of(&plant, k)));
+        if ((k % 4U) == 0U) {
+            enter_theta(self, &estimator);
+        }
+    }
+    enter_end(self, &estimator);
+    return true;
+}
+
+/// Disturbance of the displacement: noise(k) = (last noise(k-1) + before noise(k-2)) / 1024 + gain white(k) / 16. The
+/// gain grows from `gain` to `gain_end` within `period` samples; then it starts again, with a jump of the noise.
+typedef struct {
+    int32_t last;
+    int32_t before;
+    int32_t gain;
+    int32_t gain_end;
+    int32_t jump;  ///< [codes]
+    int32_t period;
+    int64_t noise[2];  ///< newest first, in the unit of the plant
+} disturbance_t;
+
+/// Return the next value [codes].
+static int32_t disturb(disturbance_t* const self, plant_t* const plant, const uint32_t k) {
+    const int32_t phase = (int32_t)k % self->period;
+    const int32_t gain  = self->gain + (((self->gain_end - self->gain) * phase) / self->period);
+    const int64_t past  = ((self->last * self->noise[0]) + (self->before * self->noise[1])) / 1024;
+    self->noise[1]      = self->noise[0];
+    self->noise[0] =
+        past + ((gain * plant_noise(plant)) / 16) + ((phase == 0) ? (self->jump * (int64_t)PLANT_UNIT) : 0);
+    return (int32_t)(self->noise[0] / PLANT_UNIT);
+}
+
+/// Circumstances of a run with disturbances.
+typedef struct {
+    float    noise_variance;
+    bool     noise_estimated;
+    float    ceiling;
+    uint32_t edge_every;    ///< samples
+    uint32_t change_every;  ///< samples
+    int32_t  change;        ///< of the stiffness [1/64]
+    uint32_t steps_n;
+} circumstances_t;
+
+/// Model of a run with disturbances: as the plant is, with or without doubtful edges, or of order 1.
+static est_config_t long_configuration_of(const uint32_t model, const circumstances_t* const circumstances) {
+    est_config_t config = est_config_default();
+    if (model > 0U) {
+        config.nb            = 2U;
+        config.nk            = 1U;
+        config.offset        = false;
+        config.edge_instants = EST_EDGES_LOCKED;
+    }
+    if (model > 1U) {
+        config.na   = 1U;
+        config.nb   = 1U;
+        config.c[0] = -0.8F;
+        config.c[1] = 0.0F;
+    }
+    config.noise_variance  = circumstances->noise_variance;
+    config.noise_estimated = circumstances->noise_estimated;
+    config.trigger.ceiling = circumstances->ceiling;
+    return config;
+}
+
+/// Run with the usual trigger, disturbances, changes of the plant and gaps: these determine the scale of the innovations
+/// and their correlation. Every disturbance with every model in the first four circumstances. The others, whose steps
+/// are many, have coloured noise of varying variance.
+static bool run_long(record_t* const self, const uint32_t run_number) {
+    static const disturbance_t disturbances[] = {
+        { .period = 1 },                                           // none
+        { .last = 922, .gain = 16, .gain_end = 16, .period = 1 },  // correlation 0.9
+        { .last = -870, .gain = 24, .gain_end = 24, .period = 1 },
+        { .last = 614, .before = -410, .gain = 32, .gain_end = 32, .period = 1 },
+        { .gain_end = 96, .period = 256 },
+        { .last = 922, .gain_end = 48, .period = 1024 },
+        { .last = 819, .jump = 1000, .period = 97 },  // decays between jumps
+    };
+    static const circumstances_t circumstances[] = {
+        { 1.2F, true, 11.5F, 50U, 700U, -16, 1600U }, { 30.0F, true, 11.5F, 300U, 500U, -16, 1600U },
+        { 1.2F, true, 4.0F, 50U, 150U, 4, 1600U },    { 1.0e-6F, false, 11.5F, 50U, 700U, -16, 1600U },
+        { 1.2F, true, 11.5F, 50U, 1032U, -2, 9000U }, { 1.2F, true, 11.5F, 50U, 1038U, -2, 9000U },
+    };
+    uint32_t                number      = (run_number < 84U) ? run_number : (89U + (21U * (run_number - 84U)));
+    const plant_mechanics_t front       = PLANT_FRONT;
+    plant_t                 plant       = plant_at_rest(front, number, 5U * PLANT_TICKS_PER_SAMPLE);
+    const uint32_t          warm_up_n   = 300U + number;
+    disturbance_t           disturbance = disturbances[digit(&number, 7U)];
+    const uint32_t          model       = digit(&number, 3U);
+    const circumstances_t*  around      = &circumstances[number];
+    est_config_t            config      = long_configuration_of(model, around);
+    uint32_t                gap_n       = 0U;
+    est_t                   estimator;
+    config.trigger.warm_up_n = (uint16_t)warm_up_n;
+    plant.half_period_ticks  = around->edge_every * PLANT_TICKS_PER_SAMPLE;
+    if (!est_init(&estimator, &config)) {
+        return false;
+    }
+    for (uint32_t k = 0U; k < around->steps_n; k++) {
+        if ((k % around->change_every) == 99U) {
+            const bool back           = plant.mechanics.stiffness != front.stiffness;
+            plant.mechanics.stiffness = back ? front.stiffness : ((front.stiffness / 64) * (64 + around->change));
+        }
+        const plant_codes_t codes = plant_next(&plant);
+        const int32_t       y     = codes.y + disturb(&disturbance, &plant, k);
+        gap_n                     = ((k % 450U) == 449U) ? (3U * ((k / 450U) % 4U)) : gap_n - ((gap_n > 0U) ? 1U : 0U);
+        enter_outcome(self, est_step(&estimator, (est_sample_t){ (float)codes.u, (float)y, gap_n == 0U }));
+        enter_number(self, est_scale(&estimator));
+        if ((k % 16U) == 0U) {
+            enter_theta(self, &estimator);
+            enter_bits(self, estimator.scale.high_n);
+            enter_number(self, estimator.scale.sum);
+            enter_number(self, estimator.correlation.partial[0]);
+            enter_number(self, estimator.correlation.partial[1]);
+        }
+        self->readings += est_correlation_reads(&estimator.correlation) ? 1U : 0U;
     }
     enter_end(self, &estimator);
     return true;
@@ -250,6 +371,12 @@ int main(void) {
             return 1;
         }
     }
+    for (uint32_t number = 0U; number < LONG_RUNS_N; number++) {
+        if (!run_long(&record, number)) {
+            (void)printf("configuration %lu with disturbances was refused\n", (unsigned long)number);
+            return 1;
+        }
+    }
     for (uint32_t number = 0U; number < ISOLATION_RUNS_N; number++) {
         if (!run_isolation(&record, number)) {
             (void)printf("configuration %lu with isolation was refused\n", (unsigned long)number);
@@ -258,10 +385,11 @@ int main(void) {
     }
     (void)printf(
         "steps %lu nan %lu violations %lu alarms %lu slips %lu refused %lu missing %lu refreshes %lu diagnoses %lu "
-        "hash %08lx%08lx\n",
+        "readings %lu hash %08lx%08lx\n",
         (unsigned long)record.steps, (unsigned long)record.nan_n, (unsigned long)record.violations,
         (unsigned long)record.alarms, (unsigned long)record.slips, (unsigned long)record.refused,
         (unsigned long)record.missing, (unsigned long)record.refreshes, (unsigned long)record.diagnoses,
-        (unsigned long)(record.hash >> 32U), (unsigned long)(record.hash & 0xFFFFFFFFU));
+        (unsigned long)record.readings, (unsigned long)(record.hash >> 32U),
+        (unsigned long)(record.hash & 0xFFFFFFFFU));
     return 0;
 }

@@ -26,7 +26,7 @@ ISOLATION = HERE.parent / "isolation"
 
 FLAGS = (
     *("-std=c99", "-static", "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror"),
-    *("-DEST_NC_MAX=2U", "-DEST_THETA_MAX=8U", f"-I{CORE}", f"-I{ISOLATION}"),
+    *("-DEST_NC_MAX=2U", "-DEST_THETA_MAX=8U", f"-I{ISOLATION}"),
 )
 EXACT = "-ffp-contract=off"
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
@@ -89,12 +89,12 @@ def run(command: Sequence[str | Path]) -> str:
     return done.stdout.strip()
 
 
-def outcome(build: Build, *, contraction: str = EXACT) -> str:
-    """Output of the program built in the given way."""
+def outcome(build: Build, *, contraction: str = EXACT, core: Path = CORE) -> str:
+    """Output of the program built in the given way, with the core of this folder."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder, "bit_exact")
-        sources = [HERE / "bit_exact.c", *sorted(CORE.glob("*.c")), *sorted(ISOLATION.glob("*.c"))]
-        run([*build.command, *FLAGS, contraction, *sources, "-o", program])
+        sources = [HERE / "bit_exact.c", *sorted(core.glob("*.c")), *sorted(ISOLATION.glob("*.c"))]
+        run([*build.command, *FLAGS, f"-I{core}", contraction, *sources, "-o", program])
         return run([*build.runner, program])
 
 
