@@ -351,7 +351,7 @@ EST_INLINE est_edge_instants_t edge_instants_of(const est_t* const self) {
 /// True while the last alarm is on trial: theta before the alarm occupies the place of theta before an edge.
 EST_INLINE bool is_on_trial(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return self->scale.trial_n > 0U;
+    return est_scale_on_trial(&self->scale);
 #else
     (void)self;
     return false;
@@ -370,17 +370,17 @@ static bool on_bridge(const est_t* const self) {
 
 static void enter_edge(est_t* const self) {
     if (on_bridge(self)) {
-        forget_samples(self);  // the instant of the edge is unknown
-        return;                // MISRA D4
+        increment(&self->edge_age_n);  // the instant of the edge is unknown
+        forget_samples(self);
+        return;  // MISRA D4
     }
-    const bool slope = self->edge_age_n <= SLOPE_N;
+    const bool slope = self->edge_age_n < SLOPE_N;
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
         return;  // MISRA D4
     }
     const est_edge_instants_t instants = edge_instants_of(self);
-    if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) &&
-        (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
+    if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) && is_cusum(self->config)) {
         doubt_edge(self);
     } else if (instants == EST_EDGES_ANYWHERE) {
         self->pending_n = larger(self->pending_n, self->config->na);
@@ -412,14 +412,15 @@ static est_status_t enter_input(est_t* const self, float u, float* const y) {
         increment(&self->counters.stuck);
         return EST_REFUSED;  // MISRA D4
     }
-    if (EST_KNOWS_EDGES) {
-        increment(&self->edge_age_n);
-    }
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->doubt_n = (self->doubt_n < EST_DOUBT_N) ? (uint8_t)(self->doubt_n + 1U) : 0U;
     }
     if (edge) {
         enter_edge(self);
+    } else if (EST_KNOWS_EDGES) {
+        increment(&self->edge_age_n);
+    } else {
+        // nothing depends on the age of edges
     }
 #if EST_WITH_ROBUSTNESS
     self->bridged_n = 0U;
@@ -548,10 +549,10 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 /// with the next one. An earlier trial ends.
 static void put_on_trial(est_t* const self, const bool overflown) {
 #if EST_WITH_ROBUSTNESS
-    if (self->scale.trial_n > 0U) {
+    if (est_scale_on_trial(&self->scale)) {
         est_scale_conclude(self);
     }
-    if (!overflown && self->cusum) {
+    if (!overflown && is_cusum(self->config)) {
         est_scale_begin_trial(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
@@ -641,59 +642,60 @@ EST_INLINE float weight_of(const est_t* const self) {
 
 #if EST_WITH_ROBUSTNESS
 
-/// Let the next innovation raise an alarm if the blocks of late were high.
-static void find_hidden_change(est_t* const self) {
+/// Let the next innovation raise an alarm if the blocks of late were high. `mean`: mean square of the newest one.
+static void find_hidden_change(est_t* const self, const float mean) {
     est_scale_t* const scale = &self->scale;
-    est_scale_count_high(scale, self->noise_variance);
-    if ((self->trigger.quiet_n > 0U) || !self->cusum || (scale->share <= 0.0F)) {
+    if ((self->trigger.quiet_n > 0U) || !self->config->noise_estimated) {
         scale->high_n = 0U;
-    } else if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {
+        return;  // MISRA D4
+    }
+    est_scale_count(scale, mean >= (EST_HIGH * self->noise_variance));
+    if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {  // a doubt comes first
         scale->high_n           = 0U;
         self->trigger.statistic = 2.0F * self->config->trigger.ceiling;
+    }
+}
+
+/// Let correlation and dispersion of the innovations follow a complete block of this mean square. The dispersion of
+/// squares without peaks does not count. Neither does it before the trigger is armed, while theta settles.
+static void follow_shape(est_t* const self, const float mean) {
+    const bool               armed       = self->trigger.quiet_n == 0U;
+    est_correlation_t* const correlation = &self->correlation;
+    est_scale_t* const       scale       = &self->scale;
+    if ((correlation->work & EST_WORK_LAGS) != 0U) {
+        est_correlation_follow(correlation, scale->product, mean, self->noise_variance,
+                               armed ? EST_PARTIAL_SHARE : EST_PARTIAL_WARM);
+    }
+    if (armed && !est_correlation_smooth(correlation)) {
+        est_scale_disperse(scale, mean / self->noise_variance);
     } else {
-        // nothing is hidden, or a doubt comes first
+        scale->dispersion = 1.0F;
     }
 }
 
-/// Let the correlation of the innovations follow a complete block.
-static void follow_correlation(est_t* const self) {
-    if (self->cusum && (self->correlation.work > 0U)) {
-        const float share = (self->trigger.quiet_n > 0U) ? EST_PARTIAL_WARM : EST_PARTIAL_SHARE;
-        est_correlation_follow(&self->correlation, &self->scale, self->noise_variance, share);
-    }
-}
-
-/// Let the noise variance follow a complete block.
-static void follow_noise(est_t* const self) {
-    const est_scale_t* const scale = &self->scale;
-    const bool               warm  = (scale->share <= EST_SHARE_WARM) && (self->trigger.quiet_n < EST_WARM_N);
-    est_scale_follow(self, warm ? EST_SHARE_MIN : EST_SHARE_WARM, est_correlation_smooth(&self->correlation));
-}
-
-/// Update the scale after a block. A block that ends with a large statistic may contain a change and is discarded.
-/// Several steps, so that none is long.
+/// Update the scale after a block, by one stage. A block that ends with a large statistic may contain a change and is
+/// discarded.
 static void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    const bool counts = (scale->share > 0.0F) && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling));
-    if (scale->stage == EST_STAGE_CORRELATION) {
-        if (counts) {
-            follow_correlation(self);
-        }
-    } else if (scale->stage == EST_STAGE_NOISE) {
-        if (counts) {
-            follow_noise(self);
-        }
-    } else if (scale->stage == EST_STAGE_CHANGE) {
-        find_hidden_change(self);
-        if (self->cusum) {
-            est_correlation_restart(&self->correlation);
-        }
-    } else {
+    if (scale->phase == EST_PHASE_END) {
         est_scale_relax(scale);
         est_scale_restart(self);
         return;  // MISRA D4
     }
-    scale->stage++;
+    const float mean = est_scale_mean(scale);
+    if (scale->phase == EST_PHASE_CHANGE) {
+        if (is_cusum(self->config)) {
+            find_hidden_change(self, mean);
+            est_correlation_restart(&self->correlation);
+        }
+    } else if (scale->phase == EST_PHASE_NOISE) {
+        est_scale_follow(self, mean);
+    } else if (self->config->noise_estimated && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
+        follow_shape(self, mean);
+    } else {
+        scale->phase = EST_PHASE_NOISE;  // the block is discarded, and its noise variance with it
+    }
+    scale->phase++;
 }
 
 /// Continue the trial of the last alarm by one equation.
@@ -717,7 +719,7 @@ EST_INLINE void watch_scale(est_t* const                self,
     if (est_scale_enter(&self->scale, term)) {
         return;  // MISRA D4
     }
-    if (self->scale.trial_n > 0U) {
+    if (est_scale_on_trial(&self->scale)) {
         try_alarm(self, shape, equation, precision);
     } else if (self->renewal == EST_RENEWAL_NONE) {
         renew_scale(self);
@@ -768,7 +770,10 @@ EST_INLINE void enter_innovation(
     const float          share   = est_trigger_share(held);
 #if EST_WITH_ROBUSTNESS
     est_correlation_t* const correlation = &self->correlation;
-    if (correlation->work == 0U) {
+    if (correlation->work == EST_WORK_LAG_1) {
+        est_correlation_multiply(correlation, &self->scale, e, precision);
+    }
+    if (correlation->work <= EST_WORK_LAG_1) {
         trigger->statistic = est_trigger_sum(trigger->statistic, share * term);
         return;  // the usual step; MISRA D4
     }
@@ -873,9 +878,8 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
 #if EST_WITH_ROBUSTNESS
-    self->cusum = config->trigger.kind == EST_TRIGGER_CUSUM;
     est_scale_init(self);
-    self->correlation.work = self->cusum ? 0U : EST_WORK_OTHER_TRIGGER;
+    self->correlation.work = is_cusum(config) ? 0U : EST_WORK_OTHER_TRIGGER;
 #endif
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);
@@ -888,11 +892,12 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
-    float      y       = 0.0F;
-    est_step_t step    = { .status = examine(self, sample, &y), .alarm = false, .innovation = 0.0F };
-    step.statistic     = self->trigger.statistic;
-    const bool updated = step.status == EST_UPDATED;
-    if (updated || ((step.status != EST_GATHERING) && enter_gap(self, step.status, &y))) {
+    float              y      = 0.0F;
+    const est_status_t status = examine(self, sample, &y);
+    est_step_t         step   = {
+                  .status = status, .alarm = false, .idle = false, .innovation = 0.0F, .statistic = self->trigger.statistic
+    };
+    if ((status == EST_UPDATED) || ((status != EST_GATHERING) && enter_gap(self, status, &y))) {
         dispatch_equation(self, y, &step);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);

@@ -361,6 +361,13 @@ typedef struct {
 #define EST_GAINS_KEPT 1U
 #endif
 
+/// Number of these gains: all but the last one, unless the filter uses them directly.
+#if EST_WITH_ROBUSTNESS
+#define EST_GAIN_COLUMNS EST_GAINS_KEPT
+#else
+#define EST_GAIN_COLUMNS EST_NA_MAX
+#endif
+
 /// Last whitened values of one signal, newest first; or the last one and its differences of order 1, 2, ... Private.
 typedef struct {
     float x[EST_NA_MAX];
@@ -369,10 +376,10 @@ typedef struct {
 /// Filter that whitens the noise of consecutive equations. Private to est_whitener.h.
 typedef struct {
     float c[EST_NA_MAX];
-    float gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< one row per equation, newest first
-    float precision[EST_NA_MAX];             ///< of the whitened equations, newest first; 0: no equation
+    float gain[EST_GAINS_KEPT][EST_GAIN_COLUMNS];  ///< one row per equation, newest first
+    float precision[EST_NA_MAX];                   ///< of the whitened equations, newest first; 0: no equation
 #if EST_WITH_ROBUSTNESS
-    float step[EST_NA_MAX];  ///< factors of the differences in est_past_t, from gain[0]
+    float step[EST_NA_MAX];  ///< factors of the differences in est_past_t, from the newest gains
 #endif
     est_past_t past[EST_THETA_MAX + 1U];  ///< one for each element of the equation
 } est_whitener_t;
@@ -402,17 +409,15 @@ typedef struct {
 
 /// Scale of the innovations and the trial of the last alarm. Private to est_scale.h.
 typedef struct {
-    uint8_t left_n;   ///< equations left in this block; 0: it is complete, or an alarm is on trial
-    uint8_t stage;    ///< of the update after a complete block
-    uint8_t trial_n;  ///< equations since the alarm on trial; 0: none is
-    uint8_t high_n;   ///< steps of high blocks
-    float   weight;   ///< of a squared innovation in the cumulative sum
-    float   sum;      ///< terms of this block; during a trial, squared errors of the old estimate less those of the new
-    float   product;  ///< sum of this block's products of innovations at one lag: see est_correlation.h
-    float   share;    ///< share of this block in the noise variance
-    float   inflation;   ///< factor for what the model does not explain
-    float   dispersion;  ///< mean of the squared mean squares of the blocks [noise variances^2]
-    float   credit;      ///< alarms that may be justified without being plain
+    uint8_t  phase;       ///< equations in this block; then the stage of the update, or that of the trial of an alarm
+    uint8_t  high_n;      ///< steps of high blocks
+    uint16_t credit_n;    ///< blocks that justify alarms which are not plain
+    float    weight;      ///< of a squared innovation in the cumulative sum
+    float    sum;         ///< terms of this block; in a trial, squared errors of the old estimate less those of the new
+    float    product;     ///< sum of this block's products of innovations at one lag: see est_correlation.h
+    float    share;       ///< share of this block in the noise variance
+    float    inflation;   ///< factor for what the model does not explain
+    float    dispersion;  ///< mean of the squared mean squares of the blocks [noise variances^2]
 } est_scale_t;
 
 /// Serial correlation of the innovations. Private to est_correlation.h.
@@ -446,7 +451,6 @@ typedef struct {
     bool                settled;     ///< the gains of the whitener are c, and its variance is 1
     uint8_t             doubt_n;     ///< samples since the first edge in doubt, inclusive; 0: no doubt
 #if EST_WITH_ROBUSTNESS
-    bool    cusum;       ///< the trigger is the cumulative sum
     bool    edges_vary;  ///< edges come anywhere, against the configuration
     uint8_t bridged_n;   ///< samples before the next one that were predicted
 #endif
@@ -493,9 +497,9 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// Bad data never fails and never enters the estimate: see est_status_t. Up to 8 samples in a row that are missing or
 /// refused are predicted, if C is that of the plant and u is the same before and after them; the next good sample then
 /// has its equation. After any other gap the equations begin anew, as after est_init().
-/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.45 times a
-/// typical one if edges may slip, 1.3 times otherwise.
-/// RAM: the state, and stack: on a Cortex-M 190 to 440 bytes, at -O0 2,500; on an AVR 390, at -O0 1,660 (make
+/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.35 times a
+/// typical one if edges may slip, 1.25 times otherwise.
+/// RAM: the state, and stack: on a Cortex-M 140 to 240 bytes, at -O0 2,510; on an AVR 380, at -O0 1,670 (make
 /// cost). May be called from an interrupt.
 est_step_t est_step(est_t* self, est_sample_t sample);
 

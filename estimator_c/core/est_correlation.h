@@ -28,11 +28,12 @@
 
 /// Increase of the variance of the second reading per unit of leverage, which is the part of an innovation's variance
 /// that is due to theta. What a poor model leaves is largest where the regressor is larger than those before.
-#define EST_LEVERAGE 20.0F
+#define EST_LEVERAGE 25.0F
 
 /// Work of each step of a block: none, or products of innovations at lag 1 or 2, and the second reading.
 #define EST_WORK_LAG_1 1U
 #define EST_WORK_LAG_2 2U
+#define EST_WORK_LAGS 3U
 #define EST_WORK_READS 4U
 #define EST_WORK_OTHER_TRIGGER 8U  ///< none, for good: the trigger is not the cumulative sum
 
@@ -57,6 +58,16 @@ static inline void est_correlation_forget(est_correlation_t* const self) {
     self->lead = 0.0F;
 }
 
+/// Enter one innovation into the products of the block at lag 1. `precision`: reciprocal of its variance [1 / noise
+/// variance].
+static inline void est_correlation_multiply(est_correlation_t* const self,
+                                            est_scale_t* const       scale,
+                                            const float              e,
+                                            const float              precision) {
+    est_scale_enter_product(scale, precision * (e * self->last[0]));
+    self->last[0] = e;
+}
+
 /// Enter one innovation into the products of the block and into both readings. `statistic`: their smaller sum so far;
 /// `term`: of the first reading; `weight`: of a squared innovation in the sums; `precision`: reciprocal of its variance
 /// [1 / noise variance]. Return the smaller sum.
@@ -73,16 +84,11 @@ static inline float est_correlation_enter(est_correlation_t* const self,
     const float forward  = e - (first * before);
     const float backward = self->last[1] - (first * before);
     self->last[1]        = before;
-    self->last[0]        = e;
-    if (scale->left_n > 0U) {
-        float product = e * before;
-        if ((self->work & EST_WORK_LAG_2) != 0U) {
-            product = forward * backward;
-        }
-        scale->product += precision * product;
-    }
-    if (!est_correlation_reads(self)) {
-        return est_trigger_sum(statistic, term);  // MISRA D4
+    if ((self->work & EST_WORK_LAG_2) != 0U) {
+        est_scale_enter_product(scale, precision * (forward * backward));
+        self->last[0] = e;
+    } else {
+        est_correlation_multiply(self, scale, e, precision);
     }
     const float left   = (1.0F - (first * first)) * (1.0F - (second * second));  // of the variance
     const float spread = 1.0F + (EST_LEVERAGE * (1.0F - precision));
@@ -93,16 +99,17 @@ static inline float est_correlation_enter(est_correlation_t* const self,
     return est_min(one, other);
 }
 
-/// Improve the partial correlation of the lag of a complete block. `share`: of the block in the estimate.
+/// Improve the partial correlation of the lag of a complete block. `product`: sum of its products; `mean`: its mean
+/// square; `share`: of the block in the estimate.
 static inline void est_correlation_follow(est_correlation_t* const self,
-                                          const est_scale_t* const scale,
+                                          const float              product,
+                                          const float              mean,
                                           const float              noise_variance,
                                           const float              share) {
     const bool   second  = (self->work & EST_WORK_LAG_2) != 0U;
     float* const partial = &self->partial[second ? 1U : 0U];
     const float  left    = second ? (1.0F - (self->partial[0] * self->partial[0])) : 1.0F;
-    const float  mean    = est_scale_mean(scale);
-    const float  error   = (scale->product / (float)EST_BLOCK_N) - (EST_PARTIAL_LOAD * left * mean * *partial);
+    const float  error   = (product / (float)EST_BLOCK_N) - (EST_PARTIAL_LOAD * left * mean * *partial);
     const float  next    = *partial + ((share * error) / est_max(mean, noise_variance));
     *partial             = est_max(est_min(next, EST_PARTIAL_MAX), -EST_PARTIAL_MAX);
 }

@@ -18,7 +18,7 @@
 /// the prior of the thesis.
 EST_INLINE bool est_delta_applies(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
-    return self->cusum;
+    return is_cusum(self->config);
 #else
     (void)self;
     return false;

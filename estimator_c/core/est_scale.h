@@ -13,11 +13,14 @@
 /// was before the change.
 #define EST_BLOCK_N 32U
 
-/// Stages of the update after a block, one a step: the correlation of the innovations follows it, the noise variance
-/// does, a hidden change is found; then the next block begins.
-#define EST_STAGE_CORRELATION 0U
-#define EST_STAGE_NOISE 1U
-#define EST_STAGE_CHANGE 2U
+/// Phases of the scale. During a block it is the number of equations. Then come the stages of the update, one a step,
+/// so that none is long: correlation and dispersion of the innovations follow the block in phase EST_BLOCK_N, the noise
+/// variance follows it, a hidden change is found, and the next block begins. During a trial the phase is EST_PHASE_TRIAL
+/// and the number of equations.
+#define EST_PHASE_NOISE (EST_BLOCK_N + 1U)
+#define EST_PHASE_CHANGE (EST_BLOCK_N + 2U)
+#define EST_PHASE_END (EST_BLOCK_N + 3U)
+#define EST_PHASE_TRIAL EST_PHASE_END
 
 /// Smallest share of a new block in the noise variance: a memory of 1,000 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
@@ -28,8 +31,8 @@
 /// each other block takes one off; at the limit an alarm is due. It finds a change that an inflated scale hides: the
 /// residual of a misfit has peaks, a change lasts.
 #define EST_HIGH 5.0F
-#define EST_HIGH_STEP 2U
-#define EST_HIGH_LIMIT 6U
+#define EST_HIGH_STEP 3U
+#define EST_HIGH_LIMIT 7U
 
 /// Increase of the scale per share of the newest block: after few blocks the noise variance is uncertain.
 #define EST_MARGIN 2.0F
@@ -68,11 +71,11 @@
 /// A justified alarm is plain if the squared errors of the old estimate exceed 64 expected variances on average.
 #define EST_PLAIN (64.0F * ((float)EST_TRIAL_N - (float)EST_TRIAL_BEGIN_N) * EST_CUSUM_GAIN)
 
-/// Number of alarms that may be justified in close succession without being plain, and its increase per block: one per
-/// 5,000 equations. A plant whose equations fit it only for a while justifies every alarm, but its squared errors stay
-/// comparable to the scale.
-#define EST_CREDIT_MAX 4.0F
-#define EST_CREDIT_PER_BLOCK ((float)EST_BLOCK_N / 5000.0F)
+/// Blocks that justify an alarm which is not plain, and largest number of them: one alarm per 5,000 equations, at most
+/// four in close succession. A plant whose equations fit it only for a while justifies every alarm, but its squared
+/// errors stay comparable to the scale.
+#define EST_CREDIT_N 157U
+#define EST_CREDIT_MAX_N (4U * EST_CREDIT_N)
 
 /// Mean square of a block, of the sum of its terms over their weight.
 #define EST_MEAN_SQUARE (1.0F / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE * (float)EST_BLOCK_N))
@@ -94,8 +97,7 @@ EST_SHARED void est_scale_restart(est_t* const estimator) {
         EST_CUSUM_GAIN / (estimator->noise_variance * est_scale_factor(self) * (1.0F + (EST_MARGIN * self->share)));
     self->sum     = 0.0F;
     self->product = 0.0F;
-    self->left_n  = EST_BLOCK_N;
-    self->stage   = 0U;
+    self->phase   = 0U;
 }
 
 static inline void est_scale_init(est_t* const estimator) {
@@ -105,7 +107,7 @@ static inline void est_scale_init(est_t* const estimator) {
     if (estimator->config->noise_estimated) {
         self->share = 1.0F;
     }
-    self->credit = EST_CREDIT_MAX;
+    self->credit_n = EST_CREDIT_MAX_N;
     est_scale_restart(estimator);
 }
 
@@ -114,7 +116,7 @@ static inline void est_scale_forgive(est_t* const estimator) {
     est_scale_t* const self = &estimator->scale;
     self->inflation         = 1.0F;
     self->dispersion        = 1.0F;
-    if (self->share > 0.0F) {
+    if (estimator->config->noise_estimated) {
         self->share = EST_SHARE_WARM;
     }
     est_scale_restart(estimator);
@@ -122,12 +124,19 @@ static inline void est_scale_forgive(est_t* const estimator) {
 
 /// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
 EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
-    if (self->left_n == 0U) {
+    if (self->phase >= EST_BLOCK_N) {
         return false;  // MISRA D4
     }
-    self->left_n--;
+    self->phase++;
     self->sum += term;
     return true;
+}
+
+/// Enter a product of innovations, unless the block is complete.
+static inline void est_scale_enter_product(est_scale_t* const self, const float product) {
+    if (self->phase < EST_BLOCK_N) {
+        self->product += product;
+    }
 }
 
 /// Mean square of the innovations of a complete block.
@@ -135,26 +144,25 @@ static inline float est_scale_mean(const est_scale_t* const self) {
     return (self->sum * EST_MEAN_SQUARE) / self->weight;
 }
 
-/// Let the noise variance and the dispersion follow a complete block. `share_least`: smallest share of the next block.
-/// `smooth`: the squares have no peaks, and their dispersion does not count. Neither does it before the trigger is armed,
-/// while theta settles.
-static inline void est_scale_follow(est_t* const estimator, const float share_least, const bool smooth) {
+/// Let the dispersion follow a complete block, whose mean square is `ratio` noise variances.
+static inline void est_scale_disperse(est_scale_t* const self, const float ratio) {
+    const float square = est_min(ratio * ratio, EST_DISPERSION_MAX);
+    self->dispersion += self->share * (square - self->dispersion);
+}
+
+/// Let the noise variance follow a complete block of this mean square.
+static inline void est_scale_follow(est_t* const estimator, const float mean) {
     est_scale_t* const self    = &estimator->scale;
     const float        before  = estimator->noise_variance;
-    const float        mean    = est_scale_mean(self);
-    const float        ratio   = mean / before;
-    const float        square  = est_min(ratio * ratio, EST_DISPERSION_MAX);
     const float        limited = est_min(mean, EST_GROWTH_MAX * before);
     const float        noise   = before + (self->share * (limited - before));
-    const bool         counts  = !smooth && (estimator->trigger.quiet_n == 0U);
-    self->dispersion           = counts ? (self->dispersion + (self->share * (square - self->dispersion))) : 1.0F;
-    self->share                = est_max(self->share / (1.0F + self->share), share_least);
+    const float        least   = (estimator->trigger.quiet_n < EST_WARM_N) ? EST_SHARE_MIN : EST_SHARE_WARM;
+    self->share                = est_max(self->share / (1.0F + self->share), least);
     estimator->noise_variance  = est_max(noise, EST_NOISE_LEAST * estimator->config->noise_variance);
 }
 
-/// Count a complete block if it is high.
-static inline void est_scale_count_high(est_scale_t* const self, const float noise_variance) {
-    const bool high = (self->sum * EST_MEAN_SQUARE) >= (EST_HIGH * noise_variance * self->weight);
+/// Count a complete block, which is high or not.
+static inline void est_scale_count(est_scale_t* const self, const bool high) {
     if (high && (self->high_n < EST_HIGH_LIMIT)) {
         self->high_n = (uint8_t)(self->high_n + EST_HIGH_STEP);
     } else if (!high && (self->high_n > 0U)) {
@@ -167,30 +175,33 @@ static inline void est_scale_count_high(est_scale_t* const self, const float noi
 /// Let the inflation decrease, and the number of alarms that may be justified increase, by one block.
 static inline void est_scale_relax(est_scale_t* const self) {
     self->inflation = est_max(self->inflation * EST_INFLATION_DECAY, 1.0F);
-    self->credit    = est_min(self->credit + EST_CREDIT_PER_BLOCK, EST_CREDIT_MAX);
+    if (self->credit_n < EST_CREDIT_MAX_N) {
+        self->credit_n++;
+    }
 }
 
 /// Begin the trial of an alarm. The block restarts after it.
 static inline void est_scale_begin_trial(est_scale_t* const self) {
-    self->sum     = 0.0F;
-    self->trial_n = 1U;
-    self->left_n  = 0U;
+    self->sum   = 0.0F;
+    self->phase = (uint8_t)(EST_PHASE_TRIAL + 1U);
 }
+
+/// True while an alarm is on trial.
+static inline bool est_scale_on_trial(const est_scale_t* const self) { return self->phase > EST_PHASE_TRIAL; }
 
 /// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
 EST_SHARED void est_scale_conclude(est_t* const estimator) {
     est_scale_t* const self      = &estimator->scale;
-    const bool         justified = (self->trial_n > EST_TRIAL_LEAST_N) && (self->sum > 0.0F);
+    const bool         justified = (self->phase > (EST_PHASE_TRIAL + EST_TRIAL_LEAST_N)) && (self->sum > 0.0F);
     if (justified && ((self->sum * self->weight) > EST_PLAIN)) {
         // a plain one costs no credit
-    } else if (justified && (self->credit >= 1.0F)) {
-        self->credit -= 1.0F;
+    } else if (justified && (self->credit_n >= EST_CREDIT_N)) {
+        self->credit_n = (uint16_t)(self->credit_n - EST_CREDIT_N);
     } else if (self->inflation < EST_INFLATION_MAX) {
         self->inflation *= EST_INFLATION_STEP;
     } else {
         // the scale is large enough
     }
-    self->trial_n = 0U;
     est_scale_restart(estimator);
 }
 
@@ -199,7 +210,8 @@ EST_SHARED void est_scale_conclude(est_t* const estimator) {
 /// one.
 EST_INLINE bool
 est_scale_try(est_scale_t* const self, const float old_square, const float new_square, const uint_fast16_t edge_age_n) {
-    const uint_fast8_t n = ++self->trial_n;  // MISRA D3
+    self->phase++;
+    const uint32_t n = (uint32_t)self->phase - EST_PHASE_TRIAL;
     if (n > EST_TRIAL_BEGIN_N) {
         self->sum += old_square - (EST_JUSTIFIED * new_square);
     }

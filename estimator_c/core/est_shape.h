@@ -118,6 +118,9 @@ EST_SHARED void increment(uint16_t* const counter) {
 /// True iff the number is in the range. False for NaN.
 EST_SHARED bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
 
+/// True iff the trigger is the cumulative sum.
+EST_INLINE bool is_cusum(const est_config_t* const config) { return config->trigger.kind == EST_TRIGGER_CUSUM; }
+
 /// Orders of the model.
 typedef struct {
     uint8_t na;

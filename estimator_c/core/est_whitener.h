@@ -42,14 +42,18 @@ EST_SHARED bool est_whitener_accepts(const float* const c, const uint_fast8_t na
     return true;
 }
 
-/// Determine the filter from the newest gains. With D = 1 - z^-1, its equation D^n w(k) = x(k) - sum of step[j] D^j
+/// Store the gains of the newest equation and determine the filter from them. With D = 1 - z^-1, its equation D^n w(k) = x(k) - sum of step[j] D^j
 /// w(k-1) is that of x(k) = w(k) + gain[0] w(k-1) + ..., without the rounding of products that cancel.
-EST_SHARED void prepare_filter(est_whitener_t* const self) {
+EST_SHARED void store_gains(est_whitener_t* const self, const float* const gain) {
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_GAIN_COLUMNS; i++) {
+        self->gain[0][i] = gain[i];
+    }
 #if EST_WITH_ROBUSTNESS
     float sum[EST_NA_MAX];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        sum[i] = self->gain[0][i];
+        sum[i] = gain[i];
     }
     EST_UNROLL
     for (uint_fast8_t j = 0U; j < EST_NA_MAX; j++) {
@@ -59,8 +63,6 @@ EST_SHARED void prepare_filter(est_whitener_t* const self) {
         }
         self->step[j] = ((j % 2U) == 0U) ? (1.0F + sum[j]) : (1.0F - sum[j]);
     }
-#else
-    (void)self;
 #endif
 }
 
@@ -68,10 +70,9 @@ EST_SHARED void prepare_filter(est_whitener_t* const self) {
 EST_SHARED void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < na; i++) {
-        self->c[i]       = c[i];
-        self->gain[0][i] = c[i];
+        self->c[i] = c[i];
     }
-    prepare_filter(self);
+    store_gains(self, self->c);
 }
 
 /// Restart: the next equation is the first.
@@ -99,16 +100,12 @@ EST_INLINE void remember(est_whitener_t* const self, const float* const gain, co
         self->precision[row] = self->precision[row - 1U];
     }
     for (uint_fast8_t row = EST_GAINS_KEPT - 1U; row > 0U; row--) {
-        for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        for (uint_fast8_t i = 0U; i < EST_GAIN_COLUMNS; i++) {
             self->gain[row][i] = self->gain[row - 1U][i];
         }
     }
     self->precision[0] = 1.0F / variance;
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        self->gain[0][i] = gain[i];
-    }
-    prepare_filter(self);
+    store_gains(self, gain);
 }
 
 /// Advance to the next equation. Return the variance of its whitened noise in variances of e, at least 1. Once it is

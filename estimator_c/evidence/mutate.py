@@ -74,8 +74,8 @@ TESTS = (
 )
 LONG = "not millions_of_samples and not long_free_running and not rarer_than_promised"
 DEADLINE_S = 8
-"""A mutant may not come to an end. For each test, the longest of which takes two; in seconds of the processor: the
-machine may be busy."""
+"""A mutant may not come to an end. For each test, in seconds of the processor: the machine may be busy. A test that
+takes long on the core as it is has four times that."""
 
 FLAGS = (
     *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
@@ -359,7 +359,7 @@ class Session:
     :param arguments: what pytest runs.
     :param noticed: how many mutants each test is known to have noticed.
     :param begin: called in each fork before its first test.
-    :param deadline_s: longest time of a test, in seconds of the processor.
+    :param deadline_s: longest time of a test in a fork, in seconds of the processor; a slow test has more.
     """
 
     def __init__(
@@ -377,7 +377,7 @@ class Session:
         self._seconds: dict[str, float] = {}
         self._outside = sys.stdout
         self._failed = ""
-        self._before_each: Callable[[], None] = lambda: None
+        self._before_each: Callable[[pytest.Item], None] = lambda _: None
 
     def run(self) -> None:
         """Run the session; RuntimeError if a test fails on the core as it is."""
@@ -407,7 +407,7 @@ class Session:
 
     def _first_failure(self) -> str:
         for test, following in itertools.zip_longest(self._tests, self._tests[1:]):
-            self._before_each()
+            self._before_each(test)
             start = time.process_time()
             test.ihook.pytest_runtest_protocol(item=test, nextitem=following)
             self._seconds[test.nodeid] = time.process_time() - start
@@ -415,12 +415,16 @@ class Session:
                 break
         return self._failed
 
+    def _limit(self, test: pytest.Item) -> None:
+        """Limit the time of the next test in this fork."""
+        _set_deadline(max(self._deadline_s, 4 * int(self._seconds[test.nodeid] + 1.0)))
+
     def first_failure(self) -> str:
         """First failure with the present library, in a fork; a crash or a time-out counts as one."""
         receiver, sender = os.pipe()
         child = os.fork()
         if child == 0:
-            self._before_each = functools.partial(_set_deadline, self._deadline_s)
+            self._before_each = self._limit
             self._begin(self._session)
             nothing = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nothing, 1)

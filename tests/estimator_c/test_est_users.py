@@ -193,10 +193,10 @@ def test_every_field_of_a_configuration_has_a_comment_with_its_unit_or_range() -
 @pytest.mark.parametrize(
     ("processor", "level", "most"),
     [
-        *((processor, level, 440) for processor in stack.BUILDS for level in ("-Os", "-O2", "-O3")),
-        (stack.CORTEX_M4F, "-O0", 2500),
-        (stack.CORTEX_M0, "-O0", 2500),
-        (stack.AVR, "-O0", 1660),
+        *((processor, level, 380) for processor in stack.BUILDS for level in ("-Os", "-O2", "-O3")),
+        (stack.CORTEX_M4F, "-O0", 2510),
+        (stack.CORTEX_M0, "-O0", 2510),
+        (stack.AVR, "-O0", 1670),
     ],
     ids=lambda value: value.name if isinstance(value, stack.Toolchain) else str(value),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -46,6 +47,28 @@ def test_a_resumed_run_keeps_what_neither_core_nor_tests_have_made_doubtful(tmp_
     record = tmp_path / "mutation.json"
     mutate.write(record, outcomes)
     assert set(mutate.recalled(record, mutate.mutants(), {explained.key}).values()) == {outcomes[0], outcomes[2]}
+
+
+SESSION = """
+from estimator_c.evidence.mutate import Session
+Session(["-c", "/dev/null", "test_slow.py"], {}, lambda session: print(repr(session.first_failure())), deadline_s=1).run()
+"""
+SLOW = """
+import time
+
+def test_slow():
+    end = time.process_time() + 2.1
+    while time.process_time() < end:
+        pass
+"""
+
+
+def test_a_slow_test_does_not_count_as_one_without_end(tmp_path: Path) -> None:
+    (tmp_path / "test_slow.py").write_text(SLOW)
+    environment = os.environ | {"PYTHONPATH": str(mutate.ROOT)}
+    command = [sys.executable, "-c", SESSION]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "''\n", done.stdout + done.stderr
 
 
 def test_mutants_by_chance_are_noticed_or_explained(tmp_path: Path) -> None:

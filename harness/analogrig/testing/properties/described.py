@@ -36,7 +36,7 @@ THETA_ROUNDING = 0.2
 STATISTIC_ROUNDING = 0.2
 """The same of the statistic, relative to the statistic and 1."""
 
-EXTENT_ROUNDING = 0.05
+EXTENT_ROUNDING = 0.0075
 """The same of the extent of a change, in its own standard deviations."""
 
 

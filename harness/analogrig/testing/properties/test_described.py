@@ -19,7 +19,7 @@ SEED = 1
 TRIES = 40
 """Most seeds of a case. One play in two or more is judged: 40 seeds fail with a probability of 1e-12."""
 
-ROUNDED = frozenset({17, 77, 106, 118, 137})
+ROUNDED = frozenset({17, 118, 137})
 """Drawn cases that are left out: float32, with products fused or not, makes another decision, which the reference does
 not foresee, or comes within a factor of 2 of an allowed deviation."""
 

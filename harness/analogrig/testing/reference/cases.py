@@ -51,11 +51,16 @@ _SINGLE = {
     "B and K fall": {"B": 1500.0, "K": 17_500.0},
     "M and K rise": {"M": 60.0, "K": 28_500.0},
 }
+SUCCESSION = dataclasses.replace(
+    _scenario("small changes in close succession", dataclasses.replace(_FREE, phase=0.133), 800),
+    tweaks=tuple(PotChange(200 + 100 * n, {"K": 24_500.0 if n % 2 else 23_700.0}) for n in range(6)),
+)
 HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
 FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
 DISPLACED = _scenario("displaced edges", dataclasses.replace(_FREE, frequency_hz=211.3), 600)
+DISPLACED_LATER = _scenario("edges displaced later", dataclasses.replace(_FREE, frequency_hz=117.9, phase=0.133), 720)
 RARE_EDGES = _scenario("rare edges", dataclasses.replace(_FREE, frequency_hz=40.0, phase=0.133), 560)
 
 
@@ -192,6 +197,11 @@ def _noisy_force(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG
     codes[360:420, U] = np.round(_noise(40.0)(codes[359:420, U].astype(np.float64)))
 
 
+def _noisy_at_last(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """A noise of the displacement once the edges are known to come anywhere."""
+    codes[590:, Y] = np.round(_noise(3.0)(codes[589:, Y].astype(np.float64)))
+
+
 FAULTS: Mapping[str, Spoil] = {
     "offset of the force": _fails(U, lambda codes: codes[1:] + 150.0),
     "gain of the force": _fails(U, lambda codes: 341.0 + 1.3 * (codes[1:] - 341.0)),
@@ -205,6 +215,13 @@ FAULTS: Mapping[str, Spoil] = {
     "noisy displacement": _fails(Y, _noise(8.0)),
 }
 """Faults of a channel, one at a time. Gains are counted from where the force is zero."""
+
+
+def _coarse_and_stuck(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """A displacement in steps of 6 codes, most of which repeat, and which gets stuck."""
+    codes[:, Y] = 6 * np.round(codes[:, Y] / 6)
+    FAULTS["stuck displacement"](codes, missing)
+
 
 _ARMED = {"warm_up_n": 150}
 """Plays are too short for the default."""
@@ -238,6 +255,7 @@ CASES: Mapping[str, ReferenceCase] = {
     "edges become late, delayed": ReferenceCase(LATE, {**_FIXED, "warm_up_n": 100, "nk": 1}),
     "edges become early, delayed": ReferenceCase(EARLY, {"warm_up_n": 100, "nk": 1, "nb": 2, "c": (-1.2, 0.36)}),
     "edges anywhere": ReferenceCase(DISPLACED, _FIXED),
+    "edges anywhere after the warm-up": ReferenceCase(DISPLACED_LATER, {**_FIXED, "warm_up_n": 190}, _noisy_at_last),
     "edges anywhere, known noise": ReferenceCase(DISPLACED, {**_FIXED, "noise_estimated": False}),
     "missing while in doubt": ReferenceCase(
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
@@ -288,6 +306,9 @@ CASES: Mapping[str, ReferenceCase] = {
         )
         for number, (name, changed) in enumerate(_SINGLE.items())
     },
+    "M falls at an edge": ReferenceCase(
+        _scenario("M falls at an edge", dataclasses.replace(_FREE, phase=0.968), 530, **_SINGLE["M falls"]), _ARMED
+    ),
     "M falls, one clock": ReferenceCase(
         _scenario("M falls, one clock", _SQUARE, 530, **_SINGLE["M falls"]),
         _ONE_CLOCK,
@@ -305,12 +326,20 @@ CASES: Mapping[str, ReferenceCase] = {
     ),
     "B rises, missing": ReferenceCase(_scenario("B rises", _FREE, 560, **_SINGLE["B rises"]), _ARMED, leave_out_later),
     **{name: ReferenceCase(FAULTY, _ONE_CLOCK if "late" in name else _ARMED, spoil) for name, spoil in FAULTS.items()},
+    "stuck displacement of coarse codes": ReferenceCase(
+        dataclasses.replace(FAULTY, excitation=dataclasses.replace(_FREE, frequency_hz=40.0, high_v=0.6, phase=0.7)),
+        {"warm_up_n": 150, "stuck_n": 0, "arl0": 100.0},
+        _coarse_and_stuck,
+    ),
     **{
         f"fault {n} samples after a gap": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump_after_gap(n))
         for n in range(5, 9)
     },
     "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
-    "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40}, exchange="block"),
+    "more alarms than may be justified": ReferenceCase(
+        SUCCESSION, {"warm_up_n": 100, "noise_estimated": False, "noise_variance": 6.0, "arl0": 1e3}
+    ),
+    "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40, "idle_n": 1}, exchange="block"),
     "low ceiling": ReferenceCase(
         SOFTER, {**_FIXED, "arl0": 30.0, "noise_variance": 0.4, "hold_off_n": 10, "warm_up_n": 90}
     ),

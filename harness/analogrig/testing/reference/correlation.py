@@ -13,7 +13,7 @@ SHARE_WARM, SHARE = 0.5, 0.04
 """Share of a block in a partial correlation, before the trigger is armed and later."""
 
 LOAD, PARTIAL_MAX = 1.05, 0.98
-LEVERAGE = 20.0
+LEVERAGE = 25.0
 RESTING_N = 4
 """Blocks from one with products to the next without a second reading."""
 

@@ -22,6 +22,9 @@ MOST_SAMPLES = 2600
 USUAL_HZ, ODD_HZ = (40.0, 100.0, 200.0, 250.0, 400.0), (90.0, 310.0)
 """Frequencies whose period is a whole number of samples, and limits of others."""
 
+DISTURBED, DISTURBED_WARM_UP_N = 0.4, (180, 450)
+"""Part of the cases with a lasting disturbance, and their warm-up, which it takes to estimate a correlation."""
+
 SHAPES = ("square", "square", "square", "square", "prbs", "pulse", "sine")
 
 
@@ -74,10 +77,14 @@ def drawn(number: int) -> ReferenceCase:
         spoils.append(_gaps(draw, first))
     if draw.chance(0.5 if is_long else 0.1):
         spoils.append(_bursts(draw, samples))
+    excitation, settings = _excitation(draw), _settings(draw)
+    if draw.chance(DISTURBED):
+        spoils.append(_disturbance(draw, samples))
+        settings |= {"warm_up_n": draw.whole(*DISTURBED_WARM_UP_N), "noise_estimated": draw.chance(0.9)}
     scenario = Scenario(
-        samples=samples, excitation=_excitation(draw), set=plant, tweaks=_ordered(tweaks), name=f"drawn {number}"
+        samples=samples, excitation=excitation, set=plant, tweaks=_ordered(tweaks), name=f"drawn {number}"
     )
-    return ReferenceCase(scenario, _settings(draw), _all_of(spoils) if spoils else None)
+    return ReferenceCase(scenario, settings, _all_of(spoils) if spoils else None)
 
 
 def _plant(draw: Draw) -> dict[str, float]:
@@ -206,6 +213,40 @@ def _bursts(draw: Draw, samples: int) -> Spoil:
             now[:] = np.clip(np.round(now + noise[: len(now)]), 0.0, 4095.0)
 
     return spoil
+
+
+def _disturbance(draw: Draw, samples: int) -> Spoil:
+    """Lasting disturbance of the displacement: coloured or intermittent noise, a hum, or a bent characteristic."""
+    kind = draw.one("coloured", "coloured", "intermittent", "hum", "bent")
+    size, turn, interval = draw.size(1.5, 12.0), draw.whole(150, samples), draw.size(40.0, 300.0)
+    later, bend = draw.size(0.5, 5.0), draw.size(2e-5, 5e-4) * draw.one(-1, 1)
+    colour, other = _partial_correlations(draw), draw.one(_partial_correlations(draw), (0.0, 0.0))
+    k, white = np.arange(samples), draw.normal(size, samples)
+    added = {
+        "coloured": np.concatenate([_coloured(white[:turn], *colour), later * _coloured(white[turn:], *other)]),
+        "intermittent": white * (k // interval % 2),
+        "hum": 2.0 * size * np.sin(8.0 * np.pi * k / interval) * ((k < turn) ^ (later < 1.0)),
+        "bent": np.zeros(samples),
+    }[kind]
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+        true = codes[:, Y].astype(np.float64)
+        bent = bend * (true - 400.0) ** 2 if kind == "bent" else 0.0
+        codes[:, Y] = np.clip(np.round(true + added + bent), 0.0, 4095.0)
+
+    return spoil
+
+
+def _partial_correlations(draw: Draw) -> tuple[float, float]:
+    return draw.real(-0.6, 0.99), draw.real(-0.7, 0.7)
+
+
+def _coloured(white: NDArray[np.float64], first: float, second: float) -> NDArray[np.float64]:
+    """Noise with these partial correlations at lags 1 and 2, and the variance of the white noise."""
+    out = [0.0, 0.0]
+    for each in (white * math.sqrt((1.0 - first**2) * (1.0 - second**2))).tolist():
+        out.append(first * (1.0 - second) * out[-1] + second * out[-2] + each)
+    return np.array(out[2:])
 
 
 def _all_of(spoils: Sequence[Spoil]) -> Spoil:

@@ -59,7 +59,7 @@ NEAR = 0.03
 NEAR_SETTLED, NEAR_LIMITED = 0.5, 0.1
 """The same of the excess of the noise variance over 1, when the whitening may begin anew, and when P is limited."""
 
-ROUNDED = 1e-7
+ROUNDED = 4e-7
 """Relative rounding of the sums that the noise variance of the whitening is the difference of."""
 
 NEAR_SUM = 0.01

@@ -14,13 +14,13 @@ BLOCK_N = 32
 SHARE_MIN, SHARE_WARM, WARM_N = 0.032, 0.25, 64
 """Smallest shares of a block in the noise variance, armed and before; equations before which it is armed."""
 
-HIGH, HIGH_STEP, HIGH_LIMIT = 5.0, 2, 6
+HIGH, HIGH_STEP, HIGH_LIMIT = 5.0, 3, 7
 """Mean square of a high block in noise variances that contain it, its step, and the count at which an alarm is due."""
 
 MARGIN, GROWTH_MAX = 2.0, 9.0
 INFLATION_STEP, INFLATION_DECAY, INFLATION_MAX = 4.0, 0.9998933, 1e6
 TRIAL_BEGIN_N, TRIAL_LEAST_N, TRIAL_N, TRIAL_MAX_N = 16, 20, 56, 120
-JUSTIFIED, CREDIT_MAX, CREDIT_PER_BLOCK = 4.0, 4.0, BLOCK_N / 5000.0
+JUSTIFIED, CREDIT_N, CREDIT_MAX_N = 4.0, 157, 4 * 157
 PLAIN = 64.0 * (TRIAL_N - TRIAL_BEGIN_N)
 """Squared errors of the old estimate, in expected variances, beyond which a justified alarm is plain."""
 DISPERSED, DISPERSION_GAIN, DISPERSION_MAX = 1.15, 2.0, 10.0
@@ -47,7 +47,7 @@ class ReferenceScale:
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.noise_variance = config.noise_variance
-        self.inflation, self._credit = 1.0, CREDIT_MAX
+        self.inflation, self._credit_n = 1.0, CREDIT_MAX_N
         self._is_cusum = config.trigger == "cusum"
         self._share = 1.0 if config.noise_estimated else 0.0
         """Share of the next block in the noise variance; 0: it is not followed."""
@@ -103,9 +103,9 @@ class ReferenceScale:
             return
         excess = self._balance - PLAIN * self.expected
         self.is_doubtful |= min(abs(self._balance), abs(excess)) < NEAR * self._energy
-        cost = 0.0 if excess > 0.0 else 1.0
-        if self._trial_n > TRIAL_LEAST_N and self._balance > 0.0 and self._credit >= cost:
-            self._credit -= cost
+        cost_n = 0 if excess > 0.0 else CREDIT_N
+        if self._trial_n > TRIAL_LEAST_N and self._balance > 0.0 and self._credit_n >= cost_n:
+            self._credit_n -= cost_n
         elif self.inflation < INFLATION_MAX:
             self.inflation *= INFLATION_STEP
         self._trial_n = 0
@@ -147,13 +147,15 @@ class ReferenceScale:
 
         A block whose sum is half way to an alarm is discarded.
         """
-        stage, counts = self._stage, self._share > 0.0 and excess < 1.0
-        if stage in (BlockStage.CORRELATION, BlockStage.NOISE):
-            self.is_doubtful |= self._share > 0.0 and abs(excess - 1.0) < NEAR
+        stage = self._stage
         self._stage = BlockStage(min(stage.value + 1, BlockStage.END.value))
-        if stage is BlockStage.CORRELATION and counts and self._is_cusum:
-            self.correlation.follow(self._squares / BLOCK_N, self.noise_variance, BLOCK_N, armed=quiet_n == 0)
-        elif stage is BlockStage.NOISE and counts:
+        if stage is BlockStage.CORRELATION:
+            self.is_doubtful |= self._share > 0.0 and abs(excess - 1.0) < NEAR
+            if self._share > 0.0 and excess < 1.0:
+                self._follow_shape(quiet_n)
+            else:
+                self._stage = BlockStage.CHANGE
+        elif stage is BlockStage.NOISE:
             self._follow(quiet_n)
         elif stage is BlockStage.CHANGE:
             self._count_high()
@@ -170,16 +172,21 @@ class ReferenceScale:
         if self._trial_n >= TRIAL_MAX_N or (self._trial_n >= TRIAL_N and since_n < self._trial_n):
             self.end_trial()
 
-    def _follow(self, quiet_n: int) -> None:
-        """Let the noise variance and the dispersion follow the complete block."""
+    def _follow_shape(self, quiet_n: int) -> None:
+        """Let correlation and dispersion of the innovations follow the complete block."""
         mean = self._squares / BLOCK_N
+        if self._is_cusum:
+            self.correlation.follow(mean, self.noise_variance, BLOCK_N, armed=quiet_n == 0)
         square = min((mean / self.noise_variance) ** 2, DISPERSION_MAX)
         self._dispersion += self._share * (square - self._dispersion)
         if quiet_n or self.correlation.is_smooth:  # theta settles, or the squares have no peaks
             self._dispersion = 1.0
-        mean = min(mean, GROWTH_MAX * self.noise_variance)
+
+    def _follow(self, quiet_n: int) -> None:
+        """Let the noise variance follow the complete block."""
+        mean = min(self._squares / BLOCK_N, GROWTH_MAX * self.noise_variance)
         self.noise_variance = max(self.noise_variance + self._share * (mean - self.noise_variance), self._least)
-        least = SHARE_WARM if quiet_n >= WARM_N or self._share > SHARE_WARM else SHARE_MIN
+        least = SHARE_WARM if quiet_n >= WARM_N else SHARE_MIN
         self._share = max(self._share / (1.0 + self._share), least)
 
     def _count_high(self) -> None:
@@ -193,6 +200,6 @@ class ReferenceScale:
     def _relax(self) -> None:
         """Let the inflation decrease, and the number of alarms that may be justified increase."""
         self.inflation = max(self.inflation * INFLATION_DECAY, 1.0)
-        self._credit = min(self._credit + CREDIT_PER_BLOCK, CREDIT_MAX)
+        self._credit_n = min(self._credit_n + 1, CREDIT_MAX_N)
         self._restart()
         self._apply()
