@@ -24,9 +24,12 @@
 /// the innovations are larger.
 #define ENOUGH_N 400.0F
 
-/// Limit of an innovation in standard deviations, squared; and of one factor in its fourth power, over that limit.
+/// Limit of an innovation in standard deviations, squared; and of one factor in its fourth power, over that limit. An
+/// innovation beyond its limit that follows another has the factor FOLLOWING, by which it counts as Gaussian: an edge
+/// that moved, or a change of the plant, has several.
 #define CLIP 9.0F
 #define OUTLIER 11.0F
+#define FOLLOWING 0.33F
 
 /// Memory of the level of y [draws].
 #define LEVEL_N 128U
@@ -56,18 +59,26 @@
 /// Limits of the statistics of noise, which two blocks share. COLOUR: variance of the sums over that of white
 /// innovations. ALONG: squared correlation of successive innovations over its variance. UNEVEN: squared deviations of
 /// the energies of the regions, in squared variances. TAILS: kurtosis above that of innovations that are GAUSSIAN and
-/// limited. EXCESS: variance over the declared one. RISE: variance over that of the block before.
+/// limited. EXCESS: variance over the declared one. RISE: variance over that of the block before. STEEP: squared excess
+/// of the energy where y is steep, over its variance; the latter is EVEN if the steepness hardly varies.
 #define COLOUR 6.8F
 #define ALONG 85.0F
 #define UNEVEN 140.0F
 #define GAUSSIAN 2.9F
-#define TAILS 1.15F
+#define TAILS 0.88F
 #define EXCESS 5.0F
 #define RISE 1.55F
+#define STEEP 78.0F
+#define TAILS_PART 0.5F
+#define EVEN 0.01F
+
+/// Part of the configured variance that is due to the resolution of the codes, and more. Outliers and steepness relate
+/// to it if the innovations have less: the rounding of y varies only where y moves.
+#define RESOLUTION 0.25F
 
 /// Evidence for noise that either block needs, as a change of the plant disturbs only one. Beside ALARMED_N alarms less
 /// suffices, by the factor ALARMED for each alarm. One that was not justified counts UNJUSTIFIED_N more.
-#define NOISE_EACH 0.4F
+#define NOISE_EACH 0.5F
 #define ALARMED 0.45F
 #define ALARMED_N 3U
 #define UNJUSTIFIED_N 2U
@@ -75,14 +86,16 @@
 /// A line is hum if its share of the power of the sums exceeds LINE_SHARE, and its share of the energy of the
 /// innovations that of the regions by REGIONS_HUM: the response of a plant that is not linear has peaks too. Between two
 /// lines, some of its power is in others; BETWEEN makes up for it. In the LOW_LINES_N lowest lines noise that jumps has
-/// peaks, and LOW_SHARE applies. The power of a line is steady if neither block has more than STEADY times the other's.
-/// A mean is drift if its share exceeds MEAN_SHARE: noise of low frequency has means too.
+/// peaks, and LOW_SHARE applies. A line is steady if neither block has more than STEADY times the other's power, and its
+/// frequency differs by no more than BESIDE [lines]. A mean is drift if its share exceeds MEAN_SHARE: noise of low
+/// frequency has means too.
 #define LINE_SHARE 0.66F
 #define LOW_SHARE 0.79F
 #define LOW_LINES_N 3U
 #define BETWEEN 0.25F
 #define REGIONS_HUM 2.0F
 #define STEADY 2.0F
+#define BESIDE 0.65F
 #define MEAN_SHARE 0.85F
 
 /// Strength of a dependence on the state of the plant from which on that is the cause of lines and of correlation; and
@@ -122,8 +135,14 @@ static float improve_root(const float root, const float x) { return 0.5F * (root
 static void count_energy(est_fit_watch_t* const self, const bool counts) {
     const uint32_t n = (EST_FIT_SUM_N * self->sum_n) + self->slot + 1U - self->sums.lost_n;
     if (counts) {
-        self->energies[self->region] += self->sums.squares - self->sums.counted;
-        self->energies_n[self->region] = (uint16_t)(self->energies_n[self->region] + n - self->sums.counted_n);
+        const float    energy    = self->sums.squares - self->sums.counted;
+        const uint32_t energy_n  = n - self->sums.counted_n;
+        const float    steepness = self->steepness * (float)energy_n;
+        self->energies[self->region] += energy;
+        self->energies_n[self->region] = (uint16_t)(self->energies_n[self->region] + energy_n);
+        self->sums.steep += self->steepness * energy;
+        self->sums.steepness += steepness;
+        self->sums.steepness_squares += self->steepness * steepness;
     }
     self->sums.counted   = self->sums.squares;
     self->sums.counted_n = (uint16_t)n;
@@ -143,6 +162,7 @@ static void find_region(est_fit_watch_t* const self, const est_t* const estimato
     stage += (above < bound) ? 0U : 1U;
     trend += (moved < moves) ? 0U : 1U;
     self->region     = (uint8_t)((3U * stage) + trend);
+    self->steepness  = moved * moved;
     self->learnt_n   = (uint8_t)(self->learnt_n + ((self->learnt_n < LEVEL_N) ? 1U : 0U));
     const float rate = 1.0F / (float)self->learnt_n;
     self->level += rate * above;
@@ -309,35 +329,68 @@ static float scale_misfit(const est_t* const estimator) {
 #endif
 }
 
-/// Evidence for noise in the block: of correlation, of more than one variance, of outliers, and of excess.
-static float find_noise(const est_fit_watch_t* const self) {
-    const est_fit_sums_t* const sums     = &self->sums;
-    const float                 variance = variance_of(self);
-    const float                 level    = reference_variance(self);
-    const float                 along    = quotient(sums->along * sums->along, clear_energy_of(self) * level * ALONG);
-    const float                 uneven   = sums->uneven / (level * level * UNEVEN);
-    const float                 kurtosis = sums->fourths / (sums->squares * variance);
-    const float                 tails    = (kurtosis - GAUSSIAN) / TAILS;
-    const float                 excess   = quotient(variance, declared_variance(self) * EXCESS);
-    return est_max(est_max(along, uneven), est_max(tails, excess));
+/// This variance, or that of the resolution if that is more.
+static float resolved(const est_fit_watch_t* const self, const float variance) {
+    return est_max(variance, RESOLUTION * self->config->noise_variance);
 }
 
-/// Weigh noise over this block and the one before. Correlation over EST_FIT_SUM_N samples may be in one block alone. In
-/// the first block that states nothing yet.
+/// Weigh outliers: the kurtosis. That of fewer innovations is less certain, and counts less.
+static float weigh_tails(const est_fit_watch_t* const self) {
+    const float variance = variance_of(self);
+    const float level    = resolved(self, variance);
+    const float beyond   = self->sums.fourths - (GAUSSIAN * self->sums.squares * variance);
+    return beyond / (level * level * number(EST_FIT_BLOCK_N) * TAILS);
+}
+
+/// Weigh noise that grows with the steepness of y, in this block and the one before: energy where y is steep, beyond its
+/// share. Its variance is proportional to the squared deviations of the steepness.
+static float weigh_steepness(est_fit_watch_t* const self) {
+    const est_fit_sums_t* const sums      = &self->sums;
+    const float                 n         = (float)sums->energy_n;
+    const float                 variance  = quotient(sums->energy, n);
+    const float                 steepness = quotient(sums->steepness, n);
+    const float                 steep = quotient(sums->steep - (variance * sums->steepness), resolved(self, variance));
+    const float                 variety = ((1.0F + EVEN) * sums->steepness_squares) - (steepness * sums->steepness);
+    const float                 sum     = steep + self->last_steep;
+    const float                 weight  = quotient(sum * sum, (variety + self->last_variety) * STEEP);
+    const bool                  in_both = (steep > 0.0F) && (self->last_steep > 0.0F);
+    self->last_steep                    = steep;
+    self->last_variety                  = variety;
+    return in_both ? weight : 0.0F;
+}
+
+/// Evidence for noise in the block: of correlation, of more than one variance, and of excess.
+static float find_noise(const est_fit_watch_t* const self) {
+    const est_fit_sums_t* const sums   = &self->sums;
+    const float                 level  = reference_variance(self);
+    const float                 along  = quotient(sums->along * sums->along, clear_energy_of(self) * level * ALONG);
+    const float                 uneven = sums->uneven / (level * level * UNEVEN);
+    const float                 excess = quotient(variance_of(self), declared_variance(self) * EXCESS);
+    return est_max(est_max(along, uneven), excess);
+}
+
+/// Weigh noise over this block and the one before. Correlation over EST_FIT_SUM_N samples may be in one block alone, and
+/// so may outliers without any alarm: a change of the plant has one. In the first block that states nothing yet.
 static float weigh_noise(est_fit_watch_t* const self, const est_t* const estimator) {
     if (scale_misfit(estimator) > (2.0F * self->inflation)) {
         self->alarms_n = (uint16_t)(self->alarms_n + UNJUSTIFIED_N);
     }
     const float    colour   = quotient(self->sums.power, clear_energy_of(self) * COLOUR);
     const float    rise     = quotient(variance_of(self), self->last_variance * RISE);
+    const float    steep    = weigh_steepness(self);
+    const float    tails    = weigh_tails(self);
+    const float    both     = tails + self->last_tails;
     const uint32_t alarms_n = (uint32_t)self->alarms_n + self->last_alarms_n;
-    self->noise             = est_max(colour, find_noise(self));
-    const float sum         = self->noise + self->last_noise;
+    self->noise             = est_max(est_max(colour, tails), find_noise(self));
+    self->last_tails        = tails;
+    const float sum         = self->noise + self->last_noise + steep;
     const bool  in_both     = (self->noise >= NOISE_EACH) && (self->last_noise >= NOISE_EACH);
     const float alone       = in_both ? sum : 0.0F;
     const float shared      = (alarms_n >= ALARMED_N) ? (ALARMED * (float)alarms_n * sum) : alone;
     const bool  before      = (self->candidate == EST_MISFIT_NOISE) && (self->misfit.kind == EST_MISFIT_NONE);
-    return est_max(est_max(colour, before ? self->last_noise : rise), shared);
+    const float quiet       = (alarms_n == 0U) ? both : 0.0F;
+    const float shape       = est_max(quiet, steep + (TAILS_PART * quiet));
+    return est_max(est_max(colour, before ? self->last_noise : rise), est_max(shared, shape));
 }
 
 /// True iff the plant hardly moves between two samples.
@@ -389,11 +442,20 @@ static void begin_block(est_fit_watch_t* const self) {
     self->sum_n = 0U;
 }
 
-/// True iff the peak of the spectrum is where it was in the block before, or beside it, and its power is comparable.
+/// True iff the line is that of the block before, and its power is comparable.
 static bool is_steady(const est_fit_watch_t* const self) {
     const float power = peak_power(self);
-    return (self->peak <= (self->last_peak + 1U)) && (self->last_peak <= (self->peak + 1U)) &&
-           (power <= (STEADY * self->last_power)) && (self->last_power <= (STEADY * power));
+    const float moved = est_magnitude(self->found.frequency - self->last_frequency);
+    return ((moved * number(EST_FIT_BLOCK_N)) <= BESIDE) && (power <= (STEADY * self->last_power)) &&
+           (self->last_power <= (STEADY * power));
+}
+
+/// True iff a line or a mean was found where the block before had noise, but not the same line or a mean.
+static bool is_unsteady(const est_fit_watch_t* const self) {
+    const est_misfit_kind_t kind = self->found.kind;
+    const bool              line = kind == EST_MISFIT_HUM;
+    const bool              same = (self->last_kind == kind) && (!line || is_steady(self));
+    return (line || (kind == EST_MISFIT_DRIFT)) && (self->last_noise >= NOISE_EACH) && !same;
 }
 
 /// True iff the innovations depend on the state of the plant, though less than EST_MISFIT_NONLINEAR alone needs.
@@ -402,8 +464,9 @@ static bool is_dependent(const est_fit_watch_t* const self) {
     return weigh_nonlinearity(self) > est_max(DEPENDENT, DEPENDENT_COLOUR * colour);
 }
 
-/// Complete what was found. A line that is another in the next block is noise. Lines and correlation that depend on
-/// the state of the plant are no disturbance. If the scale is inflated, the model does not fit, whatever the cause.
+/// Complete what was found. A line or a mean that is another in the next block is noise. Lines and correlation that
+/// depend on the state of the plant are no disturbance. If the scale is inflated, the model does not fit, whatever the
+/// cause.
 static void complete(est_fit_watch_t* const self, const est_t* const estimator) {
     const float         inflation = scale_misfit(estimator);
     est_misfit_t* const found     = &self->found;
@@ -412,14 +475,20 @@ static void complete(est_fit_watch_t* const self, const est_t* const estimator) 
     } else {
         found->strength = est_max(found->strength, inflation);
     }
-    if ((found->kind == EST_MISFIT_HUM) && (self->candidate != EST_MISFIT_NONE) && !is_steady(self)) {
+    if (found->kind == EST_MISFIT_HUM) {
+        found->frequency = find_frequency(self);
+    }
+    const est_misfit_kind_t kind = found->kind;
+    if (is_unsteady(self)) {
         found->kind = EST_MISFIT_NOISE;
     }
+    self->last_frequency = found->frequency;
+    self->last_kind      = kind;
     if (((found->kind == EST_MISFIT_HUM) || (found->kind == EST_MISFIT_NOISE)) && is_dependent(self)) {
         found->kind = EST_MISFIT_NONLINEAR;
     }
-    if (found->kind == EST_MISFIT_HUM) {
-        found->frequency = find_frequency(self);
+    if (found->kind != EST_MISFIT_HUM) {
+        found->frequency = 0.0F;
     }
     if ((found->kind == EST_MISFIT_EXCITATION) && is_slow(estimator)) {
         found->kind = EST_MISFIT_SLOW_PLANT;
@@ -429,7 +498,6 @@ static void complete(est_fit_watch_t* const self, const est_t* const estimator) 
 /// Keep what the next block is compared with.
 static void keep_block(est_fit_watch_t* const self, const est_t* const estimator) {
     self->candidate     = self->found.kind;
-    self->last_peak     = self->peak;
     self->last_power    = peak_power(self);
     self->last_variance = variance_of(self);
     self->last_noise    = self->noise;
@@ -469,6 +537,8 @@ static void evaluate_region(est_fit_watch_t* const self, const uint32_t region) 
     if (self->energies_n[region] >= ENERGY_MIN) {
         self->sums.uneven += (deviation * deviation) / energies_n;
     }
+    self->sums.energy += self->energies[region];
+    self->sums.energy_n      = (uint16_t)(self->sums.energy_n + self->energies_n[region]);
     self->energies[region]   = 0.0F;
     self->energies_n[region] = 0U;
     const uint8_t n          = self->regions_n[region];
@@ -504,7 +574,8 @@ static void close_sum(est_fit_watch_t* const self, const est_t* const estimator)
     self->limit   = improve_root(self->limit, CLIP * est_noise_variance(estimator));
     self->sums.power += self->sum * self->sum;
     self->sums.total += self->sum;
-    self->sum = 0.0F;
+    self->sum        = 0.0F;
+    self->beyond_end = 0U;
     self->sum_n++;
     if (edges_vary(estimator)) {
         self->misfit = (est_misfit_t){ .kind = EST_MISFIT_EDGES, .strength = 1.0F };
@@ -529,16 +600,24 @@ work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const
     }
 }
 
-/// Limit an innovation beyond its limit. It counts as an outlier if nothing else explains it: no edge in doubt, no
-/// slip, and no gap of late.
+/// Limit an innovation beyond its limit. It counts as an outlier if nothing else explains it: no innovation before it,
+/// no edge in doubt, no slip, and no gap of late.
 static float limit_innovation(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
-    const float limit  = self->limit * self->limit;
-    const float square = step.innovation * step.innovation;
-    const bool  judged = (estimator->doubt_n == 0U) && estimator->settled && estimator->known;
-    if (judged || step.alarm) {
+    const float limit   = self->limit * self->limit;
+    const float square  = step.innovation * step.innovation;
+    const bool  judged  = (estimator->doubt_n == 0U) && estimator->settled && estimator->known;
+    const bool  follows = (self->slot > 0U) && (self->slot == self->beyond_end);
+    float       factor  = limit;
+    if (follows) {
+        factor = FOLLOWING * limit;
+    } else if (judged || step.alarm) {
         const float most = OUTLIER * limit;
-        self->sums.fourths += limit * (((square < most) ? square : most) - limit);
+        factor           = (square < most) ? square : most;
+    } else {
+        // no more than its limit
     }
+    self->beyond_end = (uint8_t)(self->slot + 1U);
+    self->sums.fourths += limit * (factor - limit);
     return (step.innovation < 0.0F) ? -self->limit : self->limit;
 }
 

@@ -78,11 +78,16 @@ typedef struct {
     float    explained;  ///< energy of these that the regions explain beyond chance
     float    repeated;   ///< energy of these that the regions of the block before explain
     float    uneven;     ///< squared deviations of the energies of the regions, over their numbers
-    uint16_t lost_n;     ///< samples without an innovation, or whose innovation is excluded
-    uint16_t doubted_n;  ///< innovations that are not clear
-    uint16_t counted_n;  ///< innovations in `counted`
-    uint16_t moved_n;    ///< differences in `moved`
-    uint16_t drawn_n;    ///< innovations in `drawn`
+    float    energy;     ///< of the clear innovations in the regions
+    float    steep;      ///< the same, each times the steepness of y before it
+    float    steepness;  ///< of y before each of these
+    float    steepness_squares;  ///< squares of these
+    uint16_t lost_n;             ///< samples without an innovation, or whose innovation is excluded
+    uint16_t doubted_n;          ///< innovations that are not clear
+    uint16_t counted_n;          ///< innovations in `counted`
+    uint16_t moved_n;            ///< differences in `moved`
+    uint16_t drawn_n;            ///< innovations in `drawn`
+    uint16_t energy_n;           ///< innovations in `energy`
 } est_fit_sums_t;
 
 /// State of the watch. The fields are private; read est_fit_misfit().
@@ -94,7 +99,7 @@ typedef struct {
     uint8_t             region;                         ///< of the state of the plant before the present sample
     uint8_t             learnt_n;                       ///< samples in level and spread, limited
     uint8_t             peak;                           ///< line with the largest power
-    uint8_t             last_peak;                      ///< the same in the block before
+    uint8_t             beyond_end;                     ///< slot after that of an innovation beyond its limit; 0: none
     uint16_t            alarms_n;                       ///< alarms in the block; one that was not justified counts more
     uint16_t            last_alarms_n;                  ///< the same in the block before
     float               limit;                          ///< of an innovation [codes]
@@ -103,6 +108,7 @@ typedef struct {
     float               entered;                        ///< last complete sum
     float               level;                          ///< mean of y [codes]
     float               spread;                         ///< mean distance of y from its level [codes]
+    float               steepness;                      ///< squared change of y before the present samples
     float               now[EST_FIT_LINES_N];           ///< resonators; during the evaluation the powers
     float               before[EST_FIT_LINES_N];        ///< resonators, one step before
     float               regions[EST_FIT_REGIONS_N];     ///< sums of the drawn innovations, by region
@@ -114,12 +120,17 @@ typedef struct {
     float               first_spread;    ///< at the end of the first block [codes]
     float               first_variance;  ///< of the innovations of the first block [codes^2]; 0: none yet
     float               last_variance;   ///< the same of the block before
+    float               last_frequency;  ///< of the line in the block before [cycles per sample]
     float               last_power;      ///< of the peak in the block before
-    float               inflation;       ///< of the scale at the end of the block before, over its limit
-    float               noise;           ///< evidence for noise in the block that is evaluated; 1: twice what suffices
-    float               last_noise;      ///< the same in the block before
-    est_misfit_t        found;           ///< in the block that is evaluated
-    est_misfit_kind_t   candidate;       ///< found in the block before
+    float               last_tails;      ///< evidence for outliers in the block before
+    float               last_steep;    ///< energy where y is steep in the block before, beyond its share, in variances
+    float               last_variety;  ///< squared deviations of the steepness in the block before
+    float               inflation;     ///< of the scale at the end of the block before, over its limit
+    float               noise;         ///< evidence for noise in the block that is evaluated; 1: twice what suffices
+    float               last_noise;    ///< the same in the block before
+    est_misfit_t        found;         ///< in the block that is evaluated
+    est_misfit_kind_t   last_kind;     ///< found in the block before, by itself
+    est_misfit_kind_t   candidate;     ///< found in the block before
     est_misfit_t        misfit;
 } est_fit_watch_t;
 

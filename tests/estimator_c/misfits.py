@@ -111,6 +111,17 @@ def _impulses(codes: float, share: float) -> Callable[[Array, np.random.Generato
     return lambda y, rng: y + codes * rng.choice([-1.0, 1.0], y.shape) * (rng.random(y.shape) < share)
 
 
+def _heavy_tails(codes: float, degrees: float) -> Callable[[Array, np.random.Generator], Array]:
+    """Noise of Student's t distribution with this standard deviation."""
+    scale = codes * np.sqrt(1.0 - 2.0 / degrees)
+    return lambda y, rng: y + scale * rng.standard_t(degrees, y.shape)
+
+
+def _timing(samples: float) -> Callable[[Array, np.random.Generator], Array]:
+    """Jitter of the sampling instants with this standard deviation."""
+    return lambda y, rng: y + samples * np.gradient(y, axis=1) * rng.normal(0.0, 1.0, y.shape)
+
+
 def _popcorn(codes: float, dwell_n: float) -> Callable[[Array, np.random.Generator], Array]:
     """Jumps between two levels, this much either side, after ``dwell_n`` samples on average."""
     return lambda y, rng: y + codes * (-1.0) ** np.cumsum(rng.random(y.shape) < 1.0 / dwell_n, axis=1)
@@ -135,6 +146,8 @@ CONDITIONS = {
     "noise, 0.1 % of the displacement": Condition("noise", disturb=_proportional(0.001)),
     "noise, 8 LSB on 1 % of the samples": Condition("noise", disturb=_impulses(8.0, 0.01)),
     "noise, jumps of 3 LSB after 200 samples": Condition("noise", share=0.9, disturb=_popcorn(1.5, 200.0)),
+    "noise, Student's t with 3 degrees of freedom": Condition("noise", disturb=_heavy_tails(1.0, 3.0)),
+    "noise, jitter of 0.01 samples": Condition("noise", disturb=_timing(0.01)),
     "hum, 1 LSB, 50 Hz": Condition("hum", disturb=_hum(1.0, 50.0 / 20e3)),
     "hum, 1 LSB, 150 Hz": Condition("hum", disturb=_hum(1.0, 150.0 / 20e3)),
     "hum, 3 LSB, 50 Hz": Condition("hum", disturb=_hum(3.0, 50.0 / 20e3)),
