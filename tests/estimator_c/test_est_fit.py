@@ -202,7 +202,7 @@ def test_noise_that_grows_with_the_slope_of_y_is_noise(estimator: Estimator, sca
 def test_noise_is_not_compared_with_a_slope_that_hardly_varies(estimator: Estimator) -> None:
     steps = Steps()
     steps.y = 30.0 * np.abs((steps.at % 100) - 50.0)
-    steps.y[:: 96] += 0.01
+    steps.y[::96] += 0.01
     steps.innovation *= 1.0 + 0.1 * np.sin(0.008 * steps.at)
     assert final(steps.judged(estimator)) == "none"
 
