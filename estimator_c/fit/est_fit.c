@@ -60,7 +60,8 @@
 /// innovations. ALONG: squared correlation of successive innovations over its variance. UNEVEN: squared deviations of
 /// the energies of the regions, in squared variances. TAILS: kurtosis above that of innovations that are GAUSSIAN and
 /// limited. EXCESS: variance over the declared one. RISE: variance over that of the block before. STEEP: squared excess
-/// of the energy where y is steep, over its variance; the latter is EVEN if the steepness hardly varies.
+/// of the energy where y is steep, over its variance, which is at least EVEN squared steepnesses; beside it outliers
+/// count by TAILS_PART.
 #define COLOUR 6.8F
 #define ALONG 85.0F
 #define UNEVEN 140.0F
