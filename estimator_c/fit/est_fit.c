@@ -73,8 +73,8 @@
 #define TAILS_PART 0.5F
 #define EVEN 0.01F
 
-/// Part of the configured variance that is due to the resolution of the codes, and more. Outliers and steepness relate
-/// to it if the innovations have less: the rounding of y varies only where y moves.
+/// Part of the configured variance that is due to the resolution of the codes, and more. Rounding depends on the state
+/// of the plant, and varies only where y moves.
 #define RESOLUTION 0.25F
 
 /// Evidence for noise that either block needs, as a change of the plant disturbs only one. Beside ALARMED_N alarms less
@@ -268,10 +268,15 @@ EST_SHARED float count_of(const est_fit_watch_t* const self) {
 
 EST_SHARED float variance_of(const est_fit_watch_t* const self) { return self->sums.squares / count_of(self); }
 
-/// Variance to which the statistics relate: that of the innovations, or the declared one if that is more. The
-/// structure of innovations that are smaller than promised does no harm.
+/// This variance, or that of the resolution if that is more.
+EST_SHARED float resolved(const est_fit_watch_t* const self, const float variance) {
+    return est_max(variance, RESOLUTION * self->config->noise_variance);
+}
+
+/// Variance to which the statistics relate: that of the innovations, or the declared one or that of the resolution if
+/// these are more. The structure of innovations that are smaller than promised does no harm.
 EST_SHARED float reference_variance(const est_fit_watch_t* const self) {
-    return est_max(variance_of(self), declared_variance(self));
+    return est_max(resolved(self, variance_of(self)), declared_variance(self));
 }
 
 /// Number of innovations in the spectrum.
@@ -328,11 +333,6 @@ static float scale_misfit(const est_t* const estimator) {
     (void)estimator;
     return 0.0F;
 #endif
-}
-
-/// This variance, or that of the resolution if that is more.
-static float resolved(const est_fit_watch_t* const self, const float variance) {
-    return est_max(variance, RESOLUTION * self->config->noise_variance);
 }
 
 /// Weigh outliers: the kurtosis. That of fewer innovations is less certain, and counts less.

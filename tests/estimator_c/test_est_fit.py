@@ -117,11 +117,15 @@ def test_force_that_steps_all_the_time_has_no_edges_to_judge(estimator: Estimato
     assert final(steps.judged(estimator)) == "none"
 
 
-def test_innovations_that_follow_the_level_of_y_are_nonlinear(estimator: Estimator) -> None:
+@pytest.mark.parametrize(("scale", "cause"), [(1.0, "nonlinear"), (0.2, "none")], ids=["plant", "rounding"])
+def test_innovations_that_follow_the_level_of_y_are_nonlinear_unless_below_the_resolution(
+    estimator: Estimator, scale: float, cause: str
+) -> None:
     steps = Steps()
     between = np.abs(steps.y - steps.y.mean()) < 0.9 * steps.y.std()
     steps.innovation += 1.5 * (between - between.mean())
-    assert final(steps.judged(estimator)) == "nonlinear"
+    steps.innovation *= scale
+    assert final(steps.judged(estimator)) == cause
 
 
 @pytest.mark.parametrize(("growth", "cause"), [(2.0, "nonlinear"), (1.0, "none")], ids=["with y", "alone"])
