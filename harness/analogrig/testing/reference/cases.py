@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -51,6 +52,25 @@ _SINGLE = {
     "B and K fall": {"B": 1500.0, "K": 17_500.0},
     "M and K rise": {"M": 60.0, "K": 28_500.0},
 }
+_LARGE = {
+    "M falls by half": ("M", 70.0, 35.0),
+    "M doubles": ("M", 35.0, 70.0),
+    "B falls to a third": ("B", 2400.0, 800.0),
+    "B triples": ("B", 1400.0, 4200.0),
+    "K falls by half": ("K", 24_500.0, 12_250.0),
+    "K doubles": ("K", 12_250.0, 24_500.0),
+}
+"""Changes against which the isolation has a prior: parameter, before, after."""
+
+
+def _large(name: str, high_v: float, phase: float) -> Scenario:
+    parameter, before, after = _LARGE[name]
+    excitation = dataclasses.replace(_FREE, high_v=high_v, phase=phase % 1.0)
+    return dataclasses.replace(
+        _scenario(f"{name}, {high_v} V", excitation, 560, **{parameter: after}), set=PLANT | {parameter: before}
+    )
+
+
 SUCCESSION = dataclasses.replace(
     _scenario("small changes in close succession", dataclasses.replace(_FREE, phase=0.133), 800),
     tweaks=tuple(PotChange(200 + 100 * n, {"K": 24_500.0 if n % 2 else 23_700.0}) for n in range(6)),
@@ -305,6 +325,10 @@ CASES: Mapping[str, ReferenceCase] = {
             _scenario(name, dataclasses.replace(_FREE, phase=0.1 + 0.11 * number), 530, **changed), _ARMED
         )
         for number, (name, changed) in enumerate(_SINGLE.items())
+    },
+    **{
+        f"{name}, {high_v} V": ReferenceCase(_large(name, high_v, 0.07 + 0.09 * number), _ARMED)
+        for number, (name, high_v) in enumerate(itertools.product(_LARGE, (0.4, 1.0, 3.0)))
     },
     "M falls at an edge": ReferenceCase(
         _scenario("M falls at an edge", dataclasses.replace(_FREE, phase=0.968), 530, **_SINGLE["M falls"]), _ARMED
