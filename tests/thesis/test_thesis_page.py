@@ -60,7 +60,7 @@ def test_filter_shows_the_claims_of_a_chapter_and_verdict(browser: Browser, repr
     page.get_by_role("combobox", name="Chapter").select_option("3")
     assert page.locator("#count").inner_text() == f"0 of {len(claims['claims'])} claims"
     page.get_by_role("link", name="4.6", exact=True).click()
-    assert page.locator("#fig-4\\.6").is_visible()
+    page.locator("#fig-4\\.6").wait_for()  # the event comes after the click
     assert page.locator(".claim:visible").count() == len(claims["claims"])
     page.close()
 
