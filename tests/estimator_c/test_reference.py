@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,10 +13,19 @@ from numpy.typing import NDArray
 from analogrig.devices.estimator import Estimator, StepStatus
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.rigs.description import open_rig
+from analogrig.run import INPUT, OUTPUT, missing_samples
+from analogrig.testing.properties.described import ROUNDING, STATISTIC_ROUNDING, THETA_ROUNDING
+from analogrig.testing.properties.test_described import DRAWN, TELLING
+from analogrig.testing.reference.cases import SpoiledRig
+from analogrig.testing.reference.comparison import Expected, expected_of
+from analogrig.testing.reference.drawn import drawn
 from analogrig.testing.reference.estimator import ReferenceEstimator
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 900
+FEW_DRAWN = (*DRAWN[:40], *TELLING)
+"""Drawn cases; the shipped properties try them all."""
 FIXED: dict[str, Any] = {"refresh_n": 0, "warm_up_n": 0}
 LOCKED: dict[str, Any] = FIXED | {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked", "forgetting": 1.0}
 
@@ -89,6 +99,32 @@ def test_estimator_and_reference_agree(case: str, drift: float, missing: list[in
     assert np.abs((steps.theta - reference.theta) / scale)[settled].max() < 0.015
     assert np.sqrt(np.mean((steps.innovation - reference.innovation)[settled] ** 2)) < 0.15
     assert (estimator.counters["slips"], estimator.counters["refreshes"]) == (reference.slips, reference.refreshes)
+
+
+@functools.cache
+def drawn_samples(number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_], Expected]:
+    """Codes of a drawn case, valid samples, and the answers of the reference."""
+    case = drawn(number)
+    with open_rig("emulator") as rig:
+        blocks = list((SpoiledRig(rig, case.spoil) if case.spoil else rig).perform(case.scenario, 1).blocks)
+    codes = np.concatenate([block.codes for block in blocks])
+    valid = ~missing_samples(np.concatenate([block.clipped for block in blocks]))
+    u, y = (np.ascontiguousarray(codes[:, channel]) for channel in (INPUT, OUTPUT))
+    return u, y, valid, expected_of(EstimatorConfig(**case.settings), u, y, valid)
+
+
+@pytest.mark.parametrize("number", FEW_DRAWN)
+def test_estimator_and_reference_agree_in_drawn_cases(number: int) -> None:
+    u, y, valid, expected = drawn_samples(number)
+    steps = Estimator(EstimatorConfig(**drawn(number).settings)).run(u, y, valid)
+    sure = slice(0, expected.sure_n)
+    assert [k for k in steps.alarms if k < expected.sure_n] == [k for k in expected.alarms if k < expected.sure_n]
+    for found, wanted, allowed in (
+        (steps.theta, expected.theta, THETA_ROUNDING * expected.theta_deviation),
+        (steps.innovation, expected.innovation, ROUNDING * expected.deviation),
+        (steps.statistic, expected.statistic, STATISTIC_ROUNDING * (1.0 + expected.statistic)),
+    ):
+        assert (np.abs(found - wanted) <= allowed + 1e-6 * (1.0 + np.abs(wanted)))[sure].all()
 
 
 def test_cases_show_what_they_are_for() -> None:

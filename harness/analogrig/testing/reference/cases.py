@@ -75,6 +75,15 @@ SUCCESSION = dataclasses.replace(
     _scenario("small changes in close succession", dataclasses.replace(_FREE, phase=0.133), 800),
     tweaks=tuple(PotChange(200 + 100 * n, {"K": 24_500.0 if n % 2 else 23_700.0}) for n in range(6)),
 )
+SUCCESSIONS = dataclasses.replace(
+    SUCCESSION,
+    samples=6300,
+    tweaks=tuple(
+        PotChange(at, {"K": 24_500.0 if n % 2 else 23_700.0})
+        for n, at in enumerate((200, 300, 400, 500, 5940, 6040, 6140))
+    ),
+    name="small changes in close succession, twice",
+)
 HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
 FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
@@ -152,6 +161,15 @@ def _jump_after_gap(samples: int) -> Spoil:
     def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
         missing[300:312] = True
         codes[312 + samples :, Y] += 90
+
+    return spoil
+
+
+def _gap_from(first: int) -> Spoil:
+    """A dozen samples, too many for a prediction."""
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+        missing[first : first + 12] = True
 
     return spoil
 
@@ -280,6 +298,11 @@ CASES: Mapping[str, ReferenceCase] = {
     "missing while in doubt": ReferenceCase(
         EARLY, {**_FIXED, "noise_variance": 0.7, "ceiling": 1e4, "warm_up_n": 0}, leave_out_near_edges
     ),
+    **{
+        f"gap {n} samples after {kind} edge": ReferenceCase(scenario, _RESTLESS, _gap_from(edge + n))
+        for kind, scenario, edge in (("a late", LATE, 251), ("an early", EARLY, 200))
+        for n in (2, 5)
+    },
     "strong prior": ReferenceCase(
         SOFTER,
         {
@@ -362,6 +385,10 @@ CASES: Mapping[str, ReferenceCase] = {
     "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
     "more alarms than may be justified": ReferenceCase(
         SUCCESSION, {"warm_up_n": 100, "noise_estimated": False, "noise_variance": 6.0, "arl0": 1e3}
+    ),
+    "alarms may be justified again": ReferenceCase(
+        SUCCESSIONS,
+        {**_FIXED, "warm_up_n": 100, "noise_estimated": False, "noise_variance": 6.0, "arl0": 1e3, "isolation": False},
     ),
     "no isolation": ReferenceCase(SOFTER, {"isolation": False, "warm_up_n": 40, "idle_n": 1}, exchange="block"),
     "low ceiling": ReferenceCase(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -24,6 +25,12 @@ USUAL_HZ, ODD_HZ = (40.0, 100.0, 200.0, 250.0, 400.0), (90.0, 310.0)
 
 DISTURBED, DISTURBED_WARM_UP_N = 0.4, (180, 450)
 """Part of the cases with a lasting disturbance, and their warm-up, which it takes to estimate a correlation."""
+
+ZERO_CODE = 400.0
+"""Code of either channel, near enough, where no force acts."""
+
+OTHER_PLANTS = 1000
+"""First number of the cases with a plant that no pots show."""
 
 SHAPES = ("square", "square", "square", "square", "prbs", "pulse", "sine")
 
@@ -59,8 +66,10 @@ class Draw:
 
 @functools.lru_cache(maxsize=1024)
 def drawn(number: int) -> ReferenceCase:
-    """Case with this number. Every sixth is long."""
+    """Case with this number: below OTHER_PLANTS of every kind, every sixth long; then of a plant that changes once."""
     draw = Draw(number)
+    if number >= OTHER_PLANTS:
+        return _diagnosed(draw, number)
     is_long = number % 6 == 5
     samples = draw.whole(1500, MOST_SAMPLES) if is_long else draw.whole(430, 700)
     first = draw.whole(300, samples - 100)
@@ -85,6 +94,24 @@ def drawn(number: int) -> ReferenceCase:
         samples=samples, excitation=excitation, set=plant, tweaks=_ordered(tweaks), name=f"drawn {number}"
     )
     return ReferenceCase(scenario, settings, _all_of(spoils) if spoils else None)
+
+
+def _diagnosed(draw: Draw, number: int) -> ReferenceCase:
+    """Plant that no pots show, with one change or fault, or two, under settings with a diagnosis."""
+    instants = [draw.whole(380, 430)]
+    if draw.chance(0.3):
+        instants.append(instants[0] + draw.whole(20, 180))
+    samples = instants[-1] + draw.whole(40, 130)
+    excitation = dataclasses.replace(_excitation(draw), shape="square", duty=0.5, high_v=draw.real(0.4, 3.2))
+    settings = {"warm_up_n": 150, "refresh_n": draw.one(0, 40), "forgetting": draw.one(0.98, 0.99, 0.995)}
+    settings |= draw.one({}, {}, {"nb": 2, "nk": 1, "edge_instants": "locked"})
+    is_changed = [draw.chance(0.7) for _ in instants]
+    spoils = [_other_plant(draw, samples, [at for at, changed in zip(instants, is_changed, strict=True) if changed])]
+    spoils += [_fault(draw, at, samples) for at, changed in zip(instants, is_changed, strict=True) if not changed]
+    if draw.chance(0.1):
+        spoils.append(_gaps(draw, instants[0]))
+    scenario = Scenario(samples=samples, excitation=excitation, name=f"drawn {number}")
+    return ReferenceCase(scenario, settings, _all_of(spoils))
 
 
 def _plant(draw: Draw) -> dict[str, float]:
@@ -165,6 +192,39 @@ def _settings(draw: Draw) -> dict[str, Any]:
     return out
 
 
+def _other_plant(draw: Draw, samples: int, changes: Sequence[int]) -> Spoil:
+    """Displacement of a plant with poles anywhere, up to a period of two samples, whose parameters change.
+
+    With M = 1 and the sample as unit of time, x'' = -B x' - K x + K0 (u - u0), u held from sample to sample.
+    """
+    if draw.chance(0.5):  # complex poles
+        decay, angle = draw.real(0.1, 1.2), draw.real(0.3, 2.9)
+        damping, stiffness = 2.0 * decay, decay**2 + angle**2
+    else:
+        fast, slow = draw.size(0.8, 8.0), draw.size(0.3, 2.0)
+        damping, stiffness = fast + slow, fast * slow
+    gain, noise = draw.size(0.3, 1.2), draw.normal(draw.size(0.3, 2.0), samples)
+    changed = [draw.one((0,), (1,), (2,), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2)) for _ in changes]
+    factors = [{name: draw.size(1.04, 2.5) ** draw.one(-1, 1) for name in each} for each in changed]
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+        from scipy.linalg import expm
+
+        plant = [1.0, damping, stiffness]
+        force = gain * stiffness * (codes[:, U].astype(np.float64) - ZERO_CODE)
+        out, state = np.empty(samples), np.zeros(3)
+        for first, end, change in zip((0, *changes), (*changes, samples), ({}, *factors), strict=True):
+            for parameter, factor in change.items():
+                plant[parameter] *= factor
+            step = expm([[0.0, 1.0, 0.0], [-plant[2] / plant[0], -plant[1] / plant[0], 1.0 / plant[0]], [0.0] * 3])
+            for k in range(first, end):
+                out[k], state[2] = state[0], force[k]
+                state = step @ state
+        codes[:, Y] = np.clip(np.round(ZERO_CODE + out + noise), 0.0, 4095.0)
+
+    return spoil
+
+
 def _fault(draw: Draw, at: int, end: int) -> Spoil:
     """Fault of a channel in the samples from ``at`` to ``end``."""
     channel, kind = draw.one(U, Y), draw.one("offset", "gain", "delay", "stuck", "noise")
@@ -177,7 +237,7 @@ def _fault(draw: Draw, at: int, end: int) -> Spoil:
         now, before = true[1:], true[:-1]
         wrong = {
             "offset": now + offset,
-            "gain": 400.0 + (1.0 + part) * (now - 400.0),
+            "gain": ZERO_CODE + (1.0 + part) * (now - ZERO_CODE),
             "delay": before,
             "stuck": np.full(len(now), now[0]),
             "noise": now + noise[: len(now)],
@@ -231,7 +291,7 @@ def _disturbance(draw: Draw, samples: int) -> Spoil:
 
     def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
         true = codes[:, Y].astype(np.float64)
-        bent = bend * (true - 400.0) ** 2 if kind == "bent" else 0.0
+        bent = bend * (true - ZERO_CODE) ** 2 if kind == "bent" else 0.0
         codes[:, Y] = np.clip(np.round(true + added + bent), 0.0, 4095.0)
 
     return spoil
