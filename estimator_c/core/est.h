@@ -394,7 +394,7 @@ typedef struct {
 #if EST_WITH_ROBUSTNESS
     float along;   ///< sum of innovation times the effect of a displaced edge, since the edge
     float span;    ///< sum of that effect squared
-    float energy;  ///< sum of the squared innovations, and of those before the edge
+    float energy;  ///< sum of the squared residuals, and a multiple of the last one before the edge
     float misfit;  ///< evidence that each edge is displaced otherwise
 #endif
 } est_edges_t;
@@ -521,8 +521,9 @@ float est_variance(const est_t* self, uint8_t index);
 /// Noise variance [codes^2], configured or estimated. Cost: constant. May be called from an interrupt.
 float est_noise_variance(const est_t* self);
 
-/// Variance that the trigger expects of the noise [codes^2]: the noise variance times the inflation, and more if the
-/// noise variance varies. Cost: constant. May be called from an interrupt.
+/// Scale of the innovations [codes^2]: the noise variance times the inflation, and more if the noise variance varies.
+/// While the noise variance is young, the trigger expects up to three times as much; in the end 6 % more. Cost:
+/// constant. May be called from an interrupt.
 float est_scale(const est_t* self);
 
 /// One coefficient of the prefilter C; zero beyond the order of A. index is in [0, EST_NA_MAX), asserted. Cost:

@@ -20,7 +20,7 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 
 #if EST_WITH_ROBUSTNESS
 
-/// Number of equations before an edge whose innovations count as much as those in the doubt after it.
+/// Weight of the squared residual before an edge, beside those in the doubt after it.
 #define EST_DOUBT_BEFORE_N (2.0F * (float)EST_DOUBT_N)
 
 /// Part of the energy that a displacement must explain, of more than which the excess is evidence, and the evidence
@@ -28,7 +28,7 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 #define EST_DISPLACED 0.5F
 #define EST_DISPLACED_SUM 1.5F
 
-/// Begin to compare the innovations after an edge with the effect of a displacement. `before`: innovation before it.
+/// Begin to compare the innovations after an edge with the effect of a displacement. `before`: residual before it.
 static inline void est_edges_begin_comparison(est_edges_t* const self, const float before) {
     self->along  = 0.0F;
     self->span   = 0.0F;

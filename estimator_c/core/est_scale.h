@@ -9,8 +9,8 @@
 
 #include "est_trigger.h"
 
-/// Equations between two updates of the scale. A change that raises an alarm within its block leaves the scale as it
-/// was before the change.
+/// Equations of a block. The four stages of the update take one equation each, so that a block comes every 36. A change
+/// that raises an alarm within its block leaves the scale as it was before the change.
 #define EST_BLOCK_N 32U
 
 /// Phases of the scale. During a block it is the number of equations. Then come the stages of the update, one a step,
@@ -22,7 +22,7 @@
 #define EST_PHASE_END (EST_BLOCK_N + 3U)
 #define EST_PHASE_TRIAL EST_PHASE_END
 
-/// Smallest share of a new block in the noise variance: a memory of 1,000 equations. Before the trigger is armed the
+/// Smallest share of a new block in the noise variance: a memory of 1,100 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
 #define EST_SHARE_MIN 0.032F
 #define EST_SHARE_WARM 0.25F
@@ -51,13 +51,14 @@
 /// all bounds; later it raises an alarm.
 #define EST_GROWTH_MAX 9.0F
 
-/// Inflation: factor per unjustified alarm, factor per block on the way back to 1 (a factor of 4 in 400,000 equations),
+/// Inflation: factor per unjustified alarm, factor per block on the way back to 1 (a factor of 4 in 470,000 equations),
 /// and largest value.
 #define EST_INFLATION_STEP 4.0F
 #define EST_INFLATION_DECAY 0.9998933F
 #define EST_INFLATION_MAX 1.0e6F
 
-/// After an alarm, the old estimate is compared with the new one from equation EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N,
+/// After an alarm, whose equation counts as the first, the old estimate is compared with the new one from equation
+/// EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N,
 /// and further until an edge of u came, but no further than EST_TRIAL_MAX_N. A trial that ends at an alarm needs
 /// EST_TRIAL_LEAST_N equations.
 #define EST_TRIAL_BEGIN_N 16U
@@ -68,10 +69,10 @@
 /// An alarm is justified if the squared errors of the old estimate exceed those of the new one by this factor.
 #define EST_JUSTIFIED 4.0F
 
-/// A justified alarm is plain if the squared errors of the old estimate exceed 64 expected variances on average.
+/// A justified alarm is plain if its sum exceeds 64 expected variances per equation.
 #define EST_PLAIN (64.0F * ((float)EST_TRIAL_N - (float)EST_TRIAL_BEGIN_N) * EST_CUSUM_GAIN)
 
-/// Blocks that justify an alarm which is not plain, and largest number of them: one alarm per 5,000 equations, at most
+/// Blocks that justify an alarm which is not plain, and largest number of them: one alarm per 5,700 equations, at most
 /// four in close succession. A plant whose equations fit it only for a while justifies every alarm, but its squared
 /// errors stay comparable to the scale.
 #define EST_CREDIT_N 157U

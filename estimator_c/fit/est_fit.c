@@ -266,7 +266,7 @@ EST_SHARED float count_of(const est_fit_watch_t* const self) {
     return number(EST_FIT_BLOCK_N) - (float)self->sums.lost_n;
 }
 
-EST_SHARED float variance_of(const est_fit_watch_t* const self) { return self->sums.squares / count_of(self); }
+EST_SHARED float variance_of(const est_fit_watch_t* const self) { return quotient(self->sums.squares, count_of(self)); }
 
 /// This variance, or that of the resolution if that is more.
 EST_SHARED float resolved(const est_fit_watch_t* const self, const float variance) {
@@ -544,7 +544,7 @@ static void evaluate_region(est_fit_watch_t* const self, const uint32_t region) 
     self->energies_n[region] = 0U;
     const uint8_t n          = self->regions_n[region];
     const float   mean       = ((n >= REGION_MIN) && is_enough(self)) ? (self->regions[region] / (float)n) : 0.0F;
-    self->sums.explained += (self->regions[region] * mean) - (self->sums.drawn / (float)self->sums.drawn_n);
+    self->sums.explained += (self->regions[region] * mean) - quotient(self->sums.drawn, (float)self->sums.drawn_n);
     self->sums.repeated += self->regions[region] * self->means[region];
     self->means[region]     = mean;
     self->regions[region]   = 0.0F;

@@ -35,7 +35,7 @@ from analogrig.cli import main
 from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.judging.bursts import BURST
+from analogrig.judging.bursts import BURST, upper_count
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import PotChange, Scenario
 from tests.harness.simulated_alarms import COVERED, SimulatedPlays, certificates, in_bursts
@@ -120,6 +120,7 @@ def test_certificate_says_what_it_assumed_and_which_bursts_it_saw() -> None:
     question = asked(far=1e-5, confidence=0.9)
     quiet = certify(question, SimulatedPlays(question, COVERED["independent"], 1e-7, 0))
     assert quiet.basis.startswith("bursts of 5 alarms on average, assumed (")
+    assert quiet.rate[1] == pytest.approx(upper_count(quiet.alarms, 0.9, 5.0) / quiet.samples, rel=1e-3)
     bursty = certify(question, SimulatedPlays(question, in_bursts(lambda _, n: np.full(n, 40), 40.0), 1e-4, 0))
     assert "alarms on average, observed (" in bursty.basis
     assert bursty.rate[0] < 1e-4 < bursty.rate[1]
@@ -234,9 +235,9 @@ def test_samples_that_are_missing_make_a_run_within_this_process_as_invalid_as_e
 def test_length_that_nobody_would_live_to_see_is_refused(
     dut: str, far: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """At 99.9 %, with at most 10 alarms in bursts of 5, 65.64 / far samples."""
+    """At 99.9 %, with at most 50 alarms in bursts of 5, 140.87 / far samples."""
     assert main(["certify", "--dut", dut, "--far", far]) == 2
-    assert f"far = {float(far):g} takes {65.64 / float(far):.2g} samples, and in a year" in capsys.readouterr().err
+    assert f"far = {float(far):g} takes {140.87 / float(far):.2g} samples, and in a year" in capsys.readouterr().err
 
 
 def test_command_tells_outcome_by_its_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

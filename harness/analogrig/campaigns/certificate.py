@@ -81,7 +81,7 @@ class Question:
     far: float
     confidence: float
     first_seed: int = 0
-    allowed: int = 10
+    allowed: int = 50
     """Most alarms with which a test of fixed length certifies."""
     burst: float = BURST
     """Mean number of alarms of a burst that the bounds cover; 1: alarms are taken as independent."""

@@ -28,7 +28,7 @@ def add(commands: Any) -> None:
         "prove with confidence that a device raises false alarms rarely enough",
         "certify --far 1e-4 --confidence 0.99 --dut inproc",
         "certify --sequential --dut inproc",
-        "certify --rare --far 1e-7 --dut inproc",
+        "certify --rare --far 5e-6 --dut inproc",
     )
     command.add_argument(
         "--far", type=float, default=1e-5, metavar="RATE", help="false-alarm rate per sample (default: %(default)g)"
@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--allowed",
         type=int,
-        default=10,
+        default=50,
         metavar="N",
         help="most alarms with which a test of fixed length passes (default: %(default)d)",
     )
