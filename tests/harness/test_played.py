@@ -72,3 +72,17 @@ def test_rate_leaves_out_the_plays_with_a_misfit_if_asked_and_names_their_causes
     assert finding.why.endswith(f"misfit in 1 of 2 plays: hum at 50 Hz in samples 250-999: {CURES['hum']}")
     assert rate_below(0.003, [poor], confidence=0.9, burst=1.0, or_misfit=True)
     assert not rate_below(1e-6, [quiet, poor], confidence=0.9, or_misfit=True)
+
+
+def test_statement_that_fails_on_a_plant_that_the_model_does_not_fit_says_what_to_do() -> None:
+    watching, misfits = {**ESTIMATOR, "misfit": True}, [(250, Cause.NONLINEAR, 0.0, 3.0)]
+    poor = Played(made_run(np.zeros(1000), [(0, FRONT)], alarms=[600], misfits=misfits, estimator=watching))
+    assert poor.stays_quiet().why.startswith("1 false alarm in 1000 samples: 600; the model does not fit (nonlinear)")
+    assert poor.stays_quiet().why.endswith(f"changes missed; {CURES['nonlinear']}")
+    quiet = Played(made_run(np.zeros(1000), [(0, FRONT)], misfits=misfits, estimator=watching))
+    assert "nonlinear" not in quiet.stays_quiet().why
+
+
+def test_rate_above_the_limit_asks_for_no_longer_run() -> None:
+    noisy = Played(made_run(np.linspace(0.0, 2900.0, 1000), [(0, FRONT)], alarms=[200, 400, 600]))
+    assert rate_below(1e-3, [noisy], confidence=0.9).why.endswith("; 0.001 was asked, which is less than observed")

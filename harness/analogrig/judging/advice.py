@@ -45,7 +45,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         return ()
     return (
         *_statement(run),
-        *_misfits(verdict),
+        *misfits(verdict),
         *_orders(run, verdict),
         *_unjudged_quantities(run, verdict),
         *_theta_without_a_model(run),
@@ -64,7 +64,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     )
 
 
-def _misfits(verdict: Verdict) -> Iterator[str]:
+def misfits(verdict: Verdict) -> Iterator[str]:
     """One sentence for each cure of a misfit."""
     for cure, periods in itertools.groupby(sorted(verdict.fit or (), key=_cure_and_cause), _cure):
         causes = ", ".join(dict.fromkeys(period.cause for period in periods))

@@ -76,9 +76,9 @@ CURES: Mapping[str, str] = {
     "drift": "remove the mean of the output by a high-pass filter, or make the run shorter",
     "hum": "shield the sensor and its cable, or sample synchronously with the mains",
     "edges": 'set edge_instants = "anywhere", or take the excitation from the clock of the card if it has its own',
-    "nonlinear": "reduce the amplitude of the excitation, or raise the orders na and nb",
+    "nonlinear": "reduce the amplitude of the excitation",
     "noise": "shield or filter the output, and use a sampling clock without jitter; without noise_estimated, set"
-    " noise_variance as measured at rest; or raise the orders na and nb",
+    " noise_variance as measured at rest",
     "slow plant": "lower the sample rate, or use a converter with more bits",
     "excitation": "raise the amplitude of the excitation",
 }
@@ -93,10 +93,7 @@ FAULT_CURES: Mapping[str, str] = {
 }
 """Measure against each fault of a channel."""
 
-NONLINEAR_CURE = (
-    "the program is not linear, the device's model is: reduce the amplitude of the excitation, or raise the orders na"
-    " and nb"
-)
+NONLINEAR_CURE = "the program is not linear, the device's model is: reduce the amplitude of the excitation"
 """Measure against a cause or a fault that a plant beyond the device's linear model explains."""
 
 _UNEXPLAINED_CAUSES = frozenset({"slow plant", "excitation"})

@@ -17,6 +17,7 @@ from typing import Concatenate
 import numpy as np
 from numpy.typing import ArrayLike
 
+from analogrig.judging.advice import misfits
 from analogrig.judging.bursts import BURST, Design, bound_rate
 from analogrig.judging.exposure import exposure
 from analogrig.judging.response import step_responses
@@ -40,6 +41,8 @@ def _statement(
                 raise ValueError(f"{judge.__name__}: a limit must be a finite number, not {limit}")
         if played.verdict.valid:
             finding = judge(played, *args, **kwargs)
+            if not finding:
+                finding = dataclasses.replace(finding, why="; ".join([finding.why, *misfits(played.verdict)]))
         else:
             finding = Finding(holds=False, why=f"{played.verdict.outcome.upper()}: {played.verdict.reasons[0]}")
         statement = statement_of(judge_and_note, played, *args, **kwargs)
@@ -266,8 +269,12 @@ def _rate_below(rate: float, plays: Sequence[Played], confidence: float, burst: 
         return Finding(holds=False, why=f"no alarm could be raised in any of {number_of(len(plays), 'play')}: {why}")
     bounds = bound_rate(alarms, armed, confidence, burst)
     why = f"{number_of(sum(alarms), 'false alarm')} in {number_of(sum(armed), 'sample')}"
-    why += f": the rate is below {bounds.high:.3g} per sample with {confidence:.4%} confidence, for {bounds.basis}"
-    if bounds.high > rate:
+    why += (
+        f": the rate is below {bounds.high:.3g} per sample with {100.0 * confidence:g}% confidence, for {bounds.basis}"
+    )
+    if sum(alarms) > rate * sum(armed):
+        why += f"; {rate:g} was asked, which is less than observed"
+    elif bounds.high > rate:
         needed = Design(rate, confidence, sum(alarms), bounds.burst).trials
         why += f"; to show {rate:g} with so many alarms takes {number_of(needed, 'sample')}"
     return Finding(bounds.high <= rate, why)
