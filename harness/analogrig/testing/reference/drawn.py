@@ -66,7 +66,7 @@ class Draw:
 
 @functools.lru_cache(maxsize=1024)
 def drawn(number: int) -> ReferenceCase:
-    """Case with this number: below OTHER_PLANTS of every kind, every sixth long; then of a plant that changes once."""
+    """Case with this number: below OTHER_PLANTS of every kind, every sixth long; then of a plant that no pots show."""
     draw = Draw(number)
     if number >= OTHER_PLANTS:
         return _diagnosed(draw, number)
