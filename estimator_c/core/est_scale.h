@@ -58,9 +58,8 @@
 #define EST_INFLATION_MAX 1.0e6F
 
 /// After an alarm, whose equation counts as the first, the old estimate is compared with the new one from equation
-/// EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N,
-/// and further until an edge of u came, but no further than EST_TRIAL_MAX_N. A trial that ends at an alarm needs
-/// EST_TRIAL_LEAST_N equations.
+/// EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N, and further until an edge of u came, but no further than EST_TRIAL_MAX_N. A
+/// trial that ends at an alarm needs EST_TRIAL_LEAST_N equations.
 #define EST_TRIAL_BEGIN_N 16U
 #define EST_TRIAL_LEAST_N 20U
 #define EST_TRIAL_N 56U

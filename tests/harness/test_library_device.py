@@ -617,19 +617,8 @@ def test_campaign_and_certificate_of_a_library(own: Path, tmp_path: Path, capsys
     command = ["campaign", str(plan), "--allow", str(own), "--workers", "2", "--out", str(tmp_path / "campaign")]
     assert main(command) == 1
     assert "campaign plan: 1 cell, 2 trials, 3200 samples: FAILED" in capsys.readouterr().out
-    command = [
-        "certify",
-        "--far",
-        "1e-2",
-        "--confidence",
-        "0.9",
-        "--allowed",
-        "10",
-        "--dut",
-        f"library:{own}",
-        "--workers",
-        "2",
-    ]
+    allowed = ["--far", "1e-2", "--confidence", "0.9", "--allowed", "10"]
+    command = ["certify", *allowed, "--dut", f"library:{own}", "--workers", "2"]
     assert main(command) == 0
     assert "CERTIFIED\n  0 alarms in " in capsys.readouterr().out
 
