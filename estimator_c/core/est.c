@@ -368,6 +368,15 @@ static bool on_bridge(const est_t* const self) {
 #endif
 }
 
+/// The present sample is not predicted.
+EST_INLINE void end_bridge(est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    self->bridged_n = 0U;
+#else
+    (void)self;
+#endif
+}
+
 static void enter_edge(est_t* const self) {
     if (on_bridge(self)) {
         increment(&self->edge_age_n);  // the instant of the edge is unknown
@@ -391,7 +400,7 @@ static void enter_edge(est_t* const self) {
 
 /// True iff the next sample may be predicted: the model is known, and the whitening has nearly settled. y must not be
 /// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
-static bool can_bridge(const est_t* const self) {
+EST_ROBUST_SHARED bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
     return (((uint32_t)self->pending_n | self->trigger.quiet_n | self->same_n) == 0U) &&
            (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
@@ -422,11 +431,9 @@ static est_status_t enter_input(est_t* const self, float u, float* const y) {
     } else {
         // nothing depends on the age of edges
     }
-#if EST_WITH_ROBUSTNESS
-    self->bridged_n = 0U;
-#endif
     increment_long(&self->counters.updated);
     if (self->pending_n > 0U) {
+        end_bridge(self);
         gather(self);
         shift_y(self, *y);
         return EST_GATHERING;  // MISRA D4
@@ -747,15 +754,11 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     }
 }
 
-/// Predict a missing y: replace the one of an equation by that whose innovation is zero. With C close to A the next
-/// equations then lose nothing but the information of the missing sample. A model that is not stable can predict what
-/// no plant does; the equations then begin anew.
-EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
+/// Replace the y of an equation by its prediction, the one whose innovation is zero. With C close to A the next
+/// equations then lose nothing but the information of this sample. A model that is not stable can predict what no plant
+/// does; the equations then begin anew.
+EST_ROBUST_SHARED void predict(est_t* const self, const float innovation) {
     float* const past = self->whitener.past[0].x;
-    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        float share[EST_OTHER_READINGS];
-        est_edges_shares(self, shape, share);
-    }
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         past[i] -= innovation;  // the differences contain y(k) with the factor 1
@@ -764,6 +767,63 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     if (!is_plausible(self->y[0])) {
         forget_samples(self);
     }
+}
+
+/// Predict a missing y.
+EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
+    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
+        float share[EST_OTHER_READINGS];
+        est_edges_shares(self, shape, share);
+    }
+    predict(self, innovation);
+}
+
+/// True iff an innovation whose statistic has passed the ceiling is a lone outlier so far: far beyond those before it,
+/// and no other reading of the edges in doubt explains it. A change of the plant has another one at the next sample.
+/// `term`: of the innovation in the cumulative sum.
+static bool is_lone_outlier(const est_t* const self, const float term) {
+#if EST_WITH_ROBUSTNESS
+    const float before = (self->trigger.statistic - term) + EST_CUSUM_DRIFT;
+    const float most =
+        est_max(before * EST_LONE_RATIO, (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation);
+    const bool explained = (self->doubt_n > 0U) && (est_trigger_best_rival(&self->trigger) <= 0.0F);
+    return (term > most) && (term < FLT_MAX) && !explained && !on_bridge(self) && is_cusum(self->config) &&
+           can_bridge(self);
+#else
+    (void)self;
+    (void)term;
+    return false;
+#endif
+}
+
+/// Set a lone outlier aside: its y is predicted, theta stays, and all sums begin anew. The next sample decides.
+static void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
+#if EST_WITH_ROBUSTNESS
+    predict(self, innovation);
+    self->trigger.statistic = 0.0F;
+    est_trigger_begin_doubt(&self->trigger);
+    self->scale.product = 0.0F;
+    forget_innovations(self);
+    self->bridged_n = 1U;
+    step->status    = EST_OUTLIER;
+    step->statistic = 0.0F;
+#else
+    (void)self;
+    (void)innovation;
+    (void)step;
+#endif
+}
+
+/// Enter the innovation that the present theta leaves into what depends on it.
+EST_INLINE void follow_equation(est_t* const self, const est_shape_t shape, const est_equation_t* const equation) {
+    est_equation_follow(equation, shape, self->theta);
+    if (EST_WITH_ADAPTATION) {
+        if (self->config->random_walk > 0.0F) {
+            walk(self);
+        }
+        store_residual(self, equation->x);
+    }
+    end_bridge(self);
 }
 
 /// Enter an innovation into the statistic. `term`: of the cumulative sum, `weight`: of a squared innovation in it;
@@ -795,7 +855,8 @@ EST_INLINE void enter_innovation(
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     float                     x[EST_THETA_MAX + 2U];  // the last one is spare: gcc warns of an access that never is
-    est_equation_t            equation = { .x = x };
+    float                     gain[EST_THETA_MAX] EST_ZEROED;  // MISRA D2
+    est_equation_t            equation = { .x = x, .gain = gain };
     float                     weight_min;
     if (self->settled) {
         equation.variance = 1.0F;
@@ -814,16 +875,10 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         bridge(self, shape, equation.innovation);
         return;  // MISRA D4
     }
-    const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
-    if (EST_WITH_ADAPTATION) {
-        if (config->random_walk > 0.0F) {
-            walk(self);
-        }
-        store_residual(self, equation.x);
-    }
-    const bool  held   = est_trigger_holds(&self->trigger);
-    const float weight = precision * weight_of(self);
-    const float term   = est_trigger_term(equation.innovation, weight);
+    const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation);
+    const bool  held      = est_trigger_holds(&self->trigger);
+    const float weight    = precision * weight_of(self);
+    const float term      = est_trigger_term(equation.innovation, weight);
     enter_innovation(self, equation.innovation, term, weight, precision, held);
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;
@@ -831,13 +886,22 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         judge_readings(self, shape, &equation, est_trigger_share(held) * weight);
     }
     const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->doubt_n);
-    if (finding == EST_ALARM) {
-        raise_alarm(self, step);
-        return;  // MISRA D4
-    }
-    if (EST_WITH_EDGES && (finding == EST_SLIP)) {
-        note_slip(self);
-        return;  // MISRA D4
+    if (finding == EST_QUIET) {
+        follow_equation(self, shape, &equation);
+    } else {
+        if (is_lone_outlier(self, term)) {
+            set_outlier_aside(self, equation.innovation, step);
+            return;  // MISRA D4
+        }
+        follow_equation(self, shape, &equation);
+        if (finding == EST_ALARM) {
+            raise_alarm(self, step);
+            return;  // MISRA D4
+        }
+        if (EST_WITH_EDGES && (finding == EST_SLIP)) {
+            note_slip(self);
+            return;  // MISRA D4
+        }
     }
     watch_scale(self, shape, &equation, term, precision);
     if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
@@ -896,12 +960,18 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
     EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
-    float              y      = 0.0F;
-    const est_status_t status = examine(self, sample, &y);
-    est_step_t         step   = {
-                  .status = status, .alarm = false, .idle = false, .innovation = 0.0F, .statistic = self->trigger.statistic
-    };
-    if ((status == EST_UPDATED) || ((status != EST_GATHERING) && enter_gap(self, status, &y))) {
+    float              y            = 0.0F;
+    const est_status_t status       = examine(self, sample, &y);
+    bool               has_equation = status == EST_UPDATED;
+    est_step_t         step;
+    step.status = status;
+    step.alarm  = false;
+    if (!has_equation) {
+        step.innovation = 0.0F;
+        step.statistic  = self->trigger.statistic;
+        has_equation    = (status != EST_GATHERING) && enter_gap(self, status, &y);
+    }
+    if (has_equation) {
         dispatch_equation(self, y, &step);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);

@@ -321,6 +321,7 @@ typedef enum {
     EST_MISSING   = 1,  ///< the sample was not valid: theta and its covariance are unchanged. See est_step()
     EST_REFUSED   = 2,  ///< u or y was non-finite, saturated or stuck: counted, otherwise as EST_MISSING
     EST_GATHERING = 3,  ///< the sample was stored, but its equation also needs samples that are still unknown
+    EST_OUTLIER   = 4,  ///< lone outlier: theta is unchanged, y counts as missing. See est_step()
 } est_status_t;
 
 /// Result of one step.
@@ -328,13 +329,13 @@ typedef struct {
     est_status_t status;      ///< treatment of the sample
     bool         alarm;       ///< the plant has changed; estimation restarts with the next sample
     bool         idle;        ///< excitation is lost: the estimate does not improve. Always: edge_codes is too large
-    float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1) [codes]; 0 unless status is EST_UPDATED
+    float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1) [codes]; of EST_UPDATED and EST_OUTLIER, else 0
     float        statistic;   ///< statistic of the trigger after this sample, before an alarm or a gap resets it
 } est_step_t;
 
 /// Counters since est_init(). They saturate instead of wrapping.
 typedef struct {
-    uint32_t updated;    ///< samples with EST_UPDATED or EST_GATHERING
+    uint32_t updated;    ///< samples with EST_UPDATED, EST_GATHERING or EST_OUTLIER
     uint32_t missing;    ///< samples that were not valid
     uint16_t refused;    ///< samples refused for any reason
     uint16_t saturated;  ///< samples refused because u or y was saturated
@@ -497,6 +498,8 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// Bad data never fails and never enters the estimate: see est_status_t. Up to 8 samples in a row that are missing or
 /// refused are predicted, if C is that of the plant and u is the same before and after them; the next good sample then
 /// has its equation. After any other gap the equations begin anew, as after est_init().
+/// With the cumulative sum, an innovation far beyond those before it raises no alarm: it may be an interference. If the
+/// plant has changed, the next one raises it.
 /// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.35 times a
 /// typical one if edges may slip, 1.25 times otherwise.
 /// RAM: the state, and stack: on a Cortex-M 140 to 240 bytes, at -O0 2,510; on an AVR 380, at -O0 1,670 (make

@@ -12,7 +12,9 @@
 
 typedef struct {
     float* x;           ///< y(k), followed by the regressor phi in the order of theta
+    float* gain;        ///< P phi, unscaled
     float  innovation;  ///< prediction error of y(k) [codes]
+    float  step;        ///< factor of the gain in the update of theta
     float  variance;    ///< variance of the equation's noise [noise variances]
 } est_equation_t;
 
@@ -68,18 +70,17 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
     equation->innovation = est_equation_residual(x, theta, count);
 }
 
-/// Update theta and the covariance with one measurement: Bierman, "Factorization Methods for Discrete Sequential
-/// Estimation" (1977), section V.3. The forgetting factor of thesis Equ 3.21 divides the weight of P, and with it
-/// every d at once. Return the reciprocal of the innovation's variance [1 / noise variance].
-EST_INLINE float est_equation_measure(est_factors_t* const        self,
-                                      const float                 forgetting,
-                                      const est_shape_t           shape,
-                                      const est_equation_t* const equation,
-                                      float* const                theta) {
-    const uint_fast8_t count  = est_shape_count(shape);
-    const float* const phi    = &equation->x[1];
-    const float        weight = forgetting * self->weight;
-    float              gain[EST_THETA_MAX] EST_ZEROED;  // P phi, unscaled; MISRA D2
+/// Update the covariance with one measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation"
+/// (1977), section V.3. The forgetting factor of thesis Equ 3.21 divides the weight of P, and with it every d at once.
+/// Return the reciprocal of the innovation's variance [1 / noise variance].
+EST_INLINE float est_equation_measure(est_factors_t* const  self,
+                                      const float           forgetting,
+                                      const est_shape_t     shape,
+                                      est_equation_t* const equation) {
+    const uint_fast8_t count   = est_shape_count(shape);
+    const float* const phi     = &equation->x[1];
+    float* const       gain    = equation->gain;
+    const float        weight  = forgetting * self->weight;
     float              alpha   = weight * equation->variance;
     float              inverse = 0.0F;  // 1 / alpha of the column before
     float*             column  = self->upper;
@@ -104,13 +105,18 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
         }
         gain[j] = v;
     }
-    const float scale = equation->innovation * inverse;
+    equation->step = equation->innovation * inverse;
+    self->weight   = weight;
+    return weight * inverse;
+}
+
+/// Update theta with a measurement that the covariance contains.
+EST_INLINE void est_equation_follow(const est_equation_t* const equation, const est_shape_t shape, float* const theta) {
+    const uint_fast8_t count = est_shape_count(shape);
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < count; i++) {
-        theta[i] += gain[i] * scale;
+        theta[i] += equation->gain[i] * equation->step;
     }
-    self->weight = weight;
-    return weight * inverse;
 }
 
 #endif  // EST_EQUATION_H_INCLUDED

@@ -26,6 +26,7 @@ typedef enum {
     EST_QUIET = 0,
     EST_ALARM = 1,
     EST_SLIP  = 2,  ///< the edges of u have moved by one sample; the plant has not changed
+    EST_DOUBT = 3,  ///< the statistic has passed the ceiling, but another reading of the edges has not
 } est_finding_t;
 
 /// Prepare for the first innovation. The statistic is held at zero for the next quiet_n innovations.
@@ -83,6 +84,11 @@ static inline bool est_trigger_settle_late(est_trigger_t* const self) {
 #define EST_CUSUM_DRIFT 1.1305F
 #define EST_CUSUM_GAIN (EST_TERM_GAIN / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE))
 
+/// Smallest term of a lone outlier, in ceilings, without the inflation of the scale; and its smallest ratio to the sum
+/// before it and one drift.
+#define EST_LONE_LEAST 6.0F
+#define EST_LONE_RATIO 30.0F
+
 /// Scale of the innovation before it is squared; a power of two, so that nothing is rounded. The scaled square
 /// overflows from 1.1e15 on, which no plant with codes below EST_CODE_LIMIT reaches: theta then has overflowed, or is
 /// about to.
@@ -119,7 +125,7 @@ EST_INLINE est_finding_t est_trigger_find(const est_trigger_t* const self,
         return EST_QUIET;  // MISRA D4
     }
     if (EST_WITH_EDGES && (doubt_n > 0U) && (est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
-        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_QUIET;  // MISRA D4
+        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_DOUBT;  // MISRA D4
     }
     return EST_ALARM;
 }

@@ -585,7 +585,7 @@ static void close_sum(est_fit_watch_t* const self, const est_t* const estimator)
 
 /// True iff the innovation counts.
 static bool is_used(const est_fit_watch_t* const self, const est_step_t step) {
-    return (step.status == EST_UPDATED) && (self->excluded_n == 0U);
+    return ((step.status == EST_UPDATED) || (step.status == EST_OUTLIER)) && (self->excluded_n == 0U);
 }
 
 /// Draw the innovation of this sample, count the energy of the last ones, and find the region of the next ones.
@@ -596,7 +596,7 @@ work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const
     }
     // an edge of a generator that drifts leaves a response to it
     count_energy(self, estimator->settled && (estimator->doubt_n == 0U));
-    if ((step.status == EST_UPDATED) || (step.status == EST_GATHERING)) {
+    if ((step.status != EST_MISSING) && (step.status != EST_REFUSED)) {
         find_region(self, estimator);
     }
 }

@@ -786,7 +786,7 @@ static void take_theta(est_isolation_t* const self, const est_t* const estimator
 }
 
 static void enter_quiet(est_isolation_t* const self, const est_t* const estimator, const est_step_t step) {
-    if (step.status != EST_UPDATED) {
+    if (step.status == EST_GATHERING) {
         self->since_n = (self->known_n > 1U) ? 0U : self->since_n;  // without a gap: theta has jumped
         self->known_n = 0U;
         self->quiet   = false;

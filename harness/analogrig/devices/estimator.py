@@ -25,6 +25,7 @@ class StepStatus(enum.IntEnum):
     MISSING = 1
     REFUSED = 2
     GATHERING = 3
+    OUTLIER = 4
 
 
 _FLAGS = bytes((0, SteppedFlag.MISSING, SteppedFlag.REFUSED, SteppedFlag.GATHERING)).ljust(256, b"\0")

@@ -213,6 +213,33 @@ def hum(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
     codes[:, Y] = np.round(codes[:, Y] + disturbance)
 
 
+def strike(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """Single samples far beyond their neighbours: at every phase of an edge, and beside gaps."""
+    edges = edges_of(codes).tolist()
+    struck = {
+        edges[4] + 30: 40,
+        edges[5] - 1: -60,
+        edges[5]: 50,
+        edges[6]: -500,
+        edges[7] + 1: 300,
+        edges[8] + 11: -45,
+        edges[9] + 12: 45,
+        edges[10] + 20: 90,
+        edges[11] + 25: 22,
+        edges[11] + 40: -16,
+    }
+    for at, deviation in struck.items():
+        codes[at, Y] = min(max(int(codes[at, Y]) + deviation, 0), 4095)
+    missing[edges[10] + 19] = True
+    missing[[edges[8] + 12, edges[8] + 13]] = True
+
+
+def strike_twice(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """Two successive samples far beyond their neighbours, after one alone."""
+    codes[300, Y] += 70
+    codes[340:342, Y] += 70
+
+
 FAULT_AT = 420
 """First sample of a faulty channel."""
 
@@ -382,6 +409,12 @@ CASES: Mapping[str, ReferenceCase] = {
         f"fault {n} samples after a gap": ReferenceCase(HEALTHY, {**_FIXED, **_ARMED}, _jump_after_gap(n))
         for n in range(5, 9)
     },
+    "lone outliers": ReferenceCase(SOFTER_LATER, {**_FIXED, **_ARMED}, strike),
+    "lone outliers, one clock": ReferenceCase(SOFTER_LATER, _ONE_CLOCK, strike),
+    "lone outliers, known noise": ReferenceCase(
+        SOFTER_LATER, {**_FIXED, **_ARMED, "noise_estimated": False, "refresh_n": 40}, strike
+    ),
+    "two outliers": ReferenceCase(SOFTER, {**_FIXED, **_ARMED}, strike_twice),
     "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
     "more alarms than may be justified": ReferenceCase(
         SUCCESSION, {"warm_up_n": 100, "noise_estimated": False, "noise_variance": 6.0, "arl0": 1e3}

@@ -32,6 +32,9 @@ ZERO_CODE = 400.0
 OTHER_PLANTS = 1000
 """First number of the cases with a plant that no pots show."""
 
+OUTLIERS = 10_000
+"""First number of the cases with lone outliers: those of the number less this one."""
+
 SHAPES = ("square", "square", "square", "square", "prbs", "pulse", "sine")
 
 
@@ -66,8 +69,13 @@ class Draw:
 
 @functools.lru_cache(maxsize=1024)
 def drawn(number: int) -> ReferenceCase:
-    """Case with this number: below OTHER_PLANTS of every kind, every sixth long; then of a plant that no pots show."""
+    """Case with this number: below OTHER_PLANTS of every kind, every sixth long; then of a plant that no pots show.
+
+    From OUTLIERS on those cases anew, with lone outliers.
+    """
     draw = Draw(number)
+    if number >= OUTLIERS:
+        return _struck(draw, drawn(number - OUTLIERS))
     if number >= OTHER_PLANTS:
         return _diagnosed(draw, number)
     is_long = number % 6 == 5
@@ -94,6 +102,25 @@ def drawn(number: int) -> ReferenceCase:
         samples=samples, excitation=excitation, set=plant, tweaks=_ordered(tweaks), name=f"drawn {number}"
     )
     return ReferenceCase(scenario, settings, _all_of(spoils) if spoils else None)
+
+
+def _struck(draw: Draw, case: ReferenceCase) -> ReferenceCase:
+    """The case with single samples of the displacement far beyond their neighbours."""
+    scenario = dataclasses.replace(case.scenario, name=f"{case.scenario.name}, outliers")
+    instants = draw.wholes(draw.whole(3, 12), case.scenario.samples)
+    deviations = [round(draw.size(10.0, 600.0)) * draw.one(-1, 1) for _ in instants]
+    near_edges = [(draw.whole(0, 30), draw.whole(-2, 13)) for _ in range(5)]
+
+    def spoil(codes: Codes, missing: NDArray[np.bool_]) -> None:
+        if case.spoil is not None:
+            case.spoil(codes, missing)
+        edges = edges_of(codes).tolist()
+        beside = [edges[at] + after for at, after in near_edges if at < len(edges)]
+        for at, deviation in zip([*instants, *beside], deviations + deviations[::-1], strict=False):
+            k = min(max(at, 0), len(codes) - 1)
+            codes[k, Y] = min(max(int(codes[k, Y]) + deviation, 0), 4095)
+
+    return dataclasses.replace(case, scenario=scenario, spoil=spoil)
 
 
 def _diagnosed(draw: Draw, number: int) -> ReferenceCase:

@@ -158,7 +158,7 @@ class ReferenceEstimator:
         self.displacement = Displacement()
         self.misfit = 0.0  # evidence that each edge is displaced otherwise
         self.edges_vary = False
-        self.bridged_n = 0  # samples before this one that were predicted
+        self.bridged_n = 0  # samples before the next one whose y was predicted
         self.slipped: Vector | None = None  # delta after a slip, valid from the next sample on
         self._is_doubtful = False
         self._forms: tuple[tuple[float, float], NDArray[np.float64]] | None = None
@@ -239,8 +239,14 @@ class ReferenceEstimator:
         self.counters["updated"] += 1
         self._enter_input(u)
         step = self._gather() if self.pending else self._equation(y)
-        self.y = [y, *self.y][: self.config.na]
+        self._store_output(y - step.innovation if self.bridged_n else y)
         return step
+
+    def _store_output(self, y: float) -> None:
+        """Store an output, or its prediction."""
+        self.y = [y, *self.y][: self.config.na]
+        if self.bridged_n and abs(y) > CODE_LIMIT:
+            self._forget()
 
     def _stepped(
         self, statistic: float, flags: int = 0, innovation: float = 0.0, *, alarm: bool = False
@@ -251,6 +257,7 @@ class ReferenceEstimator:
     def _gather(self) -> ReferenceStep:
         """Store a sample without an equation of its own, and do the work that the last one left."""
         self.pending -= 1
+        self.bridged_n = 0
         self.delta, self.slipped = self.slipped or self.delta, None
         if self.refresh is Refresh.TAKES:
             self._take_c()
@@ -296,8 +303,7 @@ class ReferenceEstimator:
             self.doubt.age_n += 1
             if self.doubt.age_n > DOUBT_N:
                 self.doubt = None
-        bridged_n, self.bridged_n = self.bridged_n, 0
-        if edge and bridged_n:  # the instant of the edge is unknown
+        if edge and self.bridged_n:  # the instant of the edge is unknown
             self.since_n += 1
             self._forget()
             self.u = [u]
@@ -360,9 +366,7 @@ class ReferenceEstimator:
         self.whitener.past[0][-1] -= innovation
         if self.doubt is not None:
             self._enter_readings(self.doubt)
-        self.y = [self.y[0] - innovation, *self.y][: self.config.na]
-        if abs(self.y[0]) > CODE_LIMIT:
-            self._forget()
+        self._store_output(self.y[0] - innovation)
 
     # ---- equations
 
@@ -390,13 +394,16 @@ class ReferenceEstimator:
         innovation = self._residual(equation, self.delta)
         readings = self._rival_innovations(equation)
         gain, variance = self.covariance.measure(equation[:-1], self.variance, self.config.forgetting)
-        self.delta = [t + g * innovation for t, g in zip(self.delta, gain, strict=True)]
-        self._adapt(equation)
         expires = self.doubt is not None and self.doubt.age_n >= DOUBT_N
         decision = self.trigger.enter(innovation, variance, readings, expires=expires)
         if expires:
             self._watch_edges()
         self.deviation = math.sqrt(variance * self.trigger.noise_variance)
+        bridged_n, self.bridged_n = self.bridged_n, 0
+        if decision is not Meaning.QUIET and not bridged_n and self._is_lone_outlier(innovation, variance):
+            return self._set_aside(innovation)
+        self.delta = [t + g * innovation for t, g in zip(self.delta, gain, strict=True)]
+        self._adapt(equation)
         step = self._stepped(self.trigger.statistic, 0, innovation, alarm=decision is Meaning.ALARM)
         if decision is Meaning.ALARM:
             self._alarm()
@@ -409,6 +416,17 @@ class ReferenceEstimator:
                 self._refresh()
             self.equations += 1
         return step
+
+    def _is_lone_outlier(self, innovation: float, variance: float) -> bool:
+        applies = self._is_delta and self._can_bridge
+        return applies and self.trigger.is_lone_outlier(innovation, variance, is_doubted=self.doubt is not None)
+
+    def _set_aside(self, innovation: float) -> ReferenceStep:
+        """Predict the output of a lone outlier, and let the next sample decide."""
+        self.whitener.past[0][-1] -= innovation
+        self.trigger.set_aside()
+        self.bridged_n = 1
+        return self._stepped(self.trigger.statistic, 0, innovation)
 
     def _watch_scale(self, equation: Vector, square: float) -> None:
         scale = self.trigger.scale
