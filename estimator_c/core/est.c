@@ -814,13 +814,10 @@ static void set_outlier_aside(est_t* const self, const float innovation, est_ste
 #endif
 }
 
-/// Enter the innovation that the present theta leaves into what depends on it.
+/// Update theta with an equation.
 EST_INLINE void follow_equation(est_t* const self, const est_shape_t shape, const est_equation_t* const equation) {
     est_equation_follow(equation, shape, self->theta);
     if (EST_WITH_ADAPTATION) {
-        if (self->config->random_walk > 0.0F) {
-            walk(self);
-        }
         store_residual(self, equation->x);
     }
     end_bridge(self);
@@ -876,9 +873,12 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         return;  // MISRA D4
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation);
-    const bool  held      = est_trigger_holds(&self->trigger);
-    const float weight    = precision * weight_of(self);
-    const float term      = est_trigger_term(equation.innovation, weight);
+    if (EST_WITH_ADAPTATION && (config->random_walk > 0.0F)) {
+        walk(self);
+    }
+    const bool  held   = est_trigger_holds(&self->trigger);
+    const float weight = precision * weight_of(self);
+    const float term   = est_trigger_term(equation.innovation, weight);
     enter_innovation(self, equation.innovation, term, weight, precision, held);
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;

@@ -502,7 +502,7 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// plant has changed, the next one raises it.
 /// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.35 times a
 /// typical one if edges may slip, 1.25 times otherwise.
-/// RAM: the state, and stack: on a Cortex-M 140 to 240 bytes, at -O0 2,510; on an AVR 380, at -O0 1,670 (make
+/// RAM: the state, and stack: on a Cortex-M 270 to 420 bytes, at -O0 2,770; on an AVR 400, at -O0 1,810 (make
 /// cost). May be called from an interrupt.
 est_step_t est_step(est_t* self, est_sample_t sample);
 

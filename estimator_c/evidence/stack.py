@@ -21,6 +21,8 @@ LEVELS = ("-O0", "-Os", "-O2", "-O3")
 
 CALL = re.compile(r"^\s+(?:r?call|bl?|b\.w|r?jmp)\s+([A-Za-z_][\w.]*)\s*$", re.MULTILINE)
 FUNCTION = re.compile(r"^([A-Za-z_][\w.]*):\n(.*?)^\s+\.size\s+\1,", re.MULTILINE | re.DOTALL)
+CLONE = re.compile(r"(\.(?:constprop|isra|part))\.\d+\b")
+"""Number of a copy of a function, which the list of the frames lacks."""
 FRAME = re.compile(r"^.*:([\w.]+)\t(\d+)\t(?:static|dynamic,bounded)$", re.MULTILINE)
 
 
@@ -54,7 +56,8 @@ def stack_bytes(processor: Toolchain, level: str, folder: Path, *options: str, r
     frames = {name: int(size) for name, size in FRAME.findall(usage)}
     if len(frames) != len(usage.splitlines()):
         raise ValueError(f"a frame has no fixed size, or two have one name: {usage}")
-    calls = {name: CALL.findall(body) for name, body in FUNCTION.findall(assembly.read_text())}
+    code = CLONE.sub(r"\1", assembly.read_text())
+    calls = {name: CALL.findall(body) for name, body in FUNCTION.findall(code)}
     return deepest(root, frames, calls)
 
 

@@ -596,7 +596,7 @@ work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const
     }
     // an edge of a generator that drifts leaves a response to it
     count_energy(self, estimator->settled && (estimator->doubt_n == 0U));
-    if ((step.status != EST_MISSING) && (step.status != EST_REFUSED)) {
+    if ((step.status == EST_UPDATED) || (step.status == EST_GATHERING)) {
         find_region(self, estimator);
     }
 }

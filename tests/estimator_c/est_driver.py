@@ -37,7 +37,7 @@ COVERED = ("-O0", "--coverage", "-DNDEBUG", "-D__OPTIMIZE_SIZE__=1", "-DEST_NA_M
 COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "saturated", "stuck", "refreshes")
 
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM, CUSTOM = range(5)
-UPDATED, MISSING, REFUSED, GATHERING = range(4)
+UPDATED, MISSING, REFUSED, GATHERING, OUTLIER = range(5)
 LOCKED, MAY_SLIP, ANYWHERE = range(3)
 
 WARM_UP_N = EstimatorConfig().warm_up_n

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +25,10 @@ from tests.estimator_c.est_driver import (
     MAY_SLIP,
     MEAN_BETWEEN_FAULTS,
     NONE,
+    OUTLIER,
     PREDICTION_ERROR,
     Estimator,
+    Result,
 )
 
 FRONT = (115.0, 3021.0, 24500.0)
@@ -243,6 +247,99 @@ def test_noise_behind_an_inflated_scale_raises_no_alarm(estimator: Estimator) ->
         assert alarms_behind_an_inflated_scale(estimator, 2500, seed) == []
 
 
+def struck(
+    estimator: Estimator, *deviations: float, at: int = 1000, edge_instants: int = LOCKED, **settings: float
+) -> Result:
+    """Result for a healthy suspension, whose samples of y from ``at`` on deviate by so many codes."""
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 1400.0, 50.0), 1400, 1.0, 0)
+    y[at : at + len(deviations)] += deviations
+    assert estimator.init(edge_instants=edge_instants, **settings)
+    return estimator.run(u, y)
+
+
+@pytest.mark.parametrize("edge_instants", [LOCKED, MAY_SLIP])
+@pytest.mark.parametrize("deviation", [20.0, -100.0, 1e4])
+@pytest.mark.parametrize("at", [1000, 1009, 1010, 1011, 1015, 1022, 1023])
+def test_lone_outlier_raises_no_alarm_and_leaves_theta(
+    estimator: Estimator, at: int, deviation: float, edge_instants: int
+) -> None:
+    """At every phase of an edge, which comes at 1010."""
+    result = struck(estimator, deviation, at=at, edge_instants=edge_instants)
+    assert len(result.alarms) == 0
+    assert np.flatnonzero(result.status == OUTLIER).tolist() == [at]
+    assert (result.theta[at] == result.theta[at - 1]).all()
+    assert result.innovation[at] == pytest.approx(deviation, abs=5.0)
+    assert result.statistic[at] == 0.0
+    assert result.counters["updated"] == 1400
+    untouched = struck(estimator, edge_instants=edge_instants)
+    later = slice(at + 30, None)
+    assert np.abs(result.innovation[later] - untouched.innovation[later]).max() < 0.5
+
+
+def test_second_outlier_in_succession_raises_the_alarm(estimator: Estimator) -> None:
+    result = struck(estimator, 100.0, 100.0)
+    assert result.alarms.tolist() == [1001]
+    assert np.flatnonzero(result.status == OUTLIER).tolist() == [1000]
+
+
+def test_outlier_after_large_innovations_raises_the_alarm(estimator: Estimator) -> None:
+    """The innovations after a change of the plant grow."""
+    assert struck(estimator, 3.5, 17.0).alarms.tolist() == [1001]
+    assert len(struck(estimator, 3.5, 30.0).alarms) == 0
+
+
+@pytest.mark.parametrize("inflation", [1.0, 4.0])
+def test_outlier_is_set_aside_from_six_ceilings_on_without_the_inflation(
+    estimator: Estimator, inflation: float
+) -> None:
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 1400.0, 50.0), 1400, 1.0, 0)
+    alarms = []
+    for deviation in (5.0, 12.0):
+        struck_y = y + np.where(np.arange(1400) == 1000, deviation, 0.0)
+        assert estimator.init(edge_instants=LOCKED, ceiling=3.5)
+        estimator.run(u[:900], y[:900])
+        estimator.inflate(inflation)
+        alarms.append(estimator.run(u[900:], struck_y[900:]).alarms.tolist())
+    assert alarms == [[100], []]
+
+
+@pytest.mark.parametrize("settings", [{"kind": PREDICTION_ERROR, "ceiling": 20.0}, {"nc": 1, "nb": 2, "nk": 1}])
+def test_outlier_raises_the_alarm_where_none_is_set_aside(estimator: Estimator, settings: dict[str, Any]) -> None:
+    """With another trigger, and where the residual of the sample would be unknown."""
+    result = struck(estimator, 100.0, **settings)
+    assert 1000 in result.alarms.tolist()
+    assert not (result.status == OUTLIER).any()
+
+
+def test_outlier_after_a_missing_sample_raises_the_alarm(estimator: Estimator) -> None:
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 1400.0, 50.0), 1400, 1.0, 0)
+    y[1000] += 100.0
+    valid = np.ones(1400, np.uint8)
+    valid[999] = 0
+    assert estimator.init(edge_instants=LOCKED)
+    assert estimator.run(u, y, valid).alarms.tolist() == [1000]
+
+
+@pytest.mark.parametrize(("parameter", "factor"), [*itertools.product(range(3), (1.2, 0.8))])
+def test_change_that_one_innovation_shows_is_seen_at_the_next_sample(
+    estimator: Estimator, parameter: int, factor: float
+) -> None:
+    """Of low noise: its first innovation may be as large as an outlier."""
+    mass, damping, stiffness = (value * (factor if k == parameter else 1.0) for k, value in enumerate(FRONT))
+    changed = (mass, damping, stiffness)
+    first_n = []
+    for onset in range(1010, 1030, 3):
+        u, y = suspension([(0, FRONT), (onset, changed)], np.arange(10.0, 1400.0, 50.0), 1100, 0.02, onset)
+        scale = 64.0
+        assert estimator.init(edge_instants=LOCKED, edge_codes=64.0 * scale, code_low=-9e5, code_high=9e5)
+        result = estimator.run(scale * u, scale * y)
+        first = int(np.flatnonzero((result.status == OUTLIER) | (np.arange(1100) == result.alarms[0]))[0])
+        assert first > onset
+        assert result.alarms[0] - first <= 1
+        first_n.append(first - onset)
+    assert max(first_n) <= 5
+
+
 @pytest.mark.parametrize(
     ("edges", "trial_n"),
     [([], 120), ([1030.0], 56), ([1080.0], 80)],
@@ -253,7 +350,7 @@ def test_alarm_is_on_trial_until_an_edge_but_not_for_ever(
 ) -> None:
     """The noise variance is followed again a block of 32 equations after the trial."""
     u, y = suspension([(0, FRONT)], np.append(np.arange(10.0, 960.0, 50.0), edges), 1200, 1.0, 0)
-    y[1000] += 100.0
+    y[999:1001] += 100.0
     assert estimator.init(edge_instants=LOCKED)
     before = estimator.run(u[:1001], y[:1001])
     assert before.alarms.tolist() == [1000]

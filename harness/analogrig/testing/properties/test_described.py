@@ -5,13 +5,15 @@ Both are compared with the project's own reference, in float64.
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from analogrig.scenario import Scenario
 from analogrig.testing.properties.conversed import PORTS, converses_as_catalogued
 from analogrig.testing.properties.described import computes_what_it_describes, states_hum
 from analogrig.testing.reference.cases import CASES, HUM
-from analogrig.testing.reference.drawn import OTHER_PLANTS, drawn
+from analogrig.testing.reference.drawn import OTHER_PLANTS, OUTLIERS, drawn
 from analogrig.testing.reference.scripts import SCRIPTS, is_for
 from analogrig.testing.statement import Play
 
@@ -29,8 +31,10 @@ TELLING = (
 )
 """Drawn cases that tell altered devices which the first 160 let pass, chosen from 2100."""
 
-DRAWN = [number for number in (*range(160), *range(OTHER_PLANTS, OTHER_PLANTS + 20), *TELLING) if number not in ROUNDED]
-"""Drawn cases, from two endless series."""
+SERIES = (range(160), range(OTHER_PLANTS, OTHER_PLANTS + 20), range(OUTLIERS, OUTLIERS + 12))
+
+DRAWN = [number for number in (*itertools.chain(*SERIES), *TELLING) if number not in ROUNDED]
+"""Drawn cases, from three endless series."""
 
 
 @pytest.mark.hil_needs("tweak", "excite")

@@ -394,6 +394,8 @@ class ReferenceEstimator:
         innovation = self._residual(equation, self.delta)
         readings = self._rival_innovations(equation)
         gain, variance = self.covariance.measure(equation[:-1], self.variance, self.config.forgetting)
+        if self.config.random_walk > 0.0:
+            self.covariance.walk(self.config.random_walk)
         expires = self.doubt is not None and self.doubt.age_n >= DOUBT_N
         decision = self.trigger.enter(innovation, variance, readings, expires=expires)
         if expires:
@@ -403,7 +405,8 @@ class ReferenceEstimator:
         if decision is not Meaning.QUIET and not bridged_n and self._is_lone_outlier(innovation, variance):
             return self._set_aside(innovation)
         self.delta = [t + g * innovation for t, g in zip(self.delta, gain, strict=True)]
-        self._adapt(equation)
+        if self.config.nc:
+            self.residuals = [self._residual(equation, self.delta), *self.residuals][: self.config.nc]
         step = self._stepped(self.trigger.statistic, 0, innovation, alarm=decision is Meaning.ALARM)
         if decision is Meaning.ALARM:
             self._alarm()
@@ -501,14 +504,6 @@ class ReferenceEstimator:
     def _whitened_effect(self, past: Vector, x: float) -> Vector:
         gains = self.whitener.latest
         return [x - sum(g * w for g, w in zip(gains, past, strict=False)), *past][: max(len(gains), 1)]
-
-    def _adapt(self, equation: Vector) -> None:
-        """Update what an equation determines besides theta."""
-        config = self.config
-        if config.random_walk > 0.0:
-            self.covariance.walk(config.random_walk)
-        if config.nc:
-            self.residuals = [self._residual(equation, self.delta), *self.residuals][: config.nc]
 
     def _refresh(self) -> None:
         """Do one step of a refresh of C: check that A is reliable, compare C with A, or take C from A."""
