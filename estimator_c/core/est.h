@@ -71,8 +71,8 @@ extern "C" {
 /// | EST_WITH_TRIGGERS           | 1          | 0 omits the triggers other than the cumulative sum                 |
 /// | EST_WITH_ADAPTATION         | 1          | 0 omits nc, random_walk and refresh_n                              |
 /// | EST_WITH_WATCH              | 1          | 0 omits stuck_n, idle_n and the count of saturated samples         |
-/// | EST_WITH_ROBUSTNESS         | 1          | 0 omits noise_estimated, the delta form, inflation, and bridges    |
-/// |                             |            | over missing samples: for rigs that the model is known to fit      |
+/// | EST_WITH_ROBUSTNESS         | 1          | 0 omits noise_estimated, the delta form, inflation, lone outliers, |
+/// |                             |            | and bridges over gaps: for rigs that the model is known to fit     |
 /// | EST_WITH_CHECKS             | 1          | 0 omits the check of the configuration by est_init()               |
 /// | EST_ASSERT(x)               | assert(x)  | statement that must not continue if x is false: the caller made a  |
 /// |                             |            | mistake. Empty by default with NDEBUG or without an assert.h       |
@@ -498,8 +498,8 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// Bad data never fails and never enters the estimate: see est_status_t. Up to 8 samples in a row that are missing or
 /// refused are predicted, if C is that of the plant and u is the same before and after them; the next good sample then
 /// has its equation. After any other gap the equations begin anew, as after est_init().
-/// With the cumulative sum, an innovation far beyond those before it raises no alarm: it may be an interference. If the
-/// plant has changed, the next one raises it.
+/// With the cumulative sum, a lone outlier raises no alarm: an innovation of some 12 standard deviations after small
+/// ones. It may be an interference. If the plant has changed, the next innovation raises the alarm.
 /// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.35 times a
 /// typical one if edges may slip, 1.25 times otherwise.
 /// RAM: the state, and stack: on a Cortex-M 270 to 420 bytes, at -O0 2,770; on an AVR 400, at -O0 1,810 (make
