@@ -332,7 +332,7 @@ static void doubt_edge(est_t* const self) {
     const float step = self->u[0] - self->u[1];
     self->doubt_n    = 1U;
     est_edges_begin(&self->edges, self->config, self->theta, step);
-    est_trigger_begin_doubt(&self->trigger);
+    est_trigger_align_readings(&self->trigger);
 #if EST_WITH_ROBUSTNESS
     est_edges_begin_comparison(&self->edges, last_innovation(self));
 #endif
@@ -379,7 +379,7 @@ EST_INLINE void end_bridge(est_t* const self) {
 
 static void enter_edge(est_t* const self) {
     if (on_bridge(self)) {
-        increment(&self->edge_age_n);  // the instant of the edge is unknown
+        increment(&self->edge_age_n);  // after a gap the instant of the edge is unknown
         forget_samples(self);
         return;  // MISRA D4
     }
@@ -778,16 +778,17 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     predict(self, innovation);
 }
 
-/// True iff an innovation whose statistic has passed the ceiling is a lone outlier so far: far beyond those before it,
-/// and no other reading of the edges in doubt explains it. A change of the plant has another one at the next sample.
-/// `term`: of the innovation in the cumulative sum.
-static bool is_lone_outlier(const est_t* const self, const float term) {
+/// True iff this innovation alone lifted the statistic over the ceiling, and no reading of displaced edges explains all
+/// innovations. After a change of the plant the next innovation is large too. `term`: of the innovation in the
+/// cumulative sum.
+EST_ROBUST_SHARED bool is_lone_outlier(const est_t* const self, const float term) {
 #if EST_WITH_ROBUSTNESS
-    const float before = (self->trigger.statistic - term) + EST_CUSUM_DRIFT;
-    const float most =
-        est_max(before * EST_LONE_RATIO, (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation);
-    const bool explained = (self->doubt_n > 0U) && (est_trigger_best_rival(&self->trigger) <= 0.0F);
-    return (term > most) && (term < FLT_MAX) && !explained && !on_bridge(self) && is_cusum(self->config) &&
+    const float reached = self->trigger.statistic + est_max(self->correlation.lead, 0.0F);  // sum of the first reading
+    const float before  = (reached - term) + EST_CUSUM_DRIFT;
+    const float least   = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
+    const float threshold = est_max(before * EST_LONE_RATIO, least);
+    const bool  explained = (self->doubt_n > 0U) && (est_trigger_best_rival(&self->trigger) <= 0.0F);
+    return (term > threshold) && (term < FLT_MAX) && !explained && !on_bridge(self) && is_cusum(self->config) &&
            can_bridge(self);
 #else
     (void)self;
@@ -796,15 +797,20 @@ static bool is_lone_outlier(const est_t* const self, const float term) {
 #endif
 }
 
-/// Set a lone outlier aside: its y is predicted, theta stays, and all sums begin anew. The next sample decides.
-static void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
+/// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic of every reading.
+/// The next innovation decides.
+EST_ROBUST_SHARED void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
 #if EST_WITH_ROBUSTNESS
+    self->bridged_n = 1U;
     predict(self, innovation);
     self->trigger.statistic = 0.0F;
-    est_trigger_begin_doubt(&self->trigger);
-    self->scale.product = 0.0F;
+    est_trigger_align_readings(&self->trigger);
+    if (self->doubt_n > (EST_DOUBT_N / 2U)) {  // the few innovations left would decide it
+        self->doubt_n = 0U;
+    }
+    est_scale_discard_products(&self->scale);
     forget_innovations(self);
-    self->bridged_n = 1U;
+    increment(&self->counters.outliers);
     step->status    = EST_OUTLIER;
     step->statistic = 0.0F;
 #else
@@ -814,9 +820,9 @@ static void set_outlier_aside(est_t* const self, const float innovation, est_ste
 #endif
 }
 
-/// Update theta with an equation.
-EST_INLINE void follow_equation(est_t* const self, const est_shape_t shape, const est_equation_t* const equation) {
-    est_equation_follow(equation, shape, self->theta);
+/// Accept an equation: update theta, store its residual, and end the bridge.
+EST_INLINE void accept_equation(est_t* const self, const est_shape_t shape, const est_equation_t* const equation) {
+    est_equation_update_theta(equation, shape, self->theta);
     if (EST_WITH_ADAPTATION) {
         store_residual(self, equation->x);
     }
@@ -886,14 +892,14 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         judge_readings(self, shape, &equation, est_trigger_share(held) * weight);
     }
     const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->doubt_n);
-    if (finding == EST_QUIET) {
-        follow_equation(self, shape, &equation);
+    if (finding == EST_QUIET) {  // two copies of accept_equation() save four instructions a step
+        accept_equation(self, shape, &equation);
     } else {
         if (is_lone_outlier(self, term)) {
             set_outlier_aside(self, equation.innovation, step);
             return;  // MISRA D4
         }
-        follow_equation(self, shape, &equation);
+        accept_equation(self, shape, &equation);
         if (finding == EST_ALARM) {
             raise_alarm(self, step);
             return;  // MISRA D4
@@ -963,7 +969,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
     float              y            = 0.0F;
     const est_status_t status       = examine(self, sample, &y);
     bool               has_equation = status == EST_UPDATED;
-    est_step_t         step;
+    est_step_t         step;  // enter_equation() completes that of EST_UPDATED
     step.status = status;
     step.alarm  = false;
     if (!has_equation) {

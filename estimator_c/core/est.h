@@ -321,7 +321,7 @@ typedef enum {
     EST_MISSING   = 1,  ///< the sample was not valid: theta and its covariance are unchanged. See est_step()
     EST_REFUSED   = 2,  ///< u or y was non-finite, saturated or stuck: counted, otherwise as EST_MISSING
     EST_GATHERING = 3,  ///< the sample was stored, but its equation also needs samples that are still unknown
-    EST_OUTLIER   = 4,  ///< lone outlier: theta is unchanged, y counts as missing. See est_step()
+    EST_OUTLIER   = 4,  ///< lone outlier: theta is unchanged, y is replaced by its prediction. See est_step()
 } est_status_t;
 
 /// Result of one step.
@@ -329,8 +329,8 @@ typedef struct {
     est_status_t status;      ///< treatment of the sample
     bool         alarm;       ///< the plant has changed; estimation restarts with the next sample
     bool         idle;        ///< excitation is lost: the estimate does not improve. Always: edge_codes is too large
-    float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1) [codes]; of EST_UPDATED and EST_OUTLIER, else 0
-    float        statistic;   ///< statistic of the trigger after this sample, before an alarm or a gap resets it
+    float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1) [codes]; 0 unless EST_UPDATED or EST_OUTLIER
+    float        statistic;  ///< of the trigger after this sample, before an alarm or a gap resets it; 0 of EST_OUTLIER
 } est_step_t;
 
 /// Counters since est_init(). They saturate instead of wrapping.
@@ -344,6 +344,7 @@ typedef struct {
     uint16_t restarts;   ///< times the whitening began anew, including the first
     uint16_t slips;      ///< times the edges of u began to be recorded one sample earlier or later
     uint16_t refreshes;  ///< times C was taken from the estimate of A
+    uint16_t outliers;   ///< samples with EST_OUTLIER
 } est_counters_t;
 
 #define EST_UPPER_N ((EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U)
@@ -494,13 +495,14 @@ bool est_config_valid(const est_config_t* config);
 /// the check. Cost: as one est_step(). RAM: the state. May be called from an interrupt.
 EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 
-/// Enter one sample: whiten the equation, update theta and P (Bierman 1977), run the trigger.
+/// Enter one sample: whiten the equation, update P, run the trigger, update theta (Bierman 1977).
 /// Bad data never fails and never enters the estimate: see est_status_t. Up to 8 samples in a row that are missing or
 /// refused are predicted, if C is that of the plant and u is the same before and after them; the next good sample then
 /// has its equation. After any other gap the equations begin anew, as after est_init().
-/// With the cumulative sum, a lone outlier raises no alarm: an innovation of some 12 standard deviations after small
-/// ones. It may be an interference. If the plant has changed, the next innovation raises the alarm.
-/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.35 times a
+/// With the cumulative sum, a lone outlier is set aside: an innovation of 12 standard deviations, at the default
+/// ceiling, after small ones. It may be an interference of one sample. The next innovation is not set aside, and raises
+/// the alarm if it passes the ceiling. This applies where a missing sample would be predicted.
+/// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.37 times a
 /// typical one if edges may slip, 1.25 times otherwise.
 /// RAM: the state, and stack: on a Cortex-M 270 to 420 bytes, at -O0 2,770; on an AVR 400, at -O0 1,810 (make
 /// cost). May be called from an interrupt.

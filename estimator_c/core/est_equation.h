@@ -14,7 +14,7 @@ typedef struct {
     float* x;           ///< y(k), followed by the regressor phi in the order of theta
     float* gain;        ///< P phi, unscaled
     float  innovation;  ///< prediction error of y(k) [codes]
-    float  step;        ///< factor of the gain in the update of theta
+    float  factor;      ///< innovation over its variance, in units of the gain
     float  variance;    ///< variance of the equation's noise [noise variances]
 } est_equation_t;
 
@@ -72,7 +72,7 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
 
 /// Update the covariance with one measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation"
 /// (1977), section V.3. The forgetting factor of thesis Equ 3.21 divides the weight of P, and with it every d at once.
-/// Return the reciprocal of the innovation's variance [1 / noise variance].
+/// Store the gain. Return the reciprocal of the innovation's variance [1 / noise variance].
 EST_INLINE float est_equation_measure(est_factors_t* const  self,
                                       const float           forgetting,
                                       const est_shape_t     shape,
@@ -105,17 +105,18 @@ EST_INLINE float est_equation_measure(est_factors_t* const  self,
         }
         gain[j] = v;
     }
-    equation->step = equation->innovation * inverse;
-    self->weight   = weight;
+    equation->factor = equation->innovation * inverse;
+    self->weight     = weight;
     return weight * inverse;
 }
 
-/// Update theta with a measurement that the covariance contains.
-EST_INLINE void est_equation_follow(const est_equation_t* const equation, const est_shape_t shape, float* const theta) {
+/// Update theta with the gain of est_equation_measure().
+EST_INLINE void
+est_equation_update_theta(const est_equation_t* const equation, const est_shape_t shape, float* const theta) {
     const uint_fast8_t count = est_shape_count(shape);
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < count; i++) {
-        theta[i] += equation->gain[i] * equation->step;
+        theta[i] += equation->gain[i] * equation->factor;
     }
 }
 

@@ -48,7 +48,7 @@
 #define EST_NOISE_LEAST 0.07F
 
 /// Largest mean square of a block that counts, in noise variances. Before the trigger is armed, an outlier might pass
-/// all bounds; later it raises an alarm.
+/// all bounds; later it raises an alarm or is set aside.
 #define EST_GROWTH_MAX 9.0F
 
 /// Inflation: factor per unjustified alarm, factor per block on the way back to 1 (a factor of 4 in 470,000 equations),
@@ -136,6 +136,13 @@ EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
 static inline void est_scale_enter_product(est_scale_t* const self, const float product) {
     if (self->phase < EST_BLOCK_N) {
         self->product += product;
+    }
+}
+
+/// Discard the products of an incomplete block.
+static inline void est_scale_discard_products(est_scale_t* const self) {
+    if (self->phase < EST_BLOCK_N) {
+        self->product = 0.0F;
     }
 }
 

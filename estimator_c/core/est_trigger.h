@@ -23,10 +23,10 @@ static inline bool est_trigger_config_valid(const est_trigger_config_t* const co
 }
 
 typedef enum {
-    EST_QUIET = 0,
-    EST_ALARM = 1,
-    EST_SLIP  = 2,  ///< the edges of u have moved by one sample; the plant has not changed
-    EST_DOUBT = 3,  ///< the statistic has passed the ceiling, but another reading of the edges has not
+    EST_QUIET     = 0,
+    EST_ALARM     = 1,
+    EST_SLIP      = 2,  ///< the edges of u have moved by one sample; the plant has not changed
+    EST_UNDECIDED = 3,  ///< the statistic has reached the ceiling, that of another reading of the edges has not
 } est_finding_t;
 
 /// Prepare for the first innovation. The statistic is held at zero for the next quiet_n innovations.
@@ -39,8 +39,8 @@ static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t
     }
 }
 
-/// Begin a doubt: all readings of the edges start from the present statistic.
-static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
+/// Let all readings of the edges start from the present statistic.
+static inline void est_trigger_align_readings(est_trigger_t* const self) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
         self->rival[i] = self->statistic;
@@ -84,8 +84,9 @@ static inline bool est_trigger_settle_late(est_trigger_t* const self) {
 #define EST_CUSUM_DRIFT 1.1305F
 #define EST_CUSUM_GAIN (EST_TERM_GAIN / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE))
 
-/// Smallest term of a lone outlier, in ceilings, without the inflation of the scale; and its smallest ratio to the sum
-/// before it and one drift.
+/// A lone outlier has a term of more than EST_LONE_LEAST ceilings, computed without the inflation of the scale, and of
+/// more than EST_LONE_RATIO times the sum before it. The innovations after a change grow from sample to sample; at 12
+/// bits the first ones are small.
 #define EST_LONE_LEAST 6.0F
 #define EST_LONE_RATIO 30.0F
 
@@ -125,7 +126,7 @@ EST_INLINE est_finding_t est_trigger_find(const est_trigger_t* const self,
         return EST_QUIET;  // MISRA D4
     }
     if (EST_WITH_EDGES && (doubt_n > 0U) && (est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
-        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_DOUBT;  // MISRA D4
+        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_UNDECIDED;  // MISRA D4
     }
     return EST_ALARM;
 }

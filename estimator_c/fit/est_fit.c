@@ -591,7 +591,7 @@ static bool is_used(const est_fit_watch_t* const self, const est_step_t step) {
 /// Draw the innovation of this sample, count the energy of the last ones, and find the region of the next ones.
 static void
 work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step, const float z) {
-    if (is_used(self, step) && (self->slot >= DRAWS_FROM)) {
+    if (is_used(self, step) && (step.status == EST_UPDATED) && (self->slot >= DRAWS_FROM)) {
         draw(self, estimator, z, step.innovation);
     }
     // an edge of a generator that drifts leaves a response to it

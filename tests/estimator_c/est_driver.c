@@ -173,7 +173,7 @@ float driver_variance(int index) { return est_variance(&self, (uint8_t)index); }
 void driver_age_counters(void) {
     self.counters =
         (est_counters_t){ UINT32_MAX - 1U, UINT32_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U,
-                          UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U };
+                          UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U };
 }
 
 /* Sets the inflation of the scale, as after alarms that were not justified. The weight follows with the next block. */
@@ -231,11 +231,11 @@ float driver_noise_variance(void) { return est_noise_variance(&self); }
 
 float driver_scale(void) { return est_scale(&self); }
 
-void driver_counters(unsigned out[9]) {
-    const est_counters_t c      = est_counters(&self);
-    const unsigned       all[9] = { c.updated, c.missing,   c.refused, c.alarms,   c.restarts,
-                                    c.slips,   c.saturated, c.stuck,   c.refreshes };
-    for (int i = 0; i < 9; i++) {
+void driver_counters(unsigned out[10]) {
+    const est_counters_t c       = est_counters(&self);
+    const unsigned       all[10] = { c.updated, c.missing,   c.refused, c.alarms,    c.restarts,
+                                     c.slips,   c.saturated, c.stuck,   c.refreshes, c.outliers };
+    for (int i = 0; i < 10; i++) {
         out[i] = all[i];
     }
 }

@@ -63,7 +63,7 @@ class _Out(ctypes.Structure):
 
 
 _COUNTERS = dict.fromkeys(("updated", "missing"), ctypes.c_uint32) | dict.fromkeys(
-    ("refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes"), ctypes.c_uint16
+    ("refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes", "outliers"), ctypes.c_uint16
 )
 """Fields of est_counters_t with their C types."""
 

@@ -48,7 +48,7 @@ class ReferenceCorrelation:
 
     def forget(self) -> None:
         """Forget the last innovations: the next one does not follow them."""
-        self._last, self._lead = [0.0, 0.0], 0.0
+        self._last, self.lead = [0.0, 0.0], 0.0
 
     def restart_products(self) -> None:
         """Begin the products of a block anew."""
@@ -77,9 +77,9 @@ class ReferenceCorrelation:
             return cusum(statistic, e, variance * scale)
         left = (1.0 - first**2) * (1.0 - second**2)
         spread = 1.0 + LEVERAGE * (1.0 - 1.0 / variance)
-        one = cusum(statistic + max(self._lead, 0.0), e, variance * scale)
-        other = cusum(statistic + max(-self._lead, 0.0), forward - second * backward, variance * scale * left * spread)
-        self._lead = one - other
+        one = cusum(statistic + max(self.lead, 0.0), e, variance * scale)
+        other = cusum(statistic + max(-self.lead, 0.0), forward - second * backward, variance * scale * left * spread)
+        self.lead = one - other
         return min(one, other)
 
     def follow(self, mean: float, noise_variance: float, block_n: int, *, armed: bool) -> None:

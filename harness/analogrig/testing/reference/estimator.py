@@ -422,12 +422,14 @@ class ReferenceEstimator:
 
     def _is_lone_outlier(self, innovation: float, variance: float) -> bool:
         applies = self._is_delta and self._can_bridge
-        return applies and self.trigger.is_lone_outlier(innovation, variance, is_doubted=self.doubt is not None)
+        return applies and self.trigger.is_lone_outlier(innovation, variance, in_doubt=self.doubt is not None)
 
     def _set_aside(self, innovation: float) -> ReferenceStep:
         """Predict the output of a lone outlier, and let the next sample decide."""
         self.whitener.past[0][-1] -= innovation
         self.trigger.set_aside()
+        if self.doubt is not None and self.doubt.age_n > DOUBT_N // 2:  # the few innovations left would decide it
+            self.doubt = None
         self.bridged_n = 1
         return self._stepped(self.trigger.statistic, 0, innovation)
 

@@ -11,12 +11,11 @@ from analogrig.testing.reference.scale import HIGH_LIMIT, ReferenceScale
 NEAR = 0.003
 """Distance from the ceiling at which rounding may decide, relative to the ceiling and 1."""
 
-LONE_LEAST, LONE_RATIO = 6.0, 30.0
-"""Smallest term of a lone outlier, in ceilings without the inflation, and its smallest ratio to the sum before it and
-one drift."""
-
 RIVAL_NEAR = 3e-4
 """The same of the distance between two readings of an edge, which share most of their rounding."""
+
+LONE_LEAST, LONE_RATIO = 6.0, 30.0
+"""Smallest term of a lone outlier, in ceilings without the inflation, and its smallest ratio to the sum before it."""
 
 
 class Meaning(Enum):
@@ -26,8 +25,8 @@ class Meaning(Enum):
     ALARM = 1
     SLIP = 2
     """The edges of the force have moved by one sample; the plant has not changed."""
-    DOUBT = 3
-    """The statistic has reached the ceiling, but another reading of the edges has not."""
+    UNDECIDED = 3
+    """The statistic has reached the ceiling, that of another reading of the edges has not."""
 
 
 class ReferenceTrigger:
@@ -85,22 +84,23 @@ class ReferenceTrigger:
         """Continue with the better of the other readings, after a slip."""
         self.statistic = min(self.rivals)
 
-    def is_lone_outlier(self, innovation: float, variance: float, *, is_doubted: bool) -> bool:
-        """True if an innovation whose statistic has reached the ceiling is far beyond those before it.
+    def is_lone_outlier(self, innovation: float, variance: float, *, in_doubt: bool) -> bool:
+        """True if this innovation alone lifted the statistic over the ceiling, and no other reading explains all.
 
         :param variance: of the innovation, in noise variances.
-        :param is_doubted: edges are in doubt; a reading whose sum is zero explains the innovation.
+        :param in_doubt: edges are in doubt.
         """
         term = GAIN * innovation * innovation / (variance * self.scale.expected)
-        least = LONE_LEAST * self._ceiling / self.scale.inflation
-        most = max(LONE_RATIO * (self.statistic - term + DRIFT), least)
-        self.is_doubtful |= abs(term - most) < NEAR * most or (is_doubted and 0.0 < min(self.rivals) < NEAR)
-        return term > most and not (is_doubted and min(self.rivals) <= 0.0)
+        before = self.statistic + max(self.scale.correlation.lead, 0.0) - term + DRIFT
+        threshold = max(LONE_RATIO * before, LONE_LEAST * self._ceiling / self.scale.inflation)
+        self.is_doubtful |= abs(term - threshold) < NEAR * threshold or (in_doubt and 0.0 < min(self.rivals) < NEAR)
+        return term > threshold and not (in_doubt and min(self.rivals) <= 0.0)
 
     def set_aside(self) -> None:
-        """Begin all sums anew after a lone outlier."""
+        """Restart the statistic of every reading after a lone outlier."""
         self.statistic, self.rivals = 0.0, [0.0, 0.0]
-        self.scale.correlation.restart_products()
+        if self.scale.is_open:
+            self.scale.correlation.restart_products()
         self.scale.correlation.forget()
 
     def find_hidden_change(self, *, is_doubted: bool) -> None:
@@ -159,4 +159,4 @@ class ReferenceTrigger:
             return Meaning.QUIET
         if not is_doubted or min(self.rivals) >= self._ceiling:
             return Meaning.ALARM
-        return Meaning.SLIP if expires else Meaning.DOUBT
+        return Meaning.SLIP if expires else Meaning.UNDECIDED
