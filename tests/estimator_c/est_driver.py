@@ -34,7 +34,18 @@ STRICT = [
 COVERED = ("-O0", "--coverage", "-DNDEBUG", "-D__OPTIMIZE_SIZE__=1", "-DEST_NA_MAX=3U")
 """One copy of every line, and loops over EST_NA_MAX that are loops."""
 
-COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "saturated", "stuck", "refreshes", "outliers")
+COUNTERS = (
+    "updated",
+    "missing",
+    "refused",
+    "alarms",
+    "restarts",
+    "slips",
+    "saturated",
+    "stuck",
+    "refreshes",
+    "outliers",
+)
 
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM, CUSTOM = range(5)
 UPDATED, MISSING, REFUSED, GATHERING, OUTLIER = range(5)
