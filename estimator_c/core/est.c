@@ -37,6 +37,10 @@
 /// Samples after an edge of u within which another one is part of a slope: no edge that could slip.
 #define SLOPE_N 5U
 
+/// Samples after an edge in which an outlier is one at the edge, and bits of edge_outliers for the two edges before.
+#define AT_EDGE_N 3U
+#define EDGES_BEFORE 6U
+
 /// Square of the smallest ratio of the range of the codes to the standard deviation of the noise.
 #define NOISE_SHARE 1024.0F
 
@@ -44,6 +48,9 @@
 /// a start the prediction would rest on few noisy samples.
 #define BRIDGED_MAX 8U
 #define BRIDGE_PRECISION 0.6F
+
+/// Value of bridged_n after an outlier: its y was predicted, and its u is known.
+#define OUTLIER_BRIDGED UINT8_MAX
 
 EST_SHARED void increment_long(uint32_t* const counter) {
     const uint32_t next = *counter + (uint32_t)1U;
@@ -332,7 +339,7 @@ static void doubt_edge(est_t* const self) {
     const float step = self->u[0] - self->u[1];
     self->doubt_n    = 1U;
     est_edges_begin(&self->edges, self->config, self->theta, step);
-    est_trigger_align_readings(&self->trigger);
+    est_trigger_begin_doubt(&self->trigger);
 #if EST_WITH_ROBUSTNESS
     est_edges_begin_comparison(&self->edges, last_innovation(self));
 #endif
@@ -358,7 +365,7 @@ EST_INLINE bool is_on_trial(const est_t* const self) {
 #endif
 }
 
-/// True iff the previous sample was predicted.
+/// True iff the previous y was predicted.
 static bool on_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
     return self->bridged_n > 0U;
@@ -368,7 +375,17 @@ static bool on_bridge(const est_t* const self) {
 #endif
 }
 
-/// The present sample is not predicted.
+/// True iff the previous sample is missing, and was predicted.
+static bool in_gap(const est_t* const self) {
+#if EST_WITH_ROBUSTNESS
+    return (self->bridged_n > 0U) && (self->bridged_n <= BRIDGED_MAX);
+#else
+    (void)self;
+    return false;
+#endif
+}
+
+/// End a bridge: the y of the present sample is not predicted.
 EST_INLINE void end_bridge(est_t* const self) {
 #if EST_WITH_ROBUSTNESS
     self->bridged_n = 0U;
@@ -378,11 +395,14 @@ EST_INLINE void end_bridge(est_t* const self) {
 }
 
 static void enter_edge(est_t* const self) {
-    if (on_bridge(self)) {
-        increment(&self->edge_age_n);  // after a gap the instant of the edge is unknown
+    if (in_gap(self)) {
+        increment(&self->edge_age_n);  // the instant of the edge is unknown
         forget_samples(self);
         return;  // MISRA D4
     }
+#if EST_WITH_ROBUSTNESS
+    self->correlation.edge_outliers = (uint8_t)(self->correlation.edge_outliers << 1U);
+#endif
     const bool slope = self->edge_age_n < SLOPE_N;
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
@@ -778,18 +798,32 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     predict(self, innovation);
 }
 
-/// True iff this innovation alone lifted the statistic over the ceiling, and no reading of displaced edges explains all
-/// innovations. After a change of the plant the next innovation is large too. `term`: of the innovation in the
-/// cumulative sum.
+#if EST_WITH_ROBUSTNESS
+
+/// True iff another reading of the edges in doubt may explain the innovations.
+static bool may_be_displaced(const est_t* const self) {
+    return (self->doubt_n > 0U) &&
+           (est_trigger_best_rival(&self->trigger) < (EST_LONE_EXPLAINED * self->config->trigger.ceiling));
+}
+
+/// True iff an outlier comes right after an edge, as at one of the two edges before: a poor model, and no interference.
+static bool returns_at_edge(const est_t* const self) {
+    return (self->edge_age_n < AT_EDGE_N) && ((self->correlation.edge_outliers & EDGES_BEFORE) != 0U);
+}
+#endif
+
+/// True iff this innovation alone lifted the statistic over the ceiling, and nothing else explains it. After a change of
+/// the plant the next innovation is large too. `term`: of the innovation in the cumulative sum.
 EST_ROBUST_SHARED bool is_lone_outlier(const est_t* const self, const float term) {
 #if EST_WITH_ROBUSTNESS
+    if (may_be_displaced(self)) {
+        return false;  // MISRA D4
+    }
     const float reached = self->trigger.statistic + est_max(self->correlation.lead, 0.0F);  // sum of the first reading
     const float before  = (reached - term) + EST_CUSUM_DRIFT;
     const float least   = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
-    const float threshold = est_max(before * EST_LONE_RATIO, least);
-    const bool  explained = (self->doubt_n > 0U) && (est_trigger_best_rival(&self->trigger) <= 0.0F);
-    return (term > threshold) && (term < FLT_MAX) && !explained && !on_bridge(self) && is_cusum(self->config) &&
-           can_bridge(self);
+    return (term > est_max(before * EST_LONE_RATIO, least)) && (term < FLT_MAX) && !on_bridge(self) &&
+           is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
 #else
     (void)self;
     (void)term;
@@ -797,19 +831,19 @@ EST_ROBUST_SHARED bool is_lone_outlier(const est_t* const self, const float term
 #endif
 }
 
-/// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic of every reading.
-/// The next innovation decides.
+/// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic. A doubt about edges
+/// ends, since its readings have lost their base. The next innovation decides.
 EST_ROBUST_SHARED void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
 #if EST_WITH_ROBUSTNESS
-    self->bridged_n = 1U;
+    self->bridged_n = OUTLIER_BRIDGED;
     predict(self, innovation);
     self->trigger.statistic = 0.0F;
-    est_trigger_align_readings(&self->trigger);
-    if (self->doubt_n > (EST_DOUBT_N / 2U)) {  // the few innovations left would decide it
-        self->doubt_n = 0U;
-    }
+    self->doubt_n           = 0U;
     est_scale_discard_products(&self->scale);
     forget_innovations(self);
+    if (self->edge_age_n < AT_EDGE_N) {
+        self->correlation.edge_outliers |= 1U;
+    }
     increment(&self->counters.outliers);
     step->status    = EST_OUTLIER;
     step->statistic = 0.0F;

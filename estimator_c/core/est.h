@@ -424,11 +424,12 @@ typedef struct {
 
 /// Serial correlation of the innovations. Private to est_correlation.h.
 typedef struct {
-    uint8_t work;        ///< of each step of this block; 0: none
-    uint8_t turn;        ///< blocks so far
-    float   last[2];     ///< innovations of the last two equations, newest first [codes]
-    float   partial[2];  ///< partial correlations at lags 1 and 2
-    float   lead;        ///< sum of the first reading less that of the second
+    uint8_t work;           ///< of each step of this block; 0: none
+    uint8_t turn;           ///< blocks so far
+    uint8_t edge_outliers;  ///< a bit for each edge of late, the last one first: it was followed by an outlier
+    float   last[2];        ///< innovations of the last two equations, newest first [codes]
+    float   partial[2];     ///< partial correlations at lags 1 and 2
+    float   lead;           ///< sum of the first reading less that of the second
 } est_correlation_t;
 
 /// Work that a step leaves to the next one. Private.

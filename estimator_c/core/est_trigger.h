@@ -39,8 +39,8 @@ static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t
     }
 }
 
-/// Let all readings of the edges start from the present statistic.
-static inline void est_trigger_align_readings(est_trigger_t* const self) {
+/// Begin a doubt: all readings of the edges start from the present statistic.
+static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
         self->rival[i] = self->statistic;
@@ -89,6 +89,9 @@ static inline bool est_trigger_settle_late(est_trigger_t* const self) {
 /// bits the first ones are small.
 #define EST_LONE_LEAST 6.0F
 #define EST_LONE_RATIO 30.0F
+
+/// Part of the ceiling below which the sum of another reading explains an outlier.
+#define EST_LONE_EXPLAINED 0.5F
 
 /// Scale of the innovation before it is squared; a power of two, so that nothing is rounded. The scaled square
 /// overflows from 1.1e15 on, which no plant with codes below EST_CODE_LIMIT reaches: theta then has overflowed, or is

@@ -258,7 +258,7 @@ def struck(
 
 
 @pytest.mark.parametrize("edge_instants", [LOCKED, MAY_SLIP])
-@pytest.mark.parametrize("deviation", [20.0, -100.0, 1e4])
+@pytest.mark.parametrize("deviation", [45.0, -100.0, 1e4])
 @pytest.mark.parametrize("at", [1000, 1009, 1010, 1011, 1015, 1022, 1023])
 def test_lone_outlier_raises_no_alarm_and_leaves_theta(
     estimator: Estimator, at: int, deviation: float, edge_instants: int

@@ -53,6 +53,12 @@ SLOPE_N = 5
 BRIDGED_MAX, BRIDGE_PRECISION = 8, 0.6
 """Longest gap that is bridged, and smallest precision of the whitening at which it is."""
 
+OUTLIER_BRIDGED = 255
+"""Number of predicted samples that stands for an outlier: its y was predicted, and its u is known."""
+
+AT_EDGE_N = 3
+"""Samples after an edge in which an outlier is one at the edge."""
+
 CODE_LIMIT = 1e6
 """Code beyond which no sample is predicted."""
 
@@ -159,6 +165,7 @@ class ReferenceEstimator:
         self.misfit = 0.0  # evidence that each edge is displaced otherwise
         self.edges_vary = False
         self.bridged_n = 0  # samples before the next one whose y was predicted
+        self.edge_outliers = [False] * 3  # an outlier came right after the last edge, and those before
         self.slipped: Vector | None = None  # delta after a slip, valid from the next sample on
         self._is_doubtful = False
         self._forms: tuple[tuple[float, float], NDArray[np.float64]] | None = None
@@ -303,12 +310,14 @@ class ReferenceEstimator:
             self.doubt.age_n += 1
             if self.doubt.age_n > DOUBT_N:
                 self.doubt = None
-        if edge and self.bridged_n:  # the instant of the edge is unknown
+        if edge and 0 < self.bridged_n < OUTLIER_BRIDGED:  # the instant of the edge is unknown
             self.since_n += 1
             self._forget()
             self.u = [u]
             return
         is_slope = self.since_n < SLOPE_N
+        if edge:
+            self.edge_outliers = [False, *self.edge_outliers[:2]]
         self.since_n = 0 if edge else self.since_n + 1
         instants = "anywhere" if self.edges_vary else self.config.edge_instants
         if edge and instants == "anywhere":
@@ -421,16 +430,17 @@ class ReferenceEstimator:
         return step
 
     def _is_lone_outlier(self, innovation: float, variance: float) -> bool:
-        applies = self._is_delta and self._can_bridge
+        returns = self.since_n < AT_EDGE_N and any(self.edge_outliers[1:])
+        applies = self._is_delta and self._can_bridge and not returns
         return applies and self.trigger.is_lone_outlier(innovation, variance, in_doubt=self.doubt is not None)
 
     def _set_aside(self, innovation: float) -> ReferenceStep:
         """Predict the output of a lone outlier, and let the next sample decide."""
         self.whitener.past[0][-1] -= innovation
         self.trigger.set_aside()
-        if self.doubt is not None and self.doubt.age_n > DOUBT_N // 2:  # the few innovations left would decide it
-            self.doubt = None
-        self.bridged_n = 1
+        self.doubt = None
+        self.bridged_n = OUTLIER_BRIDGED
+        self.edge_outliers[0] |= self.since_n < AT_EDGE_N
         return self._stepped(self.trigger.statistic, 0, innovation)
 
     def _watch_scale(self, equation: Vector, square: float) -> None:

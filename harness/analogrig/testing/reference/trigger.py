@@ -14,8 +14,9 @@ NEAR = 0.003
 RIVAL_NEAR = 3e-4
 """The same of the distance between two readings of an edge, which share most of their rounding."""
 
-LONE_LEAST, LONE_RATIO = 6.0, 30.0
-"""Smallest term of a lone outlier, in ceilings without the inflation, and its smallest ratio to the sum before it."""
+LONE_LEAST, LONE_RATIO, LONE_EXPLAINED = 6.0, 30.0, 0.5
+"""Smallest term of a lone outlier, in ceilings without the inflation, and its smallest ratio to the sum before it; part
+of the ceiling below which the sum of another reading explains it."""
 
 
 class Meaning(Enum):
@@ -93,12 +94,14 @@ class ReferenceTrigger:
         term = GAIN * innovation * innovation / (variance * self.scale.expected)
         before = self.statistic + max(self.scale.correlation.lead, 0.0) - term + DRIFT
         threshold = max(LONE_RATIO * before, LONE_LEAST * self._ceiling / self.scale.inflation)
-        self.is_doubtful |= abs(term - threshold) < NEAR * threshold or (in_doubt and 0.0 < min(self.rivals) < NEAR)
-        return term > threshold and not (in_doubt and min(self.rivals) <= 0.0)
+        margin = min(self.rivals) - LONE_EXPLAINED * self._ceiling
+        self.is_doubtful |= abs(term - threshold) < NEAR * threshold
+        self.is_doubtful |= in_doubt and abs(margin) < NEAR * (1.0 + self._ceiling)
+        return term > threshold and not (in_doubt and margin < 0.0)
 
     def set_aside(self) -> None:
-        """Restart the statistic of every reading after a lone outlier."""
-        self.statistic, self.rivals = 0.0, [0.0, 0.0]
+        """Restart the statistic after a lone outlier."""
+        self.statistic = 0.0
         if self.scale.is_open:
             self.scale.correlation.restart_products()
         self.scale.correlation.forget()
