@@ -365,16 +365,6 @@ EST_INLINE bool is_on_trial(const est_t* const self) {
 #endif
 }
 
-/// True iff the previous y was predicted.
-static bool on_bridge(const est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    return self->bridged_n > 0U;
-#else
-    (void)self;
-    return false;
-#endif
-}
-
 /// True iff the previous sample is missing, and was predicted.
 static bool in_gap(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
@@ -822,7 +812,7 @@ EST_ROBUST_SHARED bool is_lone_outlier(const est_t* const self, const float term
     const float reached = self->trigger.statistic + est_max(self->correlation.lead, 0.0F);  // sum of the first reading
     const float before  = (reached - term) + EST_CUSUM_DRIFT;
     const float least   = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
-    return (term > est_max(before * EST_LONE_RATIO, least)) && (term < FLT_MAX) && !on_bridge(self) &&
+    return (term > est_max(before * EST_LONE_RATIO, least)) && (term < FLT_MAX) && (self->bridged_n == 0U) &&
            is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
 #else
     (void)self;
