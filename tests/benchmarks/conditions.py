@@ -234,6 +234,12 @@ OWN: Sequence[Condition] = (
         ("noise",),
     ),
     Condition(
+        "spikes",
+        "impulses of 100 LSB on 0.05 % of the samples",
+        Emulated(SQUARE, disturb=impulses(0.0005, 100.0)),
+        tolerated=("noise",),
+    ),
+    Condition(
         "impulses-1",
         "impulses of 8 LSB on 1 % of the samples",
         Emulated(SQUARE, disturb=impulses(0.01, 8.0)),
