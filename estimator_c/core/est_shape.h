@@ -56,7 +56,7 @@
 #endif
 
 /// True iff some feature of the build observes the edges of u.
-#define EST_KNOWS_EDGES (EST_WITH_EDGES || EST_WITH_ADAPTATION || EST_WITH_WATCH)
+#define EST_KNOWS_EDGES (EST_WITH_EDGES || EST_WITH_ADAPTATION || EST_WITH_WATCH || EST_WITH_ROBUSTNESS)
 
 /// Number of stored values of u, including u(k): that of the longest model, because a loop of fixed length is faster.
 /// To see an edge takes two values; an edge that may be early or late takes one more than the model.

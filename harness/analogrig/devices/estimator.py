@@ -67,6 +67,9 @@ _COUNTERS = dict.fromkeys(("updated", "missing"), ctypes.c_uint32) | dict.fromke
 )
 """Fields of est_counters_t with their C types."""
 
+_REPORTED = [name for name in _COUNTERS if name != "outliers"]
+"""Counters that devices report, the first ones: no message has the outliers."""
+
 
 _COUNTERS_TYPE = np.dtype(list(_COUNTERS.items()), align=True)
 """The C type est_counters_t."""
@@ -139,9 +142,9 @@ class Estimator:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters since the start, by their names in est_counters_t."""
+        """Counters since the start, by their names in est_counters_t, as far as devices report them."""
         counters = self._c.library_counters(self._state)
-        return {name: int(getattr(counters, name)) for name in _COUNTERS}
+        return {name: int(getattr(counters, name)) for name in _REPORTED}
 
     def run(
         self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None, *, with_theta: bool = True
@@ -183,7 +186,7 @@ class Estimator:
             self._refuse()
         for theta, innovation, statistic, status, alarm, counted in zip(*arrays, counters.tolist(), strict=True):
             output = EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm))
-            yield output, dict(zip(_COUNTERS, counted, strict=True))
+            yield output, dict(zip(_REPORTED, counted, strict=False))
 
     def _room(self, shape: tuple[int, ...], *, with_theta: bool) -> tuple[_Arrays, _Out]:
         """Arrays for theta, innovation, statistic, status and alarm of samples of this shape."""
