@@ -240,6 +240,14 @@ def strike_twice(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG
     codes[340:342, Y] += 70
 
 
+def strike_edges(codes: Codes, missing: NDArray[np.bool_]) -> None:
+    """Outliers after an edge and the next but one, twice after one, and further away; a gap before an edge."""
+    edges = edges_of(codes).tolist()
+    for at in (edges[4] + 2, edges[6] + 2, edges[9] + 3, edges[10] + 3, edges[11], edges[11] + 2):
+        codes[at, Y] += 80
+    missing[edges[8] - 8 : edges[8]] = True
+
+
 FAULT_AT = 420
 """First sample of a faulty channel."""
 
@@ -414,6 +422,7 @@ CASES: Mapping[str, ReferenceCase] = {
     "lone outliers, known noise": ReferenceCase(
         SOFTER_LATER, {**_FIXED, **_ARMED, "noise_estimated": False, "refresh_n": 40}, strike
     ),
+    "outliers at edges": ReferenceCase(SOFTER_LATER, {**_ONE_CLOCK, "stuck_n": 0}, strike_edges),
     "two outliers": ReferenceCase(SOFTER, {**_FIXED, **_ARMED}, strike_twice),
     "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
     "more alarms than may be justified": ReferenceCase(
