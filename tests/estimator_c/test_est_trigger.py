@@ -324,7 +324,7 @@ def test_outlier_after_a_missing_sample_raises_the_alarm(estimator: Estimator) -
 def test_change_that_one_innovation_shows_is_seen_at_the_next_sample(
     estimator: Estimator, parameter: int, factor: float
 ) -> None:
-    """Of low noise: its first innovation may be as large as an outlier."""
+    """With low noise the first innovation after a change may look like an outlier."""
     mass, damping, stiffness = (value * (factor if k == parameter else 1.0) for k, value in enumerate(FRONT))
     changed = (mass, damping, stiffness)
     first_n = []
