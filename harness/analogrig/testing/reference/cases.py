@@ -241,9 +241,9 @@ def strike_twice(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG
 
 
 def strike_edges(codes: Codes, missing: NDArray[np.bool_]) -> None:
-    """Outliers after an edge and the next but one, twice after one, and further away; a gap before an edge."""
+    """Outliers twice after an edge, after the next but one, and further away; a gap before an edge."""
     edges = edges_of(codes).tolist()
-    for at in (edges[4] + 2, edges[6] + 2, edges[9] + 3, edges[10] + 3, edges[11], edges[11] + 2):
+    for at in (edges[4], edges[4] + 2, edges[6] + 2, edges[9] + 2, edges[10] + 3):
         codes[at, Y] += 80
     missing[edges[8] - 8 : edges[8]] = True
 
