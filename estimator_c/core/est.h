@@ -330,7 +330,7 @@ typedef struct {
     bool         alarm;       ///< the plant has changed; estimation restarts with the next sample
     bool         idle;        ///< excitation is lost: the estimate does not improve. Always: edge_codes is too large
     float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1) [codes]; 0 unless EST_UPDATED or EST_OUTLIER
-    float        statistic;  ///< of the trigger after this sample, before an alarm or a gap resets it; 0 of EST_OUTLIER
+    float statistic;  ///< of the trigger after this sample, before an alarm or a gap resets it; 0 for EST_OUTLIER
 } est_step_t;
 
 /// Counters since est_init(). They saturate instead of wrapping.
@@ -426,7 +426,7 @@ typedef struct {
 typedef struct {
     uint8_t work;           ///< of each step of this block; 0: none
     uint8_t turn;           ///< blocks so far
-    uint8_t edge_outliers;  ///< a bit for each edge of late, the last one first: it was followed by an outlier
+    uint8_t edge_outliers;  ///< a bit for each recent edge, the last one first: an outlier came right after it
     float   last[2];        ///< innovations of the last two equations, newest first [codes]
     float   partial[2];     ///< partial correlations at lags 1 and 2
     float   lead;           ///< sum of the first reading less that of the second

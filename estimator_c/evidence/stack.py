@@ -22,7 +22,7 @@ LEVELS = ("-O0", "-Os", "-O2", "-O3")
 CALL = re.compile(r"^\s+(?:r?call|bl?|b\.w|r?jmp)\s+([A-Za-z_][\w.]*)\s*$", re.MULTILINE)
 FUNCTION = re.compile(r"^([A-Za-z_][\w.]*):\n(.*?)^\s+\.size\s+\1,", re.MULTILINE | re.DOTALL)
 CLONE = re.compile(r"(\.(?:constprop|isra|part))\.\d+\b")
-"""Number of a copy of a function, which the list of the frames lacks."""
+"""Name and number of a copy that gcc makes of a function. The list of the frames lacks the number."""
 FRAME = re.compile(r"^.*:([\w.]+)\t(\d+)\t(?:static|dynamic,bounded)$", re.MULTILINE)
 
 

@@ -219,7 +219,7 @@ def test_peak_where_theta_is_uncertain_raises_no_alarm_with_a_second_reading(est
     assert alarms[0.7] == 0
 
 
-def test_single_outlier_is_an_alarm_in_both_readings(estimator: Estimator) -> None:
+def test_single_innovation_of_8_deviations_is_an_alarm_in_both_readings(estimator: Estimator) -> None:
     innovations = correlated((0.7, 0.0), 8100, 1)
     innovations[8050] = 8.0
     assert estimator.init(**GIVEN)

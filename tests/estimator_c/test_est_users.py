@@ -209,6 +209,11 @@ def test_stack_of_a_step_is_what_the_header_says(
     assert 100 < stack.stack_bytes(processor, level, tmp_path) <= most
 
 
+def test_copy_of_a_function_has_the_name_of_its_frame() -> None:
+    """The assembly of gcc numbers copies, the list of the frames does not."""
+    assert stack.CLONE.sub(r"\1", "bl\tdispatch.constprop.0") == "bl\tdispatch.constprop"
+
+
 def test_deepest_chain_of_calls() -> None:
     calls = {"root": ["a", "b"], "a": ["leaf", "of_a_library"], "b": ["a"], "leaf": []}
     frames = {"root": 8, "a": 16, "b": 4, "leaf": 32, "other": 1000}

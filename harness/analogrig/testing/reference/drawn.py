@@ -33,7 +33,7 @@ OTHER_PLANTS = 1000
 """First number of the cases with a plant that no pots show."""
 
 OUTLIERS = 10_000
-"""First number of the cases with lone outliers: those of the number less this one."""
+"""First number of the cases with lone outliers. Case OUTLIERS + n is case n with outliers."""
 
 SHAPES = ("square", "square", "square", "square", "prbs", "pulse", "sine")
 
@@ -71,7 +71,7 @@ class Draw:
 def drawn(number: int) -> ReferenceCase:
     """Case with this number: below OTHER_PLANTS of every kind, every sixth long; then of a plant that no pots show.
 
-    From OUTLIERS on those cases anew, with lone outliers.
+    From OUTLIERS on, case n is that of n - OUTLIERS with lone outliers.
     """
     draw = Draw(number)
     if number >= OUTLIERS:
