@@ -86,6 +86,7 @@ SUCCESSIONS = dataclasses.replace(
 )
 HEALTHY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 420)
 FAULTY = _scenario("healthy", dataclasses.replace(_FREE, phase=0.133), 520)
+LONG = _scenario("healthy, long", dataclasses.replace(_FREE, phase=0.133), 2000)
 LATE = _scenario("late edges", dataclasses.replace(_FREE, phase=0.0 + 4e-5, drift_ppm=-20.0), 520)
 EARLY = _scenario("early edges", dataclasses.replace(_FREE, phase=1.0 - 4e-5, drift_ppm=20.0), 520)
 DISPLACED = _scenario("displaced edges", dataclasses.replace(_FREE, frequency_hz=211.3), 600)
@@ -246,6 +247,16 @@ def strike_edges(codes: Codes, missing: NDArray[np.bool_]) -> None:
     for at in (edges[4], edges[4] + 2, edges[6] + 2, edges[9] + 2, edges[10] + 3):
         codes[at, Y] += 80
     missing[edges[8] - 8 : edges[8]] = True
+
+
+def strike_slow_noise(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
+    """A slow noise, and an outlier in every third block, at each phase of a block."""
+    steps = np.random.default_rng(1995).normal(0.0, 1.5, len(codes))
+    noise = np.zeros(len(codes))
+    for n in range(1, len(codes)):
+        noise[n] = 0.8 * noise[n - 1] + steps[n]
+    codes[:, Y] = np.round(codes[:, Y] + noise)
+    codes[260::47, Y] += 250
 
 
 FAULT_AT = 420
@@ -423,6 +434,7 @@ CASES: Mapping[str, ReferenceCase] = {
         SOFTER_LATER, {**_FIXED, **_ARMED, "noise_estimated": False, "refresh_n": 40}, strike
     ),
     "outliers at edges": ReferenceCase(SOFTER_LATER, {**_ONE_CLOCK, "stuck_n": 0}, strike_edges),
+    "outliers in slow noise": ReferenceCase(LONG, {**_FIXED, **_ARMED}, strike_slow_noise),
     "two outliers": ReferenceCase(SOFTER, {**_FIXED, **_ARMED}, strike_twice),
     "K falls after a noisy force": ReferenceCase(SOFTER_LATER, _ARMED, _noisy_force),
     "more alarms than may be justified": ReferenceCase(
