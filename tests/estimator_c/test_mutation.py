@@ -17,6 +17,11 @@ def test_explanations_are_of_mutants_that_there_are() -> None:
     assert mutate.explained().keys() <= {mutant.key for mutant in mutate.mutants()}
 
 
+def test_functions_whose_type_stands_on_a_line_of_its_own_are_altered() -> None:
+    named = {mutant.function for mutant in mutate.mutants()}
+    assert {"judge_readings", "est_equation_update_theta", "est_equation_measure"} <= named
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
