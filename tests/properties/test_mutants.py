@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.properties.mutants import Build, every_mutant
+from estimator_c.evidence.mutate import explained
+from tests.properties.mutants import SURVIVORS, Build, every_mutant
+
+
+def test_survivors_with_a_reason_are_mutants_that_there_are() -> None:
+    assert explained(SURVIVORS).keys() <= {mutant.key for mutant in every_mutant()}
 
 
 def test_a_mutant_of_the_library_has_other_code(tmp_path: Path) -> None:

@@ -99,6 +99,11 @@ def _exit_guard() -> ctypes.CDLL:
     return guard
 
 
+def unwritten(size: int) -> ctypes.Array[ctypes.c_char]:
+    """Memory of so many bytes as a device may find it: not zero."""
+    return ctypes.create_string_buffer(b"\xa5" * size, size)
+
+
 class LibraryDevice:
     """The device in a shared library, behind its serial port or its CAN port."""
 
@@ -123,7 +128,7 @@ class LibraryDevice:
         size.restype = ctypes.c_size_t
         self.run.restype = ProgressStruct
         self.run.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t]
-        self.state = ctypes.create_string_buffer(size())
+        self.state = unwritten(size())
         identity = IdentityStruct(catalogue_hash, boot_nonce, input_blocks, FirmwareId.LIBRARY)
         init(self.state, ctypes.byref(identity), *arguments)
 
@@ -143,7 +148,7 @@ class MemoryWire(LibraryDevice):
     ) -> None:
         """Boot a device; parameters and errors as ``LibraryDevice``."""
         super().__init__("serial", boot_nonce=boot_nonce, catalogue_hash=catalogue_hash, library=library)
-        self._output = ctypes.create_string_buffer(_OUTPUT_BYTES)
+        self._output = unwritten(_OUTPUT_BYTES)
         self.clock = VirtualClock() if clock is None else clock
         self._answers = b""
 

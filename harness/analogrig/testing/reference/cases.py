@@ -209,8 +209,8 @@ def hold(codes: Codes, missing: NDArray[np.bool_]) -> None:
 
 
 def hum(codes: Codes, missing: NDArray[np.bool_]) -> None:  # noqa: ARG001
-    """Two codes of hum on the displacement, with a period of 440 samples."""
-    disturbance = 2.0 * np.sin(2.0 * np.pi * np.arange(len(codes)) / 440.0)
+    """Two codes of hum on the displacement, with a period of 142 samples: its frequency fills two bytes."""
+    disturbance = 2.0 * np.sin(2.0 * np.pi * np.arange(len(codes)) / 142.0)
     codes[:, Y] = np.round(codes[:, Y] + disturbance)
 
 
