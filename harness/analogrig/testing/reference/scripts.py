@@ -274,7 +274,7 @@ def damage(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG0
         *((good[:cut] + b"\0", 1) for cut in range(2, len(good) - 1)),
         *((good[:at] + bytes([good[at] ^ 0x40]) + good[at + 1 :], 1) for at in range(1, len(good) - 1)),
         *((full[:at] + bytes([full[at] ^ 0x81]) + full[at + 1 :], 1) for at in range(2, len(full) - 1, 5)),
-        *((frame.encode(bytes([0x7F]) + bytes(length)), 1) for length in (0, 8)),
+        *((frame.encode(bytes([0x7F]) + bytes(length)), 1) for length in (0, 1, 8)),
         *((frame.encode(bytes([layout.id]) + bytes(layout.length + more)), 1)
           for layout in LAYOUTS.values() for more in (-1, 1)),
         (frame.encode(pack(Control(0, 0, 0)), CATALOGUE_HASH ^ 1), 1),
