@@ -15,6 +15,7 @@ from analogrig.catalogue import (
     Element,
     Estimate,
     Firmware,
+    FirmwareId,
     Hello,
     Identify,
     Key,
@@ -90,6 +91,8 @@ def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[s
         device = ReferenceDevice(hello, firmware, ReferenceSettings(most), on_can=isinstance(link, CanLink))
         if hello.theta_max < EstimatorConfig().parameters or not firmware.input_blocks:
             yield f"{hello} and {firmware} state no room for the default configuration"
+        if "in-process" in description.capabilities and firmware.firmware_id != FirmwareId.LIBRARY:
+            yield f"expected the firmware of a library, {FirmwareId.LIBRARY}, received {firmware}"
         for batch in _batches(SCRIPTS[script](talk.numbers, ReferenceSettings(most)), in_blocks=talk.carries_blocks):
             if not isinstance(batch, list):
                 talk.disturb(batch)
