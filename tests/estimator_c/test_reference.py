@@ -17,6 +17,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.run import INPUT, OUTPUT, missing_samples
 from analogrig.testing.properties.described import ROUNDING, STATISTIC_ROUNDING, THETA_ROUNDING
 from analogrig.testing.properties.test_described import DRAWN, TELLING
+from analogrig.testing.reference import cases
 from analogrig.testing.reference.cases import SpoiledRig
 from analogrig.testing.reference.comparison import Expected, expected_of
 from analogrig.testing.reference.drawn import drawn
@@ -26,6 +27,8 @@ from tests.estimator_c.test_est_trigger import FRONT, suspension
 N = 900
 FEW_DRAWN = (*DRAWN[:40], *TELLING)
 """Drawn cases; the shipped properties try them all."""
+FEW_NAMED = tuple(name for name in cases.CASES if "outliers" in name or "alarms" in name)
+"""Named ones, as few: the records here have no outliers, and no alarms in close succession."""
 FIXED: dict[str, Any] = {"refresh_n": 0, "warm_up_n": 0}
 LOCKED: dict[str, Any] = FIXED | {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked", "forgetting": 1.0}
 
@@ -101,10 +104,14 @@ def test_estimator_and_reference_agree(case: str, drift: float, missing: list[in
     assert (estimator.counters["slips"], estimator.counters["refreshes"]) == (reference.slips, reference.refreshes)
 
 
+def case_of(name: str) -> cases.ReferenceCase:
+    return drawn(int(name)) if name.isdecimal() else cases.CASES[name]
+
+
 @functools.cache
-def drawn_samples(number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_], Expected]:
-    """Codes of a drawn case, valid samples, and the answers of the reference."""
-    case = drawn(number)
+def played(name: str) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_], Expected]:
+    """Codes of a named or drawn case, valid samples, and the answers of the reference."""
+    case = case_of(name)
     with open_rig("emulator") as rig:
         blocks = list((SpoiledRig(rig, case.spoil) if case.spoil else rig).perform(case.scenario, 1).blocks)
     codes = np.concatenate([block.codes for block in blocks])
@@ -113,10 +120,10 @@ def drawn_samples(number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16], 
     return u, y, valid, expected_of(EstimatorConfig(**case.settings), u, y, valid)
 
 
-@pytest.mark.parametrize("number", FEW_DRAWN)
-def test_estimator_and_reference_agree_in_drawn_cases(number: int) -> None:
-    u, y, valid, expected = drawn_samples(number)
-    steps = Estimator(EstimatorConfig(**drawn(number).settings)).run(u, y, valid)
+@pytest.mark.parametrize("case", [*map(str, FEW_DRAWN), *FEW_NAMED])
+def test_estimator_and_reference_agree_in_shipped_cases(case: str) -> None:
+    u, y, valid, expected = played(case)
+    steps = Estimator(EstimatorConfig(**case_of(case).settings)).run(u, y, valid)
     sure = slice(0, expected.sure_n)
     assert [k for k in steps.alarms if k < expected.sure_n] == [k for k in expected.alarms if k < expected.sure_n]
     for found, wanted, allowed in (
