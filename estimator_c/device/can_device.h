@@ -33,7 +33,8 @@ typedef struct {
     uint8_t  payload[ANALOGRIG_LENGTH_MAX];  ///< payload of the message that is being answered
 } can_device_t;
 
-/// Prepare the device: default configuration, stopped. `is_fd`: its controller supports CAN FD.
+/// Prepare the device: default configuration, stopped. The state may hold anything before. `is_fd`: its controller
+/// supports CAN FD.
 void can_device_init(can_device_t* self, const device_identity_t* identity, bool is_fd);
 
 /// Enter a frame. The device must not be busy (asserted). Cost: as device_enter().

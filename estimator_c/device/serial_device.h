@@ -28,7 +28,7 @@ typedef struct {
     uint32_t        dropped;  ///< dropped frames already reported to the device
 } serial_device_t;
 
-/// Prepare the device: default configuration, stopped, at the beginning of a frame.
+/// Prepare the device: default configuration, stopped, at the beginning of a frame. The state may hold anything before.
 void serial_device_init(serial_device_t* self, const device_identity_t* identity);
 
 /// Run the device as device_progress_t describes, on bytes. An answer takes SERIAL_DEVICE_ANSWER bytes.

@@ -125,7 +125,7 @@ WHOLE = re.compile(r"\b(\d+)[Uu]\b")
 REAL = re.compile(r"\b(\d+\.\d+(?:e-?\d+)?)F\b")
 CONDITION = re.compile(r"\b(?:if|while) \((.*)\) \{$")
 STATEMENT = re.compile(r"^ +(?!return|break|const|static|float|bool|u?int\w*_t|est_\w+_t |\(void\))[\w*(][^;]*;$")
-DEFINITION = re.compile(r"^(?!#|typedef|static const)(?:\w[\w* ]*?\b)?(\w+)\(")
+DEFINITION = re.compile(r"^(?!#|typedef|static const|__attribute__)(?:\w[\w* ]*?\b)?(\w+)\(")
 CONSTANT = re.compile(r"^#define (\w+) \S*\d")
 SETTING = re.compile(r"EST_(?:N[ABCK]|THETA)_MAX|EST_VERSION|EST_WITH|EST_FIXED")
 

@@ -28,7 +28,7 @@ N = 900
 FEW_DRAWN = (*DRAWN[:40], *TELLING)
 """Drawn cases; the shipped properties try them all."""
 FEW_NAMED = tuple(name for name in cases.CASES if "outliers" in name or "alarms" in name)
-"""Named ones, as few: the records here have no outliers, and no alarms in close succession."""
+"""Named cases with outliers, or with alarms in close succession, which the records of this file lack."""
 FIXED: dict[str, Any] = {"refresh_n": 0, "warm_up_n": 0}
 LOCKED: dict[str, Any] = FIXED | {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked", "forgetting": 1.0}
 

@@ -319,8 +319,8 @@ def test_device_does_not_count_what_it_said_itself_where_the_bus_shows_it() -> N
 
 def test_two_devices_on_one_bus_are_found_out() -> None:
     def greet_often() -> None:
-        """The first answer of one may come after the handshake."""
-        with on_virtual("twins").connect() as dut:
+        """Connect, and request the identity 100 times."""
+        with on_virtual("twins").connect() as dut:  # the other device may answer after the handshake
             for _ in range(100):
                 catalogue(dut).identity()
 

@@ -268,6 +268,11 @@ def _page(
         f"{time.strftime('%Y-%m-%d')}, commit {commit.stdout.strip()}, seed {seed}:",
         "the shipped properties alone, on the device in this process, each mutant until the first property",
         "fails.",
+        *(
+            ("With `--again` the survivors of a run before were tried anew, and no others.",)
+            if "--again" in command
+            else ()
+        ),
         "",
         *textwrap.wrap(f"**{_score(outcomes, survivors)}.**", WIDTH),
         "",

@@ -54,6 +54,11 @@ def test_device_in_this_process_has_every_property(tmp_path: Path) -> None:
     assert "skipped" not in last
 
 
+def test_device_whose_file_states_a_rate_of_false_alarms_takes_the_settings_of_the_cases(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('kind = "inproc"\n[estimator]\narl0 = 2e5\n')
+    assert "5 passed" in run(tmp_path, "mine.toml", "-k", "states_a_hum or prediction or no_trigger or extended")
+
+
 def test_device_program_has_every_property_that_a_line_has_time_for(tmp_path: Path) -> None:
     assert "9 passed" in run(tmp_path, "host?exchange=block", "-k", f"not ({LONG})")
 

@@ -100,7 +100,7 @@ def _exit_guard() -> ctypes.CDLL:
 
 
 def unwritten(size: int) -> ctypes.Array[ctypes.c_char]:
-    """Memory of so many bytes as a device may find it: not zero."""
+    """Buffer of ``size`` bytes that are not zero, so that a device which relies on zeroed memory fails."""
     return ctypes.create_string_buffer(b"\xa5" * size, size)
 
 

@@ -92,7 +92,7 @@ def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[s
         if hello.theta_max < EstimatorConfig().parameters or not firmware.input_blocks:
             yield f"{hello} and {firmware} state no room for the default configuration"
         if "in-process" in description.capabilities and firmware.firmware_id != FirmwareId.LIBRARY:
-            yield f"expected the firmware of a library, {FirmwareId.LIBRARY}, received {firmware}"
+            yield f"expected firmware {FirmwareId.LIBRARY:d} of a device in this process, as given, received {firmware}"
         for batch in _batches(SCRIPTS[script](talk.numbers, ReferenceSettings(most)), in_blocks=talk.carries_blocks):
             if not isinstance(batch, list):
                 talk.disturb(batch)
