@@ -12,6 +12,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Edit = Mapping[tuple[str, ...], Any]
+"""Change of a program file: value by place, ("states", "x", "full"); None deletes the key."""
+
 
 class EmulatorError(Exception):
     """Base of the emulator's errors; element: name of the element at fault, if any."""
@@ -30,7 +36,29 @@ class PotError(EmulatorError):
 
 
 class ProgramError(EmulatorError):
-    """Invalid program file; the message names the file, the place and the cure."""
+    """Invalid program file; the message names the file, the place and the cure.
+
+    edits: changes of the file that may cure it, none of them tried. otherwise: cure in words where none of them does.
+    """
+
+    def __init__(self, message: str = "", *, edits: Sequence[Edit] = (), otherwise: str = "") -> None:
+        super().__init__(message)
+        self.edits, self.otherwise = tuple(edits), otherwise
+
+    def __str__(self) -> str:
+        return f"{super().__str__()}; {self.otherwise}" if self.otherwise else super().__str__()
+
+    def at(self, place: str) -> ProgramError:
+        """The same error with a place before its message."""
+        return ProgramError(f"{place}: {super().__str__()}", edits=self.edits, otherwise=self.otherwise)
+
+    def advised(self, advice: str) -> ProgramError:
+        """The same error with advice that was tried, and nothing more to try."""
+        return ProgramError(super().__str__(), otherwise=advice)
+
+
+class UnfitError(ProgramError):
+    """Equations that machines of real parts cannot play at any full scale."""
 
 
 class ExcitationError(EmulatorError):

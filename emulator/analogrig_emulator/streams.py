@@ -19,6 +19,8 @@ from analogrig_emulator.engine import library
 
 def uniforms(seeds: Sequence[int], stream: int, count: int) -> NDArray[np.float64]:
     """Uniform numbers from 0 to 1, as of random(count): (seeds, count)."""
+    if not library.has_streams():
+        return np.array([each.random(count) for each in _generators(seeds, stream)]).reshape(len(seeds), count)
     states, out = _states(seeds, stream), np.empty((len(seeds), count))
     library.load().engine_draw(*out.shape, states.ctypes.data, out.ctypes.data)
     return out
@@ -26,17 +28,28 @@ def uniforms(seeds: Sequence[int], stream: int, count: int) -> NDArray[np.float6
 
 def normals(seeds: Sequence[int], stream: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Standard normal numbers, as of standard_normal(shape): (seeds, *shape)."""
+    if not library.has_streams():
+        numbers = [each.standard_normal(shape) for each in _generators(seeds, stream)]
+        return np.array(numbers).reshape(len(seeds), *shape)
     return _next_normals(_states(seeds, stream), shape)
+
+
+def _generators(seeds: Sequence[int], stream: int) -> list[np.random.Generator]:
+    """Streams of an engine without its fast parts."""
+    return [np.random.default_rng([seed, stream]) for seed in seeds]
 
 
 class NormalStream:
     """Standard normal numbers of one seed, in a third of the time of numpy's generator."""
 
     def __init__(self, seed: int, stream: int) -> None:
-        self._states = _states([seed], stream)
+        self._generator = None if library.has_streams() else _generators([seed], stream)[0]
+        self._states = np.empty((0, 4), np.uint64) if self._generator else _states([seed], stream)
 
     def standard_normal(self, size: tuple[int, ...], /) -> NDArray[np.float64]:
         """The next numbers: (*size,)."""
+        if self._generator:
+            return self._generator.standard_normal(size)
         return _next_normals(self._states, size).reshape(size)
 
 

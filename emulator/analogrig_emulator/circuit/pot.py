@@ -78,6 +78,14 @@ def legs_ohm(dial: float, track_ohm: float) -> tuple[float, float]:
     return max((1.0 - dial) * track_ohm, end_ohm), max(dial * track_ohm, end_ohm)
 
 
+def _inward(coefficient: float, to: float) -> str:
+    """Coefficient in five digits, rounded towards another: the text is one that the track has."""
+    text = float(f"{coefficient:.5g}")
+    step = 10.0 ** (math.floor(math.log10(coefficient)) - 4) if coefficient else 0.0
+    outside = text < coefficient if to > coefficient else text > coefficient
+    return f"{text + math.copysign(step, to - coefficient) if outside else text:.5g}"
+
+
 @dataclass(frozen=True)
 class PotModel:
     """Real pot: coefficient of a dial under load, and the inverse.
@@ -118,12 +126,14 @@ class PotModel:
 
         Raises PotError naming the pot if the dial lies beyond an end stop.
         """
+        low, high = (self.coefficient(end, load_ohm) for end in (0.0, 1.0))
+        if not low <= coefficient <= high * (1.0 + _ROUNDING):
+            track = f"{_inward(low, high)} to {_inward(high, low)}"
+            raise PotError(f"pot {name}: coefficient {coefficient:.6g} is beyond the track ({track})")
         driven_ohm = load_ohm + self.wiper_ohm
-        fraction = dial_for(coefficient * (driven_ohm / load_ohm), self._total_ohm, driven_ohm, name)
+        fraction = dial_for(min(coefficient, high) * (driven_ohm / load_ohm), self._total_ohm, driven_ohm, name)
         dial = fraction * (self._total_ohm / self.track_ohm) - self.end_ohm / self.track_ohm
-        if not 0.0 <= dial <= 1.0:
-            raise PotError(f"pot {name}: coefficient {coefficient:.6g} lies beyond an end stop")
-        return dial
+        return min(max(dial, 0.0), 1.0)
 
     def resting(self, dial: float) -> float:
         """Dial of the winding nearest to a dial, where the wiper rests."""

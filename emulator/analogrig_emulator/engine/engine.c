@@ -73,21 +73,6 @@ void engine_free(engine_t* const self) {
 
 // ---------------------------------------------    CIRCUIT AND STATE   ---------------------------------------------
 
-/// Number of elements of each array of engine_system_t.
-typedef struct {
-    size_t abc, g, cde, w_phi, lmn, y_phi, kinks, products;
-} sizes_t;
-
-static sizes_t sizes_of(const engine_t* const self) {
-    const size_t n = (size_t)self->states, q = (size_t)self->kinks, p = (size_t)self->outputs;
-    const size_t columns = (size_t)self->columns;
-    return (sizes_t){ n * columns, n * q, q * columns, q * q, p * columns, p * q, q, (size_t)self->products };
-}
-
-static bool is_equal(size_t count, size_t size, const void* one, const void* other) {
-    return count == 0U || memcmp(one, other, count * size) == 0;
-}
-
 static bool holds(const engine_t* const self, const circuit_t* circuit, const engine_system_t* system) {
     const sizes_t sizes = sizes_of(self);
     return circuit->is_set && is_equal(sizes.abc, sizeof(double), circuit->abc, system->abc) &&
@@ -98,28 +83,6 @@ static bool holds(const engine_t* const self, const circuit_t* circuit, const en
            is_equal(sizes.y_phi, sizeof(double), circuit->y_phi, system->y_phi) &&
            is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks) &&
            is_equal(sizes.products, sizeof(engine_product_t), circuit->products, system->products);
-}
-
-/// True if two matrices agree in all columns but the last.
-static bool is_equal_but_last(int rows, int columns, const double* one, const double* other) {
-    bool equal = true;
-    for (int i = 0; i < rows && equal; i++) {
-        equal = is_equal((size_t)columns - 1U, sizeof(double), &one[i * columns], &other[i * columns]);
-    }
-    return equal;
-}
-
-/// True if a circuit differs from the one kept in its constants alone, as by the offsets of amplifiers.
-static bool is_variant(const engine_t* const self, const circuit_t* circuit, const engine_system_t* system) {
-    const sizes_t sizes = sizes_of(self);
-    return circuit->is_set && self->products == 0 &&
-           is_equal_but_last(self->states, self->columns, circuit->abc, system->abc) &&
-           is_equal(sizes.g, sizeof(double), circuit->g, system->g) &&
-           is_equal_but_last(self->kinks, self->columns, circuit->cde, system->cde) &&
-           is_equal(sizes.w_phi, sizeof(double), circuit->w_phi, system->w_phi) &&
-           is_equal_but_last(self->outputs, self->columns, circuit->lmn, system->lmn) &&
-           is_equal(sizes.y_phi, sizeof(double), circuit->y_phi, system->y_phi) &&
-           is_equal(sizes.kinks, sizeof(engine_kink_t), circuit->kink, system->kinks);
 }
 
 /// Take `count` elements of a block.
@@ -158,25 +121,9 @@ static circuit_t* new_circuit(const engine_t* const self) {
     return circuit;
 }
 
-static void copy(size_t count, size_t size, const void* from, void* to) {
-    if (count > 0U) {
-        memcpy(to, from, count * size);
-    }
-}
-
-static void pack_circuit(const engine_t* const self, circuit_t* circuit) {
+void circuit_pack(const engine_t* const self, circuit_t* circuit) {
     panels_pack(self->kinks, self->columns, self->columns, circuit->cde, circuit->cde_panels);
     panels_pack(self->outputs, self->columns, self->columns, circuit->lmn, circuit->lmn_panels);
-}
-
-/// Give the constants of a variant to a circuit.
-static void retune(const engine_t* const self, const engine_system_t* system, circuit_t* circuit) {
-    const sizes_t sizes = sizes_of(self);
-    copy(sizes.abc, sizeof(double), system->abc, circuit->abc);
-    copy(sizes.cde, sizeof(double), system->cde, circuit->cde);
-    copy(sizes.lmn, sizeof(double), system->lmn, circuit->lmn);
-    pack_circuit(self, circuit);
-    circuit->tuning++;
 }
 
 /// Put a circuit in the place of the one set longest ago, and make it the present one.
@@ -205,16 +152,14 @@ static engine_status_t keep_circuit(engine_t* const self, const engine_system_t*
     products_set_laws(self, circuit->products);
     kinks_list_feeding(self);
     circuit->is_set = kinks_are_unique(self);
-    pack_circuit(self, circuit);
+    circuit_pack(self, circuit);
     return circuit->is_set ? ENGINE_OK : ENGINE_NOT_UNIQUE;
 }
 
-/// The kept circuit that fits; NULL if there is none.
-static circuit_t* find_circuit(const engine_t* const  self,
-                               const engine_system_t* system,
-                               bool (*fits)(const engine_t*, const circuit_t*, const engine_system_t*)) {
+/// The kept circuit that equals a system; NULL if there is none.
+static circuit_t* find_circuit(const engine_t* const self, const engine_system_t* system) {
     int place = 0;
-    while (place < CIRCUITS && self->circuits[place] != NULL && !fits(self, self->circuits[place], system)) {
+    while (place < CIRCUITS && self->circuits[place] != NULL && !holds(self, self->circuits[place], system)) {
         place++;
     }
     return place < CIRCUITS ? self->circuits[place] : NULL;
@@ -226,13 +171,11 @@ engine_status_t engine_set_system(engine_t* const self, const engine_system_t* s
         return ENGINE_OK;
     }
     if (self->has_system) {
-        quiet_leave(self);
+        fast_leave(self);
     }
-    circuit_t*       equal   = find_circuit(self, system, holds);
-    circuit_t* const variant = equal == NULL ? find_circuit(self, system, is_variant) : NULL;
-    if (variant != NULL) {
-        retune(self, system, variant);
-        equal = variant;
+    circuit_t* equal = find_circuit(self, system);
+    if (equal == NULL) {
+        equal = fast_retune_circuit(self, system);
     }
     if (equal != NULL) {
         self->circuit = equal;
@@ -250,7 +193,7 @@ engine_status_t engine_set_system(engine_t* const self, const engine_system_t* s
 
 void engine_get_state(const engine_t* const self, double* x) {
     if (self->is_slow) {
-        quiet_get_state(self, x);
+        fast_get_state(self, x);
     } else {
         memcpy(x, self->z, (size_t)self->states * sizeof x[0]);
     }
@@ -272,7 +215,7 @@ static engine_status_t advance(engine_t* const self, int64_t tick) {
         return products_advance(self, tick);
     }
     while (status == ENGINE_OK && self->now < tick) {
-        if (!quiet_advance(self, tick)) {
+        if (!fast_advance(self, tick)) {
             status = events_advance(self, tick);
         }
     }
@@ -294,7 +237,7 @@ static engine_status_t take_edge(engine_t* const self, int64_t tick, int32_t inp
     if (status != ENGINE_OK) {
         return status;
     }
-    quiet_leave(self);
+    fast_leave(self);
     self->z[column] = level;
     return mode_enter(self);
 }
@@ -308,16 +251,15 @@ static bool is_finite(const engine_t* const self) {
 }
 
 static void record_sample(const engine_t* const self, double* y) {
-    const int length = self->is_slow ? row_length(self) : self->outputs;
-    double    padded[PADDED(2 * ENGINE_MAX_OUTPUTS)];
-    double*   out = length % PANEL == 0 ? y : padded;
+    double  padded[PADDED(ENGINE_MAX_OUTPUTS)];
+    double* out = self->outputs % PANEL == 0 ? y : padded;
     if (self->is_slow) {
-        quiet_read(self, out);
-    } else {
-        self->kernels->multiply(self->outputs, self->columns, self->y_panels, self->z, out);
+        fast_read(self, y);
+        return;
     }
+    self->kernels->multiply(self->outputs, self->columns, self->y_panels, self->z, out);
     if (out != y) {
-        memcpy(y, padded, (size_t)length * sizeof y[0]);
+        memcpy(y, padded, (size_t)self->outputs * sizeof y[0]);
     }
 }
 
@@ -338,29 +280,9 @@ static engine_status_t record_ahead(const engine_t* const self, double* y) {
     self->mode->is_pinned        = true;
     const engine_status_t status = advance(&copy, self->now + self->ahead);
     self->mode->is_pinned        = false;
-    quiet_leave(&copy);
+    fast_leave(&copy);
     record_sample(&copy, y);
     return status;
-}
-
-/// Record the samples of a quiet stretch that come before a tick. Return their number.
-static int64_t run_quiet(engine_t* const self, int64_t before, double* y) {
-    const bool    quiet   = self->is_slow && self->clear == NO_END;
-    const int64_t samples = quiet ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
-    const int     row     = row_length(self);
-    int64_t       k       = 0;
-    while (k < samples) {
-        if (self->slow_age == LEAP - 1 && row % PANEL == 0 && samples - k >= LEAP) {
-            quiet_leap(self, &y[k * row]);
-            k += LEAP;
-        } else {
-            quiet_step(self);
-            record_sample(self, &y[k * row]);
-            k++;
-        }
-    }
-    self->counts.samples += samples > 0 ? samples : 0;
-    return samples > 0 ? samples : 0;
 }
 
 engine_status_t engine_run(engine_t*      self,
@@ -391,7 +313,7 @@ engine_status_t engine_run(engine_t*      self,
             status = self->ahead > 0 ? record_ahead(self, &y[self->outputs]) : ENGINE_OK;
             y += row_length(self);
             self->counts.samples++;
-            y += row_length(self) * run_quiet(self, edge < edges && tick[edge] <= until ? tick[edge] : until + 1, y);
+            y += row_length(self) * fast_run(self, edge < edges && tick[edge] <= until ? tick[edge] : until + 1, y);
         }
     }
     if (status == ENGINE_OK && edge < edges) {

@@ -2,7 +2,6 @@
 ///
 ///     engine.c    calls from outside, edges, recording
 ///     events.c    steps with variable length, search for the tick of an event
-///     quiet.c     stretches that provably have no event
 ///     modes.c     the mode in which the circuit is, and the store of modes
 ///     kinks.c     arguments w of the kinks, and the circuit with the kinks substituted
 ///     ladder.c    matrix exponentials
@@ -11,7 +10,7 @@
 ///     kernels.c   inner loops, from lanes.h
 ///     noise.c     noise of a linear circuit, independent of the rest
 ///     card.c      steps of a data-acquisition card, independent of the rest
-///     random.c    numpy's random streams, for many seeds at once, independent of the rest
+///     fast/       what only saves time, behind fast.h: -DENGINE_FAST=0 leaves it out
 
 #ifndef ENGINE_STATE_H
 #define ENGINE_STATE_H
@@ -45,10 +44,6 @@
 /// Circuits that are kept with their modes, so that a return to one of them costs nothing.
 #define CIRCUITS 8
 
-/// Samples of a quiet stretch that are computed from the same state. They do not depend on one another, so that the
-/// processor can overlap them.
-#define LEAP 4
-
 /// Terms of the Taylor series of the exponential over the shortest step of a mode. With |A t| <= TAYLOR_NORM they leave 1e-16
 /// of the first one.
 #define TERMS 14
@@ -58,35 +53,10 @@
 /// Anything faster was set off by an event just before, and after an event the steps grow from the shortest one.
 #define NEAR_LEVEL (TOP_LEVEL - 6)
 
+#include "fast/fast.h"
+
 /// The pieces of phi.
 enum { PIECE_LOW = 0, PIECE_MIDDLE = 1, PIECE_HIGH = 2 };
-
-/// The slow part of a mode, s = x[row]. 2^least_level ticks after the last event and later, x is a function of s, u and 1.
-/// Matrices are panelled, over [s u 1]; those named rest are over [u 1]. They lie in one block.
-typedef struct {
-    double* block;
-    int     rank;
-    int     least_level;
-    int64_t ahead;   // that of the engine for which y was built
-    bool is_chosen;  // rank, row, least_level and whether it is certain are those of the mode, whatever its constants
-    int  doublings;  // of a sample period to the instant from which on these states alone matter
-    bool certain;    // s comes to rest, and energy bounds how far w strays until then
-    int  row[ENGINE_MAX_STATES];
-    double* change;  // of s in one sample period
-    double* leap;    // of s in LEAP sample periods
-    int     base;    // |change of s| is so small in 2^base ticks that a series gives it
-    int     count;   // of the terms of that series
-    double* terms;   // of that series, as series_pack() stores them
-    double* ladder;  // changes of s in 2^level ticks, for levels from base on
-    double* state;   // x
-    double* first;   // s 2^least_level ticks after an event, over the z of that event
-    double* w;
-    double* y;       // the row of a sample now and after 1, 2, ... LEAP - 1 sample periods
-    double* rest;    // s at rest
-    double* rest_w;  // w at rest
-    double* energy;  // Q: e'Q e never grows, with e the distance of s from rest
-    double* reach;   // (w - rest_w)^2 <= reach e'Q e, for each kink
-} slow_t;
 
 /// Nodes of a step of a circuit with products, beyond its beginning; and all of them.
 #define NODES 4
@@ -128,7 +98,7 @@ typedef struct {
 } law_t;
 
 /// A circuit and its modes. Arrays as in engine_system_t, in one block.
-typedef struct {
+struct circuit {
     bool              is_set;  // it has a unique solution
     double*           block;
     double *          abc, *g, *cde, *w_phi, *lmn, *y_phi;
@@ -141,7 +111,7 @@ typedef struct {
     mode_t            store[MODES];
     int               stored, oldest;
     int64_t           tuning;  // how often the constants have changed
-} circuit_t;
+};
 
 /// The inner loops. Memory must not overlap.
 typedef struct {
@@ -263,6 +233,27 @@ static inline double kink_upper_bound(const engine_kink_t* kink, unsigned char p
     return piece == PIECE_LOW ? kink->lower : piece == PIECE_MIDDLE ? kink->upper : (double)INFINITY;
 }
 
+/// Number of elements of each array of engine_system_t.
+typedef struct {
+    size_t abc, g, cde, w_phi, lmn, y_phi, kinks, products;
+} sizes_t;
+
+static inline sizes_t sizes_of(const engine_t* self) {
+    const size_t n = (size_t)self->states, q = (size_t)self->kinks, p = (size_t)self->outputs;
+    const size_t columns = (size_t)self->columns;
+    return (sizes_t){ n * columns, n * q, q * columns, q * q, p * columns, p * q, q, (size_t)self->products };
+}
+
+static inline bool is_equal(size_t count, size_t size, const void* one, const void* other) {
+    return count == 0U || memcmp(one, other, count * size) == 0;
+}
+
+static inline void copy(size_t count, size_t size, const void* from, void* to) {
+    if (count > 0U) {
+        memcpy(to, from, count * size);
+    }
+}
+
 /// Numbers in the row of a sample.
 static inline int row_length(const engine_t* self) { return self->ahead > 0 ? 2 * self->outputs : self->outputs; }
 
@@ -316,10 +307,6 @@ engine_status_t ladder_plan(const engine_t* self, const double* a, int* base, bo
 /// Compute the terms of the present mode, and its lowest level. Overwrites a.
 void ladder_build(engine_t* self, double* a);
 
-/// Compute the last column of the terms and levels of the present mode anew, for other constants. It must not be stiff.
-/// Overwrites a. The bits are those of ladder_build() and ladder_reach().
-void ladder_retune(engine_t* self, double* a);
-
 /// Compute the levels of the present mode up to this one.
 void ladder_reach(engine_t* self, int level);
 
@@ -346,6 +333,12 @@ void kinks_build_map(const engine_t* self, const unsigned char* piece, double* a
 
 /// Panelled w, followed by panelled y, over z in the given pieces.
 void kinks_build_readings(const engine_t* self, const unsigned char* piece, double* readings);
+
+/// Panels of the matrices of w and y of a circuit.
+void circuit_pack(const engine_t* self, circuit_t* circuit);
+
+/// Take w and y from the readings of the present mode if phi feeds one of them.
+void mode_point_readings(engine_t* self);
 
 /// Make the mode of the present z the mode of the engine. The steps that follow grow from one tick again.
 engine_status_t mode_enter(engine_t* self);
@@ -385,29 +378,6 @@ bool events_look_until(engine_t* self, int64_t tick);
 
 /// Advance `clear` to a tick, at which w is panels z. Return false if w could have left its bounds on the way.
 bool events_extend(engine_t* self, int64_t tick, int columns, const double* panels, const double* z);
-
-/// Advance the slow states towards a tick. Return false if they do not suffice: z holds the state then, and `now` may lie
-/// before the tick.
-bool quiet_advance(engine_t* self, int64_t tick);
-
-/// Advance from the origin to a sample instant up to which no event comes, by the slow states alone. Return false if they do
-/// not suffice.
-bool quiet_begin(engine_t* self, int64_t tick);
-
-/// Advance by one sample period in a stretch of slow states.
-void quiet_step(engine_t* self);
-
-/// Advance by LEAP samples and record them, with the bits of LEAP single steps.
-void quiet_leap(engine_t* self, double* y);
-
-/// Row of the present sample in a stretch of slow states. It needs room for whole panels.
-void quiet_read(const engine_t* self, double* row);
-
-/// x in a stretch of slow states.
-void quiet_get_state(const engine_t* self, double* x);
-
-/// End a stretch of slow states, if there is one: z holds the state again.
-void quiet_leave(engine_t* self);
 
 #ifdef __GNUC__
 #pragma GCC visibility pop

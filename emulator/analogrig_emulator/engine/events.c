@@ -318,7 +318,7 @@ engine_status_t events_advance(engine_t* const self, int64_t tick) {
             return status;
         }
     }
-    if (self->now != self->origin || tick % ENGINE_TICKS_PER_SAMPLE != 0 || !quiet_begin(self, tick)) {
+    if (self->now != self->origin || tick % ENGINE_TICKS_PER_SAMPLE != 0 || !fast_begin(self, tick)) {
         go(self, tick);
     }
     return ENGINE_OK;

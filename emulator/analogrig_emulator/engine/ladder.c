@@ -84,53 +84,6 @@ void ladder_build(engine_t* const self, double* a) {
     store_level(self);
 }
 
-/// Store the last column of a panelled matrix.
-static void set_last(int rows, int columns, const double* column, double* panels) {
-    for (int i = 0; i < rows; i++) {
-        panels[((i / PANEL) * columns + columns - 1) * PANEL + i % PANEL] = column[i];
-    }
-}
-
-/// store_level() for the last column, which is followed by zeros in the place of inputs and 1.
-static void store_last(engine_t* const self, int rung, const double* column) {
-    const int n = self->states, q = self->kinks, columns = self->columns;
-    double    look[PADDED(ENGINE_MAX_KINKS)];
-    set_last(n, columns, column, &self->mode->ladder[rung * PANEL_ELEMENTS(n, columns)]);
-    self->kernels->multiply(q, columns, self->w_panels, column, look);
-    for (int i = 0; i < q; i++) {
-        look[i] += self->w_panels[((i / PANEL) * columns + columns - 1) * PANEL + i % PANEL];
-    }
-    set_last(q, columns, look, &self->mode->looks[rung * PANEL_ELEMENTS(q, columns)]);
-}
-
-void ladder_retune(engine_t* const self, double* a) {
-    const mode_t* mode = self->mode;
-    const int     n = self->states, columns = self->columns, stride = PADDED(columns), last = columns - 1;
-    double        f[MAX_COLUMNS] = { 0.0 }, term[ENGINE_MAX_STATES], next[PADDED(ENGINE_MAX_STATES)];
-    scale(self, a);
-    for (int k = 1; k <= TERMS; k++) {
-        for (int i = 0; i < n && k > 1; i += PANEL) {  // the first term is a, but for its last column
-            self->kernels->multiply(PANEL, n, &mode->terms[i * TERMS * columns], term, &next[i]);
-        }
-        for (int i = 0; i < n; i++) {
-            term[i] = k == 1 ? a[i * stride + last] : 1.0 / (double)k * next[i];
-            f[i]    = k == 1 ? term[i] : f[i] + term[i];
-            mode->terms[((i / PANEL * TERMS + k - 1) * columns + last) * PANEL + i % PANEL] = term[i];
-        }
-    }
-    store_last(self, 0, f);
-    for (int rung = 0; rung < mode->top - mode->base; rung++) {
-        self->kernels->multiply(n, columns, &mode->ladder[rung * PANEL_ELEMENTS(n, columns)], f, next);
-        for (int i = 0; i < n; i++) {
-            f[i] = 2.0 * f[i] + next[i];
-        }
-        store_last(self, rung + 1, f);
-    }
-    for (int i = 0; i < n; i++) {
-        mode->change[i * stride + last] = f[i];
-    }
-}
-
 void ladder_reach(engine_t* const self, int level) {
     while (self->mode->top < level) {
         square(self, self->mode->change);

@@ -10,13 +10,13 @@ from pathlib import Path
 from analogrig_emulator.errors import EngineError
 
 # The limits of engine/engine.h.
-MAX_STATES = 64
+MAX_STATES = 96
 MAX_NOISE_STATES = 128
 MAX_INPUTS = 24
 MAX_PRODUCTS = 16
-MAX_KINKS = 128
+MAX_KINKS = 192
 MAX_OUTPUTS = 256
-MAX_UNKNOWNS = 256
+MAX_UNKNOWNS = 640
 MAX_FACTOR_TERMS = 16
 DRIVE_TERMS = 5
 
@@ -85,6 +85,9 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_convert", None, (c_int64, c_int, c_void_p, c_uint, c_uint, *(c_void_p,) * 3)),
 )
 
+FAST = ("engine_seed", "engine_draw", "engine_learn", "engine_normals")
+"""Functions that an engine without its fast parts (ENGINE_FAST=0) does not have."""
+
 
 @functools.cache
 def load() -> ctypes.CDLL:
@@ -102,7 +105,14 @@ def load_from(path: Path) -> ctypes.CDLL:
     except OSError as cause:
         raise EngineError(f"the circuit engine {path} does not load ({cause}): rebuild it with `{_BUILD}`") from cause
     for name, result, arguments in _PROTOTYPES:
+        if name in FAST and not hasattr(library, name):
+            continue
         function = getattr(library, name)
         function.restype = result
         function.argtypes = arguments
     return library
+
+
+def has_streams() -> bool:
+    """True unless the library was built without its fast parts."""
+    return hasattr(load(), FAST[0])

@@ -53,30 +53,11 @@ static bool allocate(const engine_t* const self, mode_t* mode) {
     return mode->block != NULL;
 }
 
-/// Take w and y from the readings of the present mode if phi feeds one of them.
-static void point_readings(engine_t* const self) {
+void mode_point_readings(engine_t* const self) {
     if (self->circuit->feeds) {
         self->w_panels = self->mode->readings;
         self->y_panels = &self->mode->readings[PANEL_ELEMENTS(self->kinks, self->columns)];
     }
-}
-
-/// Adapt the present mode to the constants of its circuit, which have changed since it was built.
-static void retune_mode(engine_t* const self) {
-    mode_t* const mode = self->mode;
-    double        a[MAX_ELEMENTS];
-    kinks_build_map(self, mode->piece, a);
-    if (self->circuit->feeds) {
-        kinks_build_readings(self, mode->piece, mode->readings);
-    }
-    point_readings(self);
-    if (mode->stiff) {
-        ladder_build(self, a);
-    } else {
-        ladder_retune(self, a);
-    }
-    mode->has_slow = false;
-    mode->tuning   = self->circuit->tuning;
 }
 
 /// Build the present mode in the place of the oldest of the store.
@@ -102,7 +83,7 @@ static engine_status_t build_mode(engine_t* const self) {
     if (self->circuit->feeds) {
         kinks_build_readings(self, mode->piece, mode->readings);
     }
-    point_readings(self);
+    mode_point_readings(self);
     if (self->products > 0) {
         const engine_status_t built = products_build(self, a);
         mode->piece[0]              = built == ENGINE_OK ? mode->piece[0] : NO_PIECE;
@@ -127,13 +108,13 @@ engine_status_t mode_enter(engine_t* const self) {
     if (self->mode == NULL) {
         status = build_mode(self);
     } else if (self->mode->tuning != self->circuit->tuning) {
-        retune_mode(self);
+        fast_retune_mode(self);
     }
     if (status != ENGINE_OK) {
         return status;
     }
     if (self->circuit->feeds) {
-        point_readings(self);
+        mode_point_readings(self);
         self->kernels->multiply(self->kinks, self->columns, self->w_panels, self->z, self->w);
     }
     copy_z(self, self->z, self->origin_z);

@@ -2,7 +2,8 @@
 
 Scaling as an operator does it: 10 V stand for the full scale of a quantity, from the file or 1.2 times its peak in the
 trial play. No quantity may exceed 12 V in that play. A cord of coefficient up to 1 is a pot into 100k, up to 10 a pot
-into 10k, and beyond that it is refused. Coefficients suffice for the range of every parameter.
+into 10k, and beyond that it is refused. Coefficients suffice for the range of every parameter. Where a pot would come
+near an end of its track, which real parts do not reach, another resistor moves it away.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,12 +24,13 @@ from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.engine.system import Law
-from analogrig_emulator.errors import PotError, ProgramError
+from analogrig_emulator.errors import Edit, PotError, ProgramError, UnfitError
 from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
 from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scale, Scales
 from analogrig_emulator.machine.program_file import Equations, read_program
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
+from analogrig_emulator.machine.rehearsal import rehearsed, unfit
 from analogrig_emulator.machine.stages import (
     REFERENCE,
     Cord,
@@ -61,7 +64,9 @@ _LOOP_FARAD = 47e-12
 _BARRED_V = 0.05
 """Voltage beyond zero at which a root's diode conducts: at zero itself it would switch without end at rest."""
 
-_OFF_OHM = 1e12
+_OFF_OHM = 1e15
+"""Resistance of an open limiter. 1e12 ohm leaks 1e-7 of a force, which a few impacts enlarge to 0.1 LSB."""
+
 _ON_OHM = 1e3
 _HEADROOM = 1.2
 _ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
@@ -69,9 +74,16 @@ _ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 _LEAST_COEFFICIENT = 2e-4
 """One winding of a pot's 5000."""
 
+TRACK = (1e-3, 0.995)
+"""Coefficients of a pot that real parts of any draw reach: the stops, the wiper and the loads take the rest."""
+
+_GAINS = (1, 10, 0.1, 2, 5, 0.5, 0.2, 20, 0.05, 0.02, 0.01)
+"""Gains of an input, in the order in which they are tried: 100k over its resistor."""
+
 _SLOW = 0.1
 """Coefficient with the largest capacitor below which an integrator gains by more speed."""
 
+_MOST_REHEARSALS = 5
 _LONGEST_SHOWN = 32
 _MOST_CORNERS = 6
 _EXACT = 1e-9
@@ -79,7 +91,7 @@ _EXACT = 1e-9
 
 @dataclass(frozen=True)
 class PatchedCord:
-    """Cord as patched: node and sign of its source there, coefficient for the file's values, gain 1 or 10.
+    """Cord as patched: node and sign of its source there, coefficient for the file's values, gain of its resistor.
 
     pot: its pot, if it has one; per_unit: coefficient of that pot by product of the cord's factors.
     """
@@ -88,7 +100,7 @@ class PatchedCord:
     node: str
     sign: int
     coefficient: float
-    gain: int
+    gain: float
     resistor: str
     pot: str = ""
     per_unit: float = 0.0
@@ -229,7 +241,7 @@ def load_patch(path: str | Path) -> PatchedProgram:
     try:
         return compile_program(equations)
     except ProgramError as cause:
-        raise ProgramError(f"{path}: {cause}") from cause
+        raise cause.at(str(path)) from cause
 
 
 @functools.lru_cache(maxsize=32)
@@ -238,18 +250,52 @@ def compile_program(equations: Equations) -> PatchedProgram:
 
     Raises ProgramError naming the term that cannot be patched, and what to change.
     """
+    from analogrig_emulator.machine.advice import advising  # which compiles what it advises
+
+    with advising(equations.table):
+        return compile_unadvised(equations)
+
+
+def compile_unadvised(equations: Equations) -> PatchedProgram:
+    """The same without a trial of the cures."""
     stages = stages_of(equations)
     _check_driven(stages)
-    reach = reaches(stages)
-    fulls = _Scaling(stages, reach).fulls()
-    return _Patcher(stages, reach, fulls).program()
+    program = _patched(stages, reaches(stages))
+    if stages.is_linear or all(row.full is not None for row in equations.states.values()):
+        return program
+    try:
+        return _rescaled(program)
+    except UnfitError:
+        # A root or quotient whose argument has the wrong sign runs away on amplifiers without limits; real ones clip.
+        if any(each.kind in (StageKind.QUOTIENT, StageKind.ROOT) for each in stages.stages):
+            return program
+        raise
+
+
+def _patched(stages: Stages, reach: Mapping[str, Reach]) -> PatchedProgram:
+    return _Patcher(stages, reach, _Scaling(stages, reach).fulls()).program()
+
+
+def _rescaled(program: PatchedProgram) -> PatchedProgram:
+    """The program with full scales that also hold what its quantities reach on machines of real parts."""
+    equations = program.equations
+    declared = [name for name, row in (*equations.states.items(), *equations.signals.items()) if row.full is not None]
+    for _ in range(_MOST_REHEARSALS):
+        most = {
+            name: full * (LINEAR_V / MACHINE_V if name in declared else 1.0) for name, full in program.fulls.items()
+        }
+        beyond = {name: each for name, each in rehearsed(program).items() if each.peak > most[name] * (1 + _EXACT)}
+        if not beyond:
+            return program
+        program = _patched(program.stages, {**program.reach, **beyond})
+    raise unfit(program)
 
 
 def _check_driven(stages: Stages) -> None:
     """Raise ProgramError for a state on which no input and no constant acts: it starts at 0 and stays there."""
     driven = {REFERENCE, *stages.equations.inputs}
     rows = list(stages.stages)
-    while found := [row for row in rows if any(cord.source in driven for cord in row.cords)]:
+    while found := [row for row in rows if _is_driven(stages, row, driven)]:
         driven |= {row.name for row in found}
         rows = [row for row in rows if row.name not in driven]
     states = [row for row in rows if row.kind is StageKind.INTEGRATOR]
@@ -260,6 +306,19 @@ def _check_driven(stages: Stages) -> None:
             f"{states[0].place}: no input acts on {names}, which {stay} at 0, where states start; "
             "add a term with an input, or delete the line"
         )
+
+
+def _is_driven(stages: Stages, row: PatchStage, driven: AbstractSet[str]) -> bool:
+    """True if a stage leaves 0 while its driven sources do: a product needs all of them, a quotient its dividend."""
+    sources = [cord.source in driven for cord in row.cords]
+    match row.kind:
+        case StageKind.PRODUCT:
+            return all(sources)
+        case StageKind.QUOTIENT:
+            return sources[0]
+        case StageKind.FUNCTION:
+            return any(sources) or bool(stages.equations.functions[row.function](0.0) != 0.0)
+    return any(sources)
 
 
 @dataclass
@@ -285,14 +344,33 @@ class _Scaling:
         peak = self.reach[name].peak
         if full is None:
             if not peak:
-                raise ProgramError(f"{place}: {name} stays at 0 in the trial play; give its full scale, full = ...")
+                raise ProgramError(
+                    f"{place}: {name} stays at 0 in the trial play",
+                    edits=[{full_place(self.stages.equations, name): full} for full in (1.0, 0.1, 10.0)],
+                    otherwise="raise the trial levels of the inputs, or delete it",
+                )
             return _rounded_up(_HEADROOM * peak)
         if peak > full * LINEAR_V / MACHINE_V:
             raise ProgramError(
                 f"{place}: {name} reaches {peak:.4g} in the trial play, {peak / full * MACHINE_V:.3g} V at full scale "
-                f"{full:g}; write full = {_rounded_up(peak):g}, lower the trial levels of the inputs, or narrow a range"
+                f"{full:g}",
+                edits=[self._raised_scales(headroom) for headroom in (1.0, _HEADROOM, 2.0, 4.0)],
+                otherwise="lower the trial levels of the inputs, or narrow a range",
             )
         return full
+
+    def _raised_scales(self, headroom: float) -> Edit:
+        """Full scales for all quantities that exceed theirs in the trial play."""
+        equations = self.stages.equations
+        peaks = {
+            name: (row.full, self.reach[name].peak)
+            for name, row in (*equations.states.items(), *equations.signals.items())
+        }
+        return {
+            full_place(equations, name): _rounded_up(headroom * peak)
+            for name, (full, peak) in peaks.items()
+            if full is not None and peak > full * LINEAR_V / MACHINE_V
+        }
 
     def _full(self, stage: PatchStage) -> float:
         sources = [self.found[cord.source] for cord in stage.cords]
@@ -318,6 +396,11 @@ class _Scaling:
             most = [extremes(self.stages, cord, stage.place)[1] * self.found[cord.source] for cord in stage.cords]
             return max(full, _rounded_up(max(most) / 10.0))
         return full
+
+
+def full_place(equations: Equations, name: str) -> tuple[str, ...]:
+    """Place of a quantity's full scale in the file."""
+    return "states" if name in equations.states else "signals", name, "full"
 
 
 def extremes(stages: Stages, cord: Cord, place: str) -> tuple[float, float]:
@@ -479,8 +562,16 @@ class _Patcher:
             speed = self._stages.equations.speed
             raise ProgramError(
                 f"{stage.place}: integrator of {stage.name} needs a coefficient of {10 * coefficient:.3g} with 1 nF, "
-                f"beyond 10; write speed = {speed / coefficient:.3g} or less, or raise the full scale of {stage.name}"
+                "beyond 10",
+                edits=[self._speed_edit(speed / coefficient * each) for each in (1.0, 0.5, 0.1)],
+                otherwise=f"lower the speed, or raise the full scale of {stage.name}",
             )
+
+    @staticmethod
+    def _speed_edit(most: float) -> Edit:
+        """Speed of at most a value, in two digits."""
+        step = 10.0 ** (math.floor(math.log10(most)) - 1)
+        return {("speed",): float(f"{math.floor(most / step + _EXACT) * step:.2g}")}
 
     def _rectifier(self, stage: PatchStage) -> PatchedElement:
         number, cord = self._amplifiers[stage.name], stage.cords[0]
@@ -505,7 +596,7 @@ class _Patcher:
         product_full = self._fulls[stage.name] * self._fulls[other]
         ratio = self._fulls[dividend.source] / product_full
         # Small resistors make the loop fast; a gain of 10 would make the input's too small for its source.
-        ohm = GAIN_10_OHM if ratio * extremes(self._stages, dividend, stage.place)[1] <= 1 + _EXACT else INPUT_OHM
+        ohm = INPUT_OHM if self._needs_gain(dividend, ratio, stage.place) else GAIN_10_OHM
         cords = [self._cord(stage, 0, ratio, ohm)]
         # The product must cancel the dividend's current.
         product_sign = -self._source_sign(stage, dividend)
@@ -532,6 +623,12 @@ class _Patcher:
             f"U{number}": OpAmp(f"U{number}", GROUND, junction, node, IDEAL),
         }
         return self._amplifier(stage, cords)
+
+    def _needs_gain(self, cord: Cord, ratio: float, place: str) -> bool:
+        """True if a resistor for gain 1 does not suffice for a cord with a pot away from the end of its track."""
+        most = ratio * extremes(self._stages, cord, place)[1]
+        is_fixed = not cord.factors and abs(ratio * abs(cord.number) - 1) <= _EXACT
+        return most > (1 + _EXACT if is_fixed or self._stages.equations.stops else TRACK[1])
 
     def _multiplier(self, stage: PatchStage) -> PatchedElement:
         sign, node = self._output(stage)
@@ -581,10 +678,10 @@ class _Patcher:
     def _cord(self, stage: PatchStage, place: int, ratio: float, ohm: float = INPUT_OHM) -> PatchedCord:
         """Cord into an amplifier; ratio: coefficient by product of the cord's number and factors; ohm: for gain 1."""
         cord, number = stage.cords[place], self._amplifiers[stage.name]
-        most = ratio * extremes(self._stages, cord, stage.place)[1]
+        least, most = (ratio * each for each in extremes(self._stages, cord, stage.place))
         coefficient = ratio * abs(cord.number) * self._stages.factor(cord.factors, self._stages.equations.values)
         self._check_coefficient(stage, cord, coefficient, most)
-        gain = 1 if most <= 1 + _EXACT else 10
+        gain = self._gain(cord, coefficient, least, most)
         sign = self._source_sign(stage, cord)
         node, resistor = self._nodes[cord.source, sign], f"R{number}_{place + 1}"
         pot, top = "", node
@@ -595,32 +692,68 @@ class _Patcher:
         self._elements.append(Resistor(resistor, node, f"s{number}", ohm / gain))
         return PatchedCord(cord, top, sign, coefficient, gain, resistor, pot, ratio * abs(cord.number) / gain)
 
+    def _gain(self, cord: Cord, coefficient: float, least: float, most: float) -> float:
+        """Gain of a cord's resistor at which its pot stays away from the ends of the track.
+
+        The pot stays away for the whole range if a gain allows it, else for the file's values.
+        """
+        usual = 1 if most <= 1 + _EXACT else 10
+        if not cord.factors and abs(coefficient - usual) <= _EXACT:
+            return usual
+        spans = [(coefficient, coefficient)]
+        if not self._stages.equations.stops:
+            spans.insert(0, (least, most))
+        for low, high in spans:
+            for gain in (usual, *_GAINS):
+                if TRACK[0] * gain <= low and high <= TRACK[1] * gain and most <= gain * (1 + _EXACT):
+                    return gain
+        return usual
+
     def _check_coefficient(self, stage: PatchStage, cord: Cord, coefficient: float, most: float) -> None:
         name = _clipped(stage.name)
         what = f"{stage.place}: term {_clipped(cord.text)} of {name}"
         if most > 10 * (1 + _EXACT):
             raise ProgramError(
-                f"{what} needs a coefficient of {most:.3g}, and there are 10; "
-                f"write full = {_rounded_up(self._fulls[stage.name] * most / 10):g} for {name}"
+                f"{what} needs a coefficient of {most:.3g}, and there are 10",
+                edits=self._rescaled(stage, most / 10),
+                otherwise=f"raise the full scale of {name}, or name parts of the formula as signals",
             )
         if coefficient < _LEAST_COEFFICIENT:
             raise ProgramError(
-                f"{what} has a coefficient of {coefficient:.2g}, below one winding of a pot ({_LEAST_COEFFICIENT:g}); "
-                f"{self._cure_of_small(stage)}"
+                f"{what} has a coefficient of {coefficient:.2g}, below one winding of a pot ({_LEAST_COEFFICIENT:g})"
+                f"{self._slowness(stage)}",
+                edits=[*self._faster(stage), *self._rescaled(stage, coefficient / _LEAST_COEFFICIENT)],
+                otherwise=f"delete the term, or lower the full scale of {name}",
             )
 
-    def _cure_of_small(self, stage: PatchStage) -> str:
-        """Cure of a coefficient that is too small: an integrator that is slow as a whole needs more speed."""
-        speed = self._stages.equations.speed
-        if stage.kind is StageKind.INTEGRATOR:
-            rates = [self._ratio(stage, cord) * extremes(self._stages, cord, stage.place)[1] for cord in stage.cords]
-            most = speed * max(rates) * INPUT_OHM * _CAPACITORS_FARAD[0]
-            if most < _SLOW:
-                return f"the integrator is slow, at most {most:.2g} with 1 uF: write speed = {speed / most:.3g} or less"
-        return (
-            f"delete the term, lower the full scale of {_clipped(stage.name)}, or let it move more in the trial "
-            "(speed, period_s)"
-        )
+    def _rescaled(self, stage: PatchStage, times: float) -> list[Edit]:
+        """Full scale of so many times the present one, that of the trial play, and those of the trial play for all."""
+        equations = self._stages.equations
+        rows = {**equations.states, **equations.signals}
+        every: list[Edit] = [{full_place(equations, name): None for name, row in rows.items() if row.full is not None}]
+        if stage.name not in rows:
+            return every
+        place = full_place(equations, stage.name)
+        return [{place: _rounded_up(self._fulls[stage.name] * times)}, {place: None}, *every]
+
+    def _slow_most(self, stage: PatchStage) -> float:
+        """Largest coefficient of an integrator with the largest capacitor; 1 for any other stage."""
+        if stage.kind is not StageKind.INTEGRATOR:
+            return 1.0
+        rates = [self._ratio(stage, cord) * extremes(self._stages, cord, stage.place)[1] for cord in stage.cords]
+        return self._stages.equations.speed * max(rates) * INPUT_OHM * _CAPACITORS_FARAD[0]
+
+    def _slowness(self, stage: PatchStage) -> str:
+        most = self._slow_most(stage)
+        return f"; the integrator is slow, at most {most:.2g} with 1 uF" if most < _SLOW else ""
+
+    def _faster(self, stage: PatchStage) -> list[Edit]:
+        """Higher speeds of an integrator: its largest coefficient becomes one, or it moves more in the trial play."""
+        if stage.kind is not StageKind.INTEGRATOR:
+            return []
+        most = self._slow_most(stage)
+        usual = self._stages.equations.speed / (most if most < _SLOW else 0.1)
+        return [self._speed_edit(usual * each) for each in (1.0, 5.0, 0.3, 50.0, 500.0)]
 
 
 def _clipped(formula: str) -> str:

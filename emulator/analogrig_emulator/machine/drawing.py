@@ -39,7 +39,7 @@ class _Pin(NamedTuple):
     node: str
     term: str
     pot: str = ""
-    gain: int = 1
+    gain: float = 1
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _input(pin: _Pin, at: Point, left: float) -> Iterator[str]:
         yield f'<circle class="body" cx="{at.x + _POT_X:g}" cy="{at.y:g}" r="9"/>'
         yield text_at(Point(at.x + 2, at.y - 11), pin.pot, is_small=True)
     if pin.gain != 1:
-        yield text_at(Point(left - 22, at.y - 3), str(pin.gain), is_small=True)
+        yield text_at(Point(left - 22, at.y - 3), f"{pin.gain:g}", is_small=True)
 
 
 def text_at(at: Point, text: str, *, anchor: str = "start", is_small: bool = False) -> str:

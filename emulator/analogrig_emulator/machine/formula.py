@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.errors import Edit, ProgramError
 from analogrig_emulator.machine.units import NUMBER, Unit
 
 _MOST_CHARACTERS = 1000
@@ -83,6 +83,49 @@ _OPERATORS: Mapping[type, tuple[str, Callable[[Any, Any], Any]]] = MappingProxyT
         ast.Div: ("/", operator.truediv),
     }
 )
+
+
+TABLED: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
+    {
+        **{name: FUNCTIONS[name].law for name in ("sin", "cos", "tan", "exp", "log", "tanh")},
+        "sign": np.sign,
+        "sgn": np.sign,
+        "sat": lambda x: np.clip(x, -1.0, 1.0),
+        "step": lambda x: np.heaviside(x, 0.5),
+        "atan": np.arctan,
+        "arctan": np.arctan,
+        "sinh": np.sinh,
+        "cosh": np.cosh,
+    }
+)
+"""Functions that a table of points stands for where a signal is their argument."""
+
+_SIZES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+_STEP = 0.02
+"""Half the width of a jump in a table, in its size."""
+
+
+def function_edits(name: str) -> list[Edit]:
+    """Tables of points in place of a function, for arguments of several sizes, the smallest first."""
+    if name not in TABLED:
+        return []
+    new = f"{name}_table" if name in FUNCTIONS else name
+    edits: list[Edit] = []
+    for size in _SIZES:
+        low = 0.02 * size if name == "log" else -size
+        places = np.linspace(low, size, 17)
+        if name in ("sign", "sgn", "step", "sat"):
+            bend = 1.0 if name == "sat" else _STEP * size
+            places = np.array([-size, -bend, bend, size]) if bend < size else np.array([-size, size])
+        with np.errstate(all="ignore"):
+            points = [[float(f"{x:.4g}"), float(f"{TABLED[name](x):.4g}")] for x in places]
+        if max(abs(y) for _, y in points) > _LARGEST:
+            break
+        edit: dict[tuple[str, ...], Any] = {("functions", new): {"points": points}}
+        if new != name:
+            edit["equations",] = {f"{name}(": f"{new}("}
+        edits.append(edit)
+    return edits
 
 
 @dataclass(frozen=True)
@@ -357,7 +400,12 @@ class _Reading:
 
     def _call(self, node: ast.expr, name: str, arguments: list[ast.expr]) -> Formula:
         if name not in self.tables and name not in FUNCTIONS:
-            raise ProgramError(f"unknown function {name!r}{suggestion(name, [*FUNCTIONS, *sorted(self.tables)])}")
+            known = [*FUNCTIONS, *sorted(self.tables)]
+            raise ProgramError(
+                f"unknown function {name!r}",
+                edits=function_edits(name) or spellings(name, known, "("),
+                otherwise=f"there are {', '.join(known)}; write others as points, [functions.NAME]",
+            )
         wanted = 1 if name in self.tables else FUNCTIONS[name].arguments
         if len(arguments) != wanted:
             raise ProgramError(f"{name} takes {wanted} argument{'s' * (wanted > 1)}, not {len(arguments)}")
@@ -407,6 +455,11 @@ def check_constants(formula: Formula) -> None:
         divisor = formula.right
         if all(name in CONSTANTS for name in divisor.names()) and constant_value(divisor, {}) == 0.0:
             raise ProgramError(f"{formula} divides by zero")
+
+
+def spellings(name: str, known: Iterable[str], end: str = "") -> list[Edit]:
+    """Known names that an unknown one in the equations may stand for, the nearest first; end: what follows the name."""
+    return [{("equations",): {name + end: near + end}} for near in difflib.get_close_matches(name, list(known), 2)]
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

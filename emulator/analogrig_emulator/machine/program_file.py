@@ -47,6 +47,7 @@ from analogrig_emulator.machine.formula import (
     Law,
     check_constants,
     parse_formula,
+    spellings,
     suggestion,
 )
 from analogrig_emulator.machine.units import Unit, parse_unit
@@ -104,9 +105,15 @@ class Points:
 
     def __call__(self, x: Any) -> Any:
         """Value at x; the first and the last piece go on beyond the ends."""
+        at, to, run, rise = self._pieces
+        piece = np.searchsorted(at[1:], x, side="right")
+        return to[piece] + (x - at[piece]) * rise[piece] / run[piece]
+
+    @functools.cached_property
+    def _pieces(self) -> tuple[NDArray[np.float64], ...]:
+        """First x and y of each piece, and how far it goes in x and y."""
         at, to = np.array(self.points).T
-        piece = np.clip(np.searchsorted(at, x, side="right") - 1, 0, len(at) - 2)
-        return to[piece] + (x - at[piece]) * (to[piece + 1] - to[piece]) / (at[piece + 1] - at[piece])
+        return at[:-1], to[:-1], np.diff(at), np.diff(to)
 
 
 @dataclass(frozen=True)
@@ -130,6 +137,8 @@ class Equations:
     speed: speed of the machine relative to the plant. period_s: period of the trial play's square wave, in s of the
     plant. derivatives: equations of the states, in the order of `states`; definitions: those of the signals, in an
     order in which they can be computed. diagram: circuit wired by hand. estimates: formulas of parameters, in order.
+    stops: True if the ends of ranges may turn pots to the stops of their tracks, where real parts do not get.
+    table: tables of the file.
     """
 
     name: str
@@ -146,6 +155,13 @@ class Equations:
     definitions: tuple[Equation, ...]
     diagram: str = ""
     estimates: Mapping[str, Formula] = field(default_factory=dict)
+    stops: bool = False
+    table: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def run_period_s(self) -> float:
+        """Period of a run without a scenario, in s of the plant."""
+        return self.speed / _CIRCUIT_HZ
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -218,6 +234,14 @@ def _parsed(data: bytes) -> Equations:
 
 def equations_of(table: Mapping[str, Any]) -> Equations:
     """Program of a file's tables. Raises ProgramError that names the place and the cure."""
+    from analogrig_emulator.machine.advice import advising  # which compiles what it advises
+
+    with advising(table):
+        return unadvised_equations(table)
+
+
+def unadvised_equations(table: Mapping[str, Any]) -> Equations:
+    """The same without a trial of the cures."""
     return _Reader(table).equations()
 
 
@@ -238,6 +262,7 @@ class _Reader:
         "functions",
         "diagram",
         "estimates",
+        "stops",
     )
 
     def __init__(self, table: Mapping[str, Any]) -> None:
@@ -280,6 +305,8 @@ class _Reader:
             definitions=tuple(definitions),
             diagram=_text("diagram", self._table.get("diagram", "")),
             estimates=self._estimates(),
+            stops=_flag("stops", self._table.get("stops", False)),
+            table=self._table,
         )
 
     @staticmethod
@@ -334,9 +361,7 @@ class _Reader:
             raise ProgramError(f"{place}.range: {low:g} is not positive; write the sign into the equation")
         if not low <= value <= high:
             raise ProgramError(f"{place}: value {value:g} lies outside its range [{low:g}, {high:g}]")
-        pot = row.get("pot", True)
-        if not isinstance(pot, bool):
-            raise ProgramError(f"{place}.pot: {pot!r} is neither true nor false")
+        pot = _flag(f"{place}.pot", row.get("pot", True))
         alias, diagnosis = (_text(f"{place}.{key}", row.get(key, "")) for key in ("alias", "diagnosis"))
         if alias and not _NAME.fullmatch(alias):
             raise ProgramError(f"{place}.alias: {alias[:40]!r}: write a letter, then letters, digits or _, at most 32")
@@ -486,7 +511,11 @@ class _Reader:
         for line in lines:
             for name in line.formula.names():
                 if name not in known:
-                    raise ProgramError(f"{line.place}: unknown name {name[:40]!r}{suggestion(name, known)}")
+                    raise ProgramError(
+                        f"{line.place}: unknown name {name[:40]!r}",
+                        edits=spellings(name, known),
+                        otherwise=f"there are {', '.join(known)}",
+                    )
                 used.add(name)
         for key, names in (("inputs", self.inputs), ("parameters", self.parameters)):
             for name in names:
@@ -536,13 +565,19 @@ def at_place(place: str) -> Iterator[None]:
     try:
         yield
     except ProgramError as cause:
-        raise ProgramError(f"{place}: {cause}") from cause
+        raise cause.at(place) from cause
 
 
 def _check_keys(place: str, table: Mapping[str, Any], known: Sequence[str]) -> None:
     for key in table:
         if key not in known:
             raise ProgramError(f"{place}{': ' if place else ''}unknown key {key[:40]!r}{suggestion(key, known)}")
+
+
+def _flag(place: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ProgramError(f"{place}: {value!r} is neither true nor false")
+    return value
 
 
 def _number(place: str, value: Any, low: float = -_LARGEST) -> float:

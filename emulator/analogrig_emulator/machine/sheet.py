@@ -88,7 +88,7 @@ def input_text(element: PatchedElement, cord: PatchedCord) -> str:
 
 
 def _gain(element: PatchedElement, cord: PatchedCord) -> str:
-    return str(cord.gain) if element.stage.kind.has_amplifier else ""
+    return f"{cord.gain:g}" if element.stage.kind.has_amplifier else ""
 
 
 def _pots(program: PatchedProgram) -> Iterator[Sequence[str]]:

@@ -26,6 +26,7 @@ from analogrig_emulator.machine.formula import (
     Operation,
     Power,
     constant_value,
+    function_edits,
 )
 from analogrig_emulator.machine.program_file import Equation, Equations, Points, at_place
 
@@ -320,8 +321,9 @@ class _Builder:
         if name in self.equations.functions:
             return {((), (self._add(f"{name}({source})", StageKind.FUNCTION, (Cord(source),), name),)): 1.0}
         raise ProgramError(
-            f"{self.place}: {name}({source}): no element computes {name} of a signal; write [functions] with points"
-            f"{_TRICKS.get(name, '')}"
+            f"{self.place}: {name}({source}): no element computes {name} of a signal",
+            edits=function_edits(name),
+            otherwise="write [functions] with points",
         )
 
     def _rectified(self, terms: _Terms) -> _Terms:
@@ -359,9 +361,6 @@ class _Builder:
             product = f"{_bracketed(name)}*{_bracketed(other)}"
             name = self._add(product, StageKind.PRODUCT, (Cord(name), Cord(other)))
         return name
-
-
-_TRICKS = dict.fromkeys(("sin", "cos"), ", or generate it with two states: s' = c*omega, c' = -s*omega")
 
 
 def sum_text(cords: Iterable[Cord], *, exact: bool = False) -> str:

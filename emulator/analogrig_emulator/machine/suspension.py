@@ -284,10 +284,14 @@ class SuspensionComputer:
         power = math.log2(doubled / here)
         if not power or abs(power - round(power)) > _EXACT:
             return ""
-        limit = value * here ** (-1.0 / power)
+        low, high = (self._pots[pot].coefficient(dial) for dial in (0.0, 1.0))
+        end, is_most = (high, power > 0) if here > low else (low, power < 0)
+        if not end:
+            return ""
+        limit = value * (end / here) ** (1.0 / power)
         digit = 10.0 ** (math.floor(math.log10(limit)) - 3)
-        within = math.floor(limit / digit + _EXACT) if power > 0 else math.ceil(limit / digit - _EXACT)
-        return f", whose {name} is at {'most' if power > 0 else 'least'} {within * digit:.4g}"
+        within = math.floor(limit / digit + _EXACT) if is_most else math.ceil(limit / digit - _EXACT)
+        return f", whose {name} is at {'most' if is_most else 'least'} {within * digit:.4g}"
 
 
 _EXACT = 1e-9

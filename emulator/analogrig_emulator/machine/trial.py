@@ -1,14 +1,17 @@
 """Trial play of a program: its equations under square waves, for the range of every quantity.
 
 The inputs switch between their trial levels, the first with the program's period, each further one with twice the
-period of the one before: every combination of levels occurs. The parameters take their values, then each in turn the
-ends of its range.
+period of the one before: every combination of levels occurs. A second play has the period of a run without a scenario,
+where that differs: the machine plays both. The parameters take their values, then each in turn the
+ends of its range. The play goes on until the slowest mode that decays has settled: a lightly damped one may build up.
 """
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,13 +23,28 @@ from analogrig_emulator.machine.stages import StageKind, Stages
 
 _MOST_INPUTS = 4
 _LEAST_HALVES = 4
+_MOST_HALVES = 400
+"""Longest play of linear equations: 20,000 samples of a run at 200 Hz."""
+
+_MOST_SOLVED_HALVES = 40
+"""Longest play of equations that are solved numerically."""
+
+_SETTLED = 2e-3
+"""Growth of the peaks in a cycle below which a play has settled."""
+
+_DRIFT = 0.9
+"""Least growth in the last cycle over that in the first one of a play that drifts, and is not prolonged."""
 
 _POINTS = 200
 """Instants per half period at which quantities are taken."""
 
 _MOST_EVALUATIONS = 20_000
 _TOLERANCE = 1e-5
+_LATER_TOLERANCE = 1e-3
+"""Tolerance after the first play, in peaks of the states: full scales have more headroom than that."""
+
 _LARGEST = 1e30
+_EXACT = 1e-9
 _LEAST_GROWTH = 1e-6
 """Least real part of a growing mode, in magnitudes of the fastest one: less may be the rounding of an integrator."""
 _States = NDArray[np.float64]
@@ -70,22 +88,34 @@ def reaches(stages: Stages) -> dict[str, Reach]:
         _check_rest(stages, values)
     found: dict[str, Reach] = {}
     with np.errstate(all="ignore"):
-        inputs, states = _played(stages, every)
-        for values, played in zip(every, states.T, strict=True):
-            quantities = inputs | dict(zip(equations.states, played, strict=True))
-            stages.add_signals(quantities, values)
-            for name, each in quantities.items():
-                found[name] = found.get(name, Reach()).with_values(each)
+        for inputs, states in _plays(stages, every):
+            for values, played in zip(every, states.T, strict=True):
+                quantities = inputs | dict(zip(equations.states, played, strict=True))
+                stages.add_signals(quantities, values)
+                for name, each in quantities.items():
+                    found[name] = found.get(name, Reach()).with_values(each)
     _check_domains(stages, found)
     return found
 
 
-def _played(
-    stages: Stages, every: Sequence[Mapping[str, float]]
-) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
-    """Inputs (instants,) by name, and states (instants, states, settings)."""
+_Inputs = dict[str, NDArray[np.float64]]
+"""Inputs (instants,) by name."""
+
+
+def _plays(stages: Stages, every: Sequence[Mapping[str, float]]) -> Iterator[tuple[_Inputs, NDArray[np.float64]]]:
+    """Plays with the period of the program, and with that of a run where it differs and is not too long to solve."""
     equations = stages.equations
-    solve = _solved_linear if stages.is_linear else _solved
+    yield _played(equations, every, is_linear=stages.is_linear)
+    if not math.isclose(equations.period_s, equations.run_period_s, rel_tol=_EXACT):
+        with contextlib.suppress(_StiffError):
+            yield _played(replace(equations, period_s=equations.run_period_s), every, is_linear=stages.is_linear)
+
+
+def _played(
+    equations: Equations, every: Sequence[Mapping[str, float]], *, is_linear: bool
+) -> tuple[_Inputs, NDArray[np.float64]]:
+    """Inputs, and states (instants, states, settings)."""
+    solve = _solved_linear if is_linear else _solved
     slopes = equations.slopes()
     instants_s = np.linspace(0.0, 0.5 * equations.period_s, _POINTS)
     parameters = {name: np.array([values[name] for values in every]) for name in equations.parameters}
@@ -98,13 +128,98 @@ def _played(
         state = stretch[-1]
         stretches.append(stretch)
         _check_bounded(equations, every, stretches, ~(np.abs(state) < _LARGEST))
-    if stages.is_linear:
+    if is_linear:
         first = {name: each[0] for name, each in levels.items()}
         is_unstable = _is_unstable(_system(slopes, parameters | first, state))
         growth = np.abs(stretches[-1]).max(axis=0) / np.maximum(np.abs(stretches[1]).max(axis=0), 1.0 / _LARGEST)
         _check_bounded(equations, every, stretches, is_unstable & (growth == growth.max(axis=0)))
-    inputs = {name: np.repeat(each, _POINTS) for name, each in levels.items()}
-    return inputs, np.concatenate(stretches)
+    more = _settling(equations, slopes, parameters | {name: each[0] for name, each in levels.items()}, state, solve)
+    states = np.concatenate(stretches)
+    later = _prolonged(equations, solve, slopes, parameters, states, more)
+    halves = [*range(_half_periods(equations)), *later]
+    levels = _levels(equations, _MOST_HALVES)
+    inputs = {name: np.repeat(each[halves], _POINTS) for name, each in levels.items()}
+    return inputs, np.concatenate([states, *later.values()])
+
+
+def _settling(
+    equations: Equations, slopes: _Slopes, known: Mapping[str, Any], state: _States, solve: Callable[..., Any]
+) -> int:
+    """Half periods until the slowest mode that decays has settled to 1 %, or the most that are tried."""
+    if solve is not _solved_linear:
+        return _MOST_SOLVED_HALVES
+    modes = np.linalg.eigvals(_system(slopes, known, state)[:, :-1, :-1])
+    decay = -modes.real[modes.real < -_LEAST_GROWTH * np.abs(modes).max(axis=1, keepdims=True)]
+    halves = math.log(100.0) / (0.5 * equations.period_s * float(decay.min())) if decay.size else 0.0
+    return min(math.ceil(halves), _MOST_HALVES)
+
+
+def _prolonged(
+    equations: Equations,
+    solve: Callable[..., Any],
+    slopes: _Slopes,
+    parameters: Mapping[str, Any],
+    states: NDArray[np.float64],
+    halves: int,
+) -> dict[int, NDArray[np.float64]]:
+    """Later half periods that raise a peak, by number; none if a state drifts all the time.
+
+    Linear equations are played for so many halves, others until their peaks have settled or solving takes long.
+    """
+    first, levels = _half_periods(equations), _levels(equations, _MOST_HALVES)
+    instants_s = np.linspace(0.0, 0.5 * equations.period_s, _POINTS)
+    is_linear = solve is _solved_linear
+    flows: dict[tuple[float, ...], tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+    low, high, state = states.min(axis=0), states.max(axis=0), states[-1]
+    kept: dict[int, NDArray[np.float64]] = {}
+    growths: list[NDArray[np.float64]] = []
+    peak = np.maximum(high, -low)
+    evaluations = 0
+
+    def counted(known: Mapping[str, Any], state: _States) -> _States:
+        nonlocal evaluations
+        evaluations += 1
+        return slopes(known, state)
+
+    for half in range(first, halves):
+        if evaluations > _MOST_EVALUATIONS:
+            break
+        known = {**parameters, **{name: each[half] for name, each in levels.items()}}
+        if is_linear:
+            key = tuple(float(each[half]) for each in levels.values())
+            if key not in flows:
+                flows[key] = _flow(slopes, known, state, instants_s)
+            stretch = np.einsum("ksij,js->kis", flows[key][0], state) + flows[key][1]
+        else:
+            tolerance = _LATER_TOLERANCE * peak + _TOLERANCE**2
+            stretch = _solved(counted, known, state, instants_s, _LATER_TOLERANCE, tolerance)
+        if not (np.abs(stretch[-1]) < _LARGEST).all():
+            return {}
+        state = stretch[-1]
+        if (stretch.max(axis=0) > high * (1.0 + _EXACT)).any() or (stretch.min(axis=0) < low * (1.0 + _EXACT)).any():
+            low, high = np.minimum(low, stretch.min(axis=0)), np.maximum(high, stretch.max(axis=0))
+            kept[half] = stretch
+        if (half + 1) % first == 0:
+            growths.append(np.maximum(high, -low) - peak)
+            peak = np.maximum(high, -low)
+            if not is_linear and (growths[-1] <= _SETTLED * peak).all():
+                break
+    drifts = len(growths) > 1 and bool(((growths[-1] >= _DRIFT * growths[0]) & (growths[-1] > _SETTLED * peak)).any())
+    return {} if drifts else kept
+
+
+def _flow(
+    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Exact solution of linear equations: (instants, settings, n, n) for the state, and what is added to it."""
+    n = len(state)
+    zero = _solved_linear(slopes, known, np.zeros_like(state), instants_s)
+    flow = np.empty((len(instants_s), state.shape[1], n, n))
+    for i in range(n):
+        unit = np.zeros_like(state)
+        unit[i] = 1.0
+        flow[..., i] = (_solved_linear(slopes, known, unit, instants_s) - zero).transpose(0, 2, 1)
+    return flow, zero
 
 
 def _half_periods(equations: Equations) -> int:
@@ -118,9 +233,9 @@ def _half_periods(equations: Equations) -> int:
     return max(1 << count, _LEAST_HALVES)
 
 
-def _levels(equations: Equations) -> dict[str, NDArray[np.float64]]:
-    """Level of each input in each half period."""
-    halves = np.arange(_half_periods(equations))
+def _levels(equations: Equations, count: int = 0) -> dict[str, NDArray[np.float64]]:
+    """Level of each input in each half period: so many, or those of the first play."""
+    halves = np.arange(count or _half_periods(equations))
     return {
         name: np.array(quantity.trial)[1 - (halves >> place) % 2]
         for place, (name, quantity) in enumerate(equations.inputs.items())
@@ -188,10 +303,17 @@ def _check_domains(stages: Stages, found: Mapping[str, Reach]) -> None:
         if stage.kind is StageKind.ROOT:
             radicand = found[stage.cords[0].source]
             if radicand.low < -1e-6 * radicand.high:
+                source = stage.cords[0].source
                 raise ProgramError(
                     f"{stage.place}: {stage.name} takes the root of negative values in the trial play "
-                    f"(down to {radicand.low:g}); write sqrt(max(0, ...))"
+                    f"(down to {radicand.low:g})",
+                    edits=[{("equations",): {f"sqrt({source})": f"sqrt(max(0, {source}))"}}],
+                    otherwise="take the root of a signal that stays positive",
                 )
+
+
+class _StiffError(ProgramError):
+    """The equations take too long to solve."""
 
 
 _Slopes = Callable[[Mapping[str, Any], _States], _States]
@@ -228,7 +350,12 @@ def _solved_linear(
 
 
 def _solved(
-    slopes: _Slopes, known: Mapping[str, Any], state: _States, instants_s: NDArray[np.float64]
+    slopes: _Slopes,
+    known: Mapping[str, Any],
+    state: _States,
+    instants_s: NDArray[np.float64],
+    relative: float = _TOLERANCE,
+    absolute: Any = _TOLERANCE**2,
 ) -> NDArray[np.float64]:
     """Numerical solution, with at most _MOST_EVALUATIONS of the slopes: (instants, states, settings)."""
     from scipy.integrate import RK45
@@ -236,7 +363,8 @@ def _solved(
     def flat(_: float, states: NDArray[np.float64]) -> NDArray[np.float64]:
         return slopes(known, states.reshape(state.shape)).ravel()
 
-    solver = RK45(flat, 0.0, state.ravel(), instants_s[-1], rtol=_TOLERANCE, atol=_TOLERANCE**2)
+    atol = np.broadcast_to(absolute, state.shape).ravel()
+    solver = RK45(flat, 0.0, state.ravel(), instants_s[-1], rtol=relative, atol=atol)
     rows, at = [state.ravel()], 1
     while at < len(instants_s):
         solver.step()
@@ -244,10 +372,14 @@ def _solved(
             rows += [np.full(state.size, np.nan)] * (len(instants_s) - at)
             break
         if solver.nfev > _MOST_EVALUATIONS:
-            raise ProgramError(
+            raise _StiffError(
                 f"trial play: stiff, more than {_MOST_EVALUATIONS} evaluations in half a period of "
-                f"{2 * instants_s[-1]:g} s; write a shorter period_s, or change a parameter"
+                f"{2 * instants_s[-1]:g} s",
+                edits=[{("period_s",): float(f"{2 * instants_s[-1] * each:.2g}")} for each in (0.3, 0.1, 0.03, 0.01)],
+                otherwise="write a shorter period_s, or change a parameter",
             )
+        if instants_s[at] > solver.t:
+            continue
         dense = solver.dense_output()
         while at < len(instants_s) and instants_s[at] <= solver.t:
             rows.append(dense(instants_s[at]))

@@ -2,7 +2,7 @@
 /// stepped, from sample to sample. Where a Lyapunov function proves that no kink is reached before the next edge, the
 /// stretch is quiet and nothing is judged any more.
 
-#include "engine_state.h"
+#include "../engine_state.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -633,7 +633,7 @@ static void begin(engine_t* const self, const slow_t* slow) {
     self->is_slow  = true;
 }
 
-bool quiet_begin(engine_t* const self, int64_t tick) {
+bool fast_begin(engine_t* const self, int64_t tick) {
     double        s[PADDED(ENGINE_MAX_STATES)];
     const slow_t* slow  = events_look_until(self, self->origin + ENGINE_TICKS_PER_SAMPLE) ? find_slow(self) : NULL;
     const int64_t since = tick - self->origin;
@@ -684,7 +684,7 @@ static bool watch_step(engine_t* const self) {
     return true;
 }
 
-void quiet_step(engine_t* const self) {
+static void step(engine_t* const self) {
     const slow_t* slow = &self->mode->slow;
     self->slow_age++;
     if (self->slow_age == LEAP) {
@@ -695,7 +695,7 @@ void quiet_step(engine_t* const self) {
     self->counts.quiet++;
 }
 
-void quiet_leap(engine_t* const self, double* y) {
+static void leap(engine_t* const self, double* y) {
     const slow_t* slow  = &self->mode->slow;
     const int     width = width_of(self, slow);
     self->kernels->advance(slow->rank, width, slow->leap, self->slow_z);
@@ -704,10 +704,15 @@ void quiet_leap(engine_t* const self, double* y) {
     self->counts.quiet += LEAP;
 }
 
-void quiet_read(const engine_t* const self, double* row) {
+void fast_read(const engine_t* const self, double* row) {
     const slow_t* slow  = &self->mode->slow;
     const int     width = width_of(self, slow), length = row_length(self);
-    self->kernels->multiply(length, width, &slow->y[self->slow_age * PANEL_ELEMENTS(length, width)], self->slow_z, row);
+    double        padded[PADDED(2 * ENGINE_MAX_OUTPUTS)];
+    double*       out = length % PANEL == 0 ? row : padded;
+    self->kernels->multiply(length, width, &slow->y[self->slow_age * PANEL_ELEMENTS(length, width)], self->slow_z, out);
+    if (out != row) {
+        memcpy(row, padded, (size_t)length * sizeof row[0]);
+    }
 }
 
 /// x a number of ticks later.
@@ -724,7 +729,7 @@ static void get_state_after(const engine_t* const self, int64_t ticks, double* x
     memcpy(x, padded, (size_t)self->states * sizeof x[0]);
 }
 
-void quiet_get_state(const engine_t* const self, double* x) { get_state_after(self, 0, x); }
+void fast_get_state(const engine_t* const self, double* x) { get_state_after(self, 0, x); }
 
 /// End a stretch a number of ticks later.
 static void leave(engine_t* const self, int64_t ticks) {
@@ -733,19 +738,19 @@ static void leave(engine_t* const self, int64_t ticks) {
     self->now += ticks;
 }
 
-void quiet_leave(engine_t* const self) {
+void fast_leave(engine_t* const self) {
     if (self->is_slow) {
         leave(self, 0);
     }
 }
 
-bool quiet_advance(engine_t* const self, int64_t tick) {
+bool fast_advance(engine_t* const self, int64_t tick) {
     const int64_t next = self->now + ENGINE_TICKS_PER_SAMPLE;
     if (!self->is_slow && (tick < next || !begin_here(self))) {
         return false;
     }
     if (tick >= next && self->clear == NO_END) {
-        quiet_step(self);
+        step(self);
         return true;
     }
     if (tick >= next && watch_step(self)) {
@@ -755,6 +760,25 @@ bool quiet_advance(engine_t* const self, int64_t tick) {
         leave(self, tick - self->now);
         return true;
     }
-    quiet_leave(self);
+    fast_leave(self);
     return false;
+}
+
+int64_t fast_run(engine_t* const self, int64_t before, double* y) {
+    const bool    quiet   = self->is_slow && self->clear == NO_END;
+    const int64_t samples = quiet ? (before - 1 - self->now) / ENGINE_TICKS_PER_SAMPLE : 0;
+    const int     row     = row_length(self);
+    int64_t       k       = 0;
+    while (k < samples) {
+        if (self->slow_age == LEAP - 1 && row % PANEL == 0 && samples - k >= LEAP) {
+            leap(self, &y[k * row]);
+            k += LEAP;
+        } else {
+            step(self);
+            fast_read(self, &y[k * row]);
+            k++;
+        }
+    }
+    self->counts.samples += samples > 0 ? samples : 0;
+    return samples > 0 ? samples : 0;
 }

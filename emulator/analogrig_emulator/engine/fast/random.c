@@ -1,7 +1,7 @@
 /// Streams of numpy.random.default_rng([seed, stream]), for many seeds at once: O'Neill, "Simple portable C++ seed entropy"
 /// (2015) and "PCG: a family of simple fast space-efficient statistically good algorithms" (2014), PCG XSL RR 128/64.
 
-#include "engine.h"
+#include "../engine.h"
 
 #include <stdbool.h>
 #include <string.h>
