@@ -261,9 +261,9 @@ class Steps:
         """The median."""
         return statistics.median(self.counts)
 
-    def costs(self, limit: float | None, rival: Steps) -> Iterator[Cost]:
+    def costs(self, limit: float | None) -> Iterator[Cost]:
         """The typical step, and how much longer the longest is."""
-        yield Cost(self.name, self.typical, "instructions", limit, rival.name, self.typical / rival.typical)
+        yield Cost(self.name, self.typical, "instructions", limit)
         worst = max(self.counts)
         yield Cost(
             f"{self.name}, worst", worst, "instructions", EVEN * self.typical, "the typical step", worst / self.typical
@@ -282,12 +282,6 @@ class ImageRunner:
         sources = [HERE / "image.c", HERE / "subject_est.c", *core_sources()]
         flags = (*orders.flags(fixed=fixed), *(TRIGGER_ALONE if alone else ()))
         return self._steps(name, processor, sources, flags, "est_step")
-
-    def textbook(self, processor: Processor, n: int, *, factors: bool) -> Steps:
-        """The steps of a textbook's least squares."""
-        name = f"{processor.name}, n = {n}, textbook {'U-D' if factors else 'covariance'}"
-        flags = (f"-DTEXTBOOK_N={n}U", *(("-DTEXTBOOK_FACTORS",) if factors else ()))
-        return self._steps(name, processor, [HERE / "image.c", HERE / "textbook.c"], flags, "textbook_step")
 
     def isolation(self, processor: Processor, orders: Orders) -> Iterator[Steps]:
         """Steps of isolation: entering a sample, which costs most at an alarm, and each slice of work after that."""
@@ -396,26 +390,19 @@ def fit(bench: ImageRunner) -> Iterator[Cost]:
 
 def instructions(bench: ImageRunner) -> Iterator[Cost]:
     """Costs in instructions, on the M4F."""
-    rivals = {n: [bench.textbook(M4F, n, factors=factors) for factors in (False, True)] for n in (4, 6)}
     for orders, at_run_time, at_compile_time in ((SMALL, 400, 340), (LARGE, 750, 520), (FREE, 750, 520)):
-        rival = rivals[orders.count][1]
         for fixed, limit in ((False, at_run_time), (True, at_compile_time)):
-            yield from bench.estimator(M4F, orders, fixed=fixed).costs(limit, rival)
+            yield from bench.estimator(M4F, orders, fixed=fixed).costs(limit)
             if not orders.may_slip:
-                yield from bench.estimator(M4F, orders, fixed=fixed, alone=True).costs(limit, rival)
+                yield from bench.estimator(M4F, orders, fixed=fixed, alone=True).costs(limit)
     other = bench.estimator(M4F, OTHER)
     yield Cost(f"{other.name}, not one of the usual shapes", other.typical, "instructions")
-    for steps in (*rivals[4], *rivals[6]):
-        yield Cost(steps.name, steps.typical, "instructions")
 
 
 def soft_float(bench: ImageRunner) -> Iterator[Cost]:
     """On processors without floating point: libgcc's routines, whose length depends on the numbers."""
     for processor in (M3, M0):
-        rivals = [bench.textbook(processor, SMALL.count, factors=factors) for factors in (False, True)]
-        yield from bench.estimator(processor, SMALL).costs(7000, rivals[1])
-        for steps in rivals:
-            yield Cost(steps.name, steps.typical, "instructions")
+        yield from bench.estimator(processor, SMALL).costs(7000)
 
 
 def missing_tools() -> list[str]:

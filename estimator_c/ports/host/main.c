@@ -36,8 +36,11 @@ static const char usage_text[] =
     "input ends.\n"
     "\n"
     "  --slcan               speak CAN as LAWICEL's adapters do, as if such a one were between it and the line\n"
-    "  --listen ADDRESS      serve one client after the other, each with a device that has just booted. Without HOST\n"
-    "                        on the loopback interface only; port 0 takes a free one. Prints the address when ready\n"
+    "  --listen ADDRESS      serve one client after the other, each with a device that has just booted. A client's "
+    "turn\n"
+    "                        comes once it has sent something. Without HOST on the loopback interface only; port 0 "
+    "takes\n"
+    "                        a free one. Prints the address when ready\n"
     "  --can INTERFACE       a SocketCAN interface, such as can0; --fd: it carries CAN FD. Prints its name when ready\n"
     "  --catalogue-hash HEX  pretend to be built from another message catalogue (for tests)\n"
     "  --version             print the version and the hash of the catalogue\n"
@@ -249,6 +252,7 @@ static bool has_hung_up(const short events) {
 }
 
 #define WAIT_FOR_EVER (-1)
+#define SILENT_MAX 64U
 
 bool port_idle(const bool wants_input, const bool has_output) {
     const short   in     = (wants_input && !line.has_ended) ? POLLIN : 0;
@@ -296,29 +300,74 @@ static int serve_terminal(const options_t* const options) {
     return line.lost ? fail("lost", name) : EXIT_SUCCESS;
 }
 
-/// Wait for the next client and make it the line. Return false if standard input has ended, or with line.lost.
+/// Clients that have not spoken yet, in order of their arrival. A newcomer replaces the first one.
+static struct {
+    int    fds[SILENT_MAX];
+    size_t n;
+} silent;
+
+static void forget_silent(const size_t i) {
+    silent.n--;
+    (void)memmove(&silent.fds[i], &silent.fds[i + 1U], (silent.n - i) * sizeof(silent.fds[0]));
+}
+
+/// Accept all newcomers. Return false with line.lost if that failed.
+static bool accept_newcomers(const int listener) {
+    int fd = tcp_accept(listener);
+    while (fd >= 0) {
+        if (silent.n == SILENT_MAX) {
+            (void)close(silent.fds[0]);
+            forget_silent(0U);
+        }
+        silent.fds[silent.n] = fd;
+        silent.n++;
+        fd = tcp_accept(listener);
+    }
+    if (!is_transient() && (errno != ECONNABORTED)) {
+        lose(errno);
+    }
+    return !line.lost;
+}
+
+/// Make the first client that speaks the line.
+static void take_speaker(void) {
+    size_t i = 0U;
+    while ((i < silent.n) && (line.fd < 0)) {
+        const int        fd   = silent.fds[i];
+        const tcp_peer_t peer = tcp_look(fd);
+        if (peer == TCP_SILENT) {
+            i++;
+        } else {
+            forget_silent(i);
+            line.fd = (peer == TCP_SPEAKS) ? fd : -1;
+        }
+    }
+}
+
+/// Wait for the next client that speaks and make it the line. Return false if standard input has ended, or with
+/// line.lost.
 static bool await_client(const int listener) {
     line.fd        = -1;
     line.has_ended = false;
     line.lost      = false;
     while (line.fd < 0) {
-        struct pollfd fds[2] = {
+        struct pollfd fds[2U + SILENT_MAX] = {
             { .fd = STDIN_FILENO, .events = POLLIN },
             { .fd = listener, .events = POLLIN },
         };
-        if ((poll(fds, 2, WAIT_FOR_EVER) < 0) && !is_transient()) {
+        for (size_t i = 0U; i < silent.n; i++) {
+            fds[2U + i] = (struct pollfd){ .fd = silent.fds[i], .events = POLLIN };
+        }
+        if ((poll(fds, (nfds_t)(2U + silent.n), WAIT_FOR_EVER) < 0) && !is_transient()) {
             lose(errno);
             return false;
         }
         if (parent_is_gone(fds[0].revents)) {
             return false;
         }
-        if (fds[1].revents != 0) {
-            line.fd = tcp_accept(listener);
-            if ((line.fd < 0) && !is_transient() && (errno != ECONNABORTED)) {
-                lose(errno);
-                return false;
-            }
+        take_speaker();
+        if ((line.fd < 0) && (fds[1].revents != 0) && !accept_newcomers(listener)) {
+            return false;
         }
     }
     return true;

@@ -9,11 +9,12 @@
 #include <netinet/tcp.h>
 #include <stdio.h>
 #include <string.h>
+#include <strings.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
 #define SCHEME "tcp://"
-#define WAITING_MAX 8  ///< clients that wait for the one before them
+#define WAITING_MAX 128  ///< clients that wait for the one before them
 #define PORT_MAX 65535U
 
 /// Parse a port of at most five digits.
@@ -122,4 +123,56 @@ int tcp_accept(const int listener) {
     // Otherwise the kernel holds an answer back until the one before it is acknowledged, which takes up to 40 ms.
     const bool is_ready = (setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof(on)) == 0) && make_nonblocking(fd);
     return is_ready ? fd : discard(fd);
+}
+
+/// Answer of one line to a client of HTTP.
+static const char http_answer[] =
+    "HTTP/1.0 400 this port is analogrig-device, a device of binary frames, not a web server\r\n";
+
+static const char* const http_methods[] = { "GET ",     "POST ",  "HEAD ",    "PUT ",   "DELETE ",
+                                            "OPTIONS ", "PATCH ", "CONNECT ", "TRACE ", "PRI " };
+
+#define METHOD_MAX 8U
+
+/// Number of bytes after which it is known whether the first n ones begin a request of HTTP; 0 if they do, n if they do
+/// not.
+static size_t http_undecided(const char* const bytes, const size_t n) {
+    size_t wanted = n;
+    for (size_t i = 0U; i < (sizeof(http_methods) / sizeof(http_methods[0])); i++) {
+        const size_t length = strlen(http_methods[i]);
+        if (strncasecmp(bytes, http_methods[i], (n < length) ? n : length) == 0) {
+            wanted = (n < length) ? (n + 1U) : 0U;
+            break;
+        }
+    }
+    return wanted;
+}
+
+/// Tell a client of HTTP what the port is. What it has sent so far is read: unread, it would reset the connection.
+static void refuse_http(const int fd) {
+    char ignored[4096];
+    (void)send(fd, http_answer, sizeof(http_answer) - 1U, MSG_NOSIGNAL);
+    (void)shutdown(fd, SHUT_WR);
+    for (int i = 0; (i < 64) && (recv(fd, ignored, sizeof(ignored), 0) > 0); i++) {
+    }
+}
+
+tcp_peer_t tcp_look(const int fd) {
+    char          bytes[METHOD_MAX];
+    const ssize_t n = recv(fd, bytes, sizeof(bytes), MSG_PEEK);
+    if ((n < 0) && ((errno == EAGAIN) || (errno == EWOULDBLOCK) || (errno == EINTR))) {
+        return TCP_SILENT;
+    }
+    const size_t wanted = (n > 0) ? http_undecided(bytes, (size_t)n) : 0U;
+    if (wanted == 0U) {
+        if (n > 0) {
+            refuse_http(fd);
+        }
+        (void)close(fd);
+        return TCP_GONE;
+    }
+    // The socket becomes readable only once there is more to look at.
+    const int least = (wanted > (size_t)n) ? (int)wanted : 1;
+    (void)setsockopt(fd, SOL_SOCKET, SO_RCVLOWAT, &least, sizeof(least));
+    return (wanted > (size_t)n) ? TCP_SILENT : TCP_SPEAKS;
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-/// tcp: a TCP port for one client after the other.
+/// tcp: a TCP port for one client after the other, and what a client speaks.
 
 #ifndef TCP_H_INCLUDED
 #define TCP_H_INCLUDED
@@ -27,5 +27,15 @@ bool tcp_print(int listener, char text[TCP_TEXT_MAX]);
 
 /// Accept the next client: a non-blocking socket that sends every answer at once. Return -1 with errno if there is none.
 int tcp_accept(int listener);
+
+typedef enum {
+    TCP_SILENT = 0,  ///< it has sent nothing, or too little to tell
+    TCP_SPEAKS,      ///< it has sent something that is no request of HTTP
+    TCP_GONE,        ///< it has gone, or speaks HTTP: it has been told what the port is, and the socket is closed
+} tcp_peer_t;
+
+/// Look at the first bytes of a client, which stay in the socket. Any web page can make a browser send a request of
+/// HTTP with any body.
+tcp_peer_t tcp_look(int fd);
 
 #endif  // TCP_H_INCLUDED
