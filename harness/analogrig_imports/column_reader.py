@@ -1,4 +1,4 @@
-"""Reader of columns of numbers in files of other tools: ``python -m analogrig.recordings.column_reader REQUEST``.
+"""Reader of columns of numbers in files of other tools: ``python -m analogrig_imports.column_reader REQUEST``.
 
 It runs in a process of its own with bounded memory and time, because a damaged or hostile file may exhaust the memory
 or crash the library that reads it. Nothing in a file is executed: no pickles, no formulas, no links to other files.
@@ -9,8 +9,6 @@ The answer is a JSON object on standard output: ``names``, ``rate_hz``, ``blank_
 
 from __future__ import annotations
 
-import array
-import csv
 import json
 import os
 import re
@@ -19,11 +17,11 @@ import sys
 import tempfile
 import warnings
 import zipfile
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, islice
+from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any, NamedTuple
@@ -32,45 +30,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.plant import MAX_SAMPLES
+from analogrig_imports.column_names import MOST_NAME, ColumnError, place, unit_in_name
+from analogrig_imports.text_columns import MOST_COLUMNS, read_text
 
 MOST_MEMORY_BYTES = 4 << 30
 """Address space of the process, libraries included."""
 
 MOST_PROCESSOR_S = 300
 
-MOST_COLUMNS = 4096
-"""Largest number of columns of a file."""
-
-_LONGEST_LINE = 1 << 16
-_MOST_NAME = 120
+_STREAMED_BYTES = 0x7FF00000
+"""Least size that stands for an unknown one: writers to a pipe state 2 or 4 GiB, or nearly so."""
+_MOST_DEPTH = 4
+"""Structs within structs that are read."""
 _MOST_TEXT_BYTES = 4096
 """Largest array of texts that is read."""
 
-_SAMPLED_LINES = 40
-"""Lines at the start of a text from which its delimiter is found."""
-
-_NAME_AND_UNIT = re.compile(r"(.*?)\s*[\[(]([^\[\]()\d][^\[\]()]*)[\])]")  # x[2] is part of an array
-
-_MOST_FOOTER = 20
-"""Lines at the end of a text whose unwanted columns are looked at, too."""
-
-_CHUNK_BYTES = 1 << 20
-_SPACES = " "
-"""Delimiter of cells that stand apart by any number of spaces."""
-_DELIMITERS = (";", "\t", ",", _SPACES)
-_NO_TEXT = {
-    b"\xff\xfe": "is UTF-16 text: save it as UTF-8",
-    b"\xfe\xff": "is UTF-16 text: save it as UTF-8",
-    b"PK\x03\x04": "is a workbook or an archive: export its table as CSV",
-    b"\x1f\x8b": "is compressed: unpack it",
-}
-"""Files that are no delimited text, by their first bytes."""
-
 Column = NDArray[np.float64]
-
-
-class ColumnError(Exception):
-    """A file that cannot be read, in one line without its name."""
 
 
 @dataclass
@@ -107,7 +82,7 @@ class Table:
         """
         long = [size for size in shape if size != 1]
         if max(long, default=1) > MAX_SAMPLES:
-            raise ColumnError(f"{name[:_MOST_NAME]} has {max(long)} samples, more than {MAX_SAMPLES}")
+            raise ColumnError(f"{name[:MOST_NAME]} has {max(long)} samples, more than {MAX_SAMPLES}")
         if len(long) == 1:
             self._put(name, lambda: _numbers(name, load()).reshape(-1))
         elif len(long) == 2 and min(long) <= MOST_COLUMNS:
@@ -126,12 +101,12 @@ def _field_of(load: Callable[[], Any], name: str) -> Any:
 
 def _refuse_objects(name: str) -> Any:
     raise ColumnError(
-        f"{name[:_MOST_NAME] or 'the array'} holds Python objects, which are not loaded; save numbers, as float64"
+        f"{name[:MOST_NAME] or 'the array'} holds Python objects, which are not loaded; save numbers, as float64"
     )
 
 
 def _refuse_namesakes(name: str) -> Any:
-    raise ColumnError(f"several columns are called {name[:_MOST_NAME]!r}; give each a name of its own")
+    raise ColumnError(f"several columns are called {name[:MOST_NAME]!r}; give each a name of its own")
 
 
 def _row_of(name: str, load: Callable[[], Any], j: int) -> Column:
@@ -144,217 +119,23 @@ def _numbers(name: str, values: Any) -> Column:
     """:raises ColumnError: they are no real numbers."""
     found = np.asarray(values)
     if found.dtype.kind not in "buif":
-        raise ColumnError(f"{name[:_MOST_NAME]} holds no real numbers, but {found.dtype}")
+        raise ColumnError(f"{name[:MOST_NAME]} holds no real numbers, but {found.dtype}")
     return found.astype(np.float64)
 
 
-# --------------------------------------------------------------------------------------------------------------- text
+_CURES = {
+    "struct": "in MATLAB: s = load('FILE'); s = s.NAME; save('flat.mat', '-struct', 's')",
+    "opaque": "in MATLAB: load FILE; t = seconds(NAME.Time); x = NAME.Variables; save('flat.mat', 't', 'x')",
+}
+"""Lines that turn what is not loaded into arrays, by its kind."""
 
 
-def _lines(file: IO[str]) -> Iterator[str]:
-    """:raises ColumnError: a line is too long."""
-    for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), ""), 1):
-        if len(line) == _LONGEST_LINE:
-            raise ColumnError(f"line {number} has more than {_LONGEST_LINE} characters")
-        yield line
-
-
-def _number(cell: str, delimiter: str) -> float:
-    """:raises ValueError: it is no number."""
-    text = cell.strip()
-    if not text:
-        return float("nan")
-    if "_" in text or not text.isascii():
-        raise ValueError(text)  # Python would read 1_0 as 10, and the digits of every script
-    return float(text.replace(",", ".") if delimiter != "," else text)
-
-
-def _is_word(cell: str) -> bool:
-    """True unless the cell is a number; an empty one is a word, too."""
-    return not cell.strip() or not _are_numbers([cell], ";")
-
-
-def _are_numbers(cells: Sequence[str], delimiter: str) -> bool:
-    try:
-        return any(cell.strip() for cell in cells) and not any(
-            np.isnan(_number(cell, delimiter)) for cell in cells if cell.strip()
-        )
-    except ValueError:
-        return False
-
-
-def read_text(path: Path, wanted: Sequence[str], skip_lines: int) -> tuple[list[str], dict[str, Column], int]:
-    """Names and wanted columns of delimited text, and the blank lines between its rows.
-
-    Without a header the names are 0, 1, ...
-
-    :raises ColumnError: a line has no such cell, or no number there.
-    """
-    _check_text(path, skip_lines)
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-        lines = enumerate(_lines(file), 1)
-        rest = ((k, line) for k, line in islice(lines, skip_lines, None) if line[0] != "#")
-        first = next((each for each in rest if each[1].strip()), None)
-        if first is None:
-            raise ColumnError("holds no line of text")
-        start = list(islice(rest, _SAMPLED_LINES))
-        rows = chain(start, rest)
-        delimiter = _delimiter(first[1], [line for _, line in start if line.strip()])
-        cells = [cell.strip() for cell in _cells(first[1], delimiter)]
-        has_header = not _are_numbers(cells, delimiter)
-        names = cells if has_header else [str(j) for j in range(len(cells))]
-        while names and not names[-1]:
-            names.pop()
-        if len(names) > MOST_COLUMNS:
-            raise ColumnError(f"more than {MOST_COLUMNS} columns")
-        places = [_place(name, names, _cure_of_names(names)) for name in wanted]
-        found: list[array.array[float]] = []
-        blank_lines = 0
-        if wanted:
-            found, blank_lines = _read_rows(rows if has_header else chain([first], rows), names, places, delimiter)
-    return names, {name: np.frombuffer(column) for name, column in zip(wanted, found, strict=True)}, blank_lines
-
-
-def _read_rows(
-    lines: Iterable[tuple[int, str]], names: Sequence[str], places: Sequence[int], delimiter: str
-) -> tuple[list[array.array[float]], int]:
-    """Numbers at these places of every line, and the blank lines between the first and the last.
-
-    :raises ColumnError: a line has no such cell, or no number there.
-    """
-    found = [array.array("d") for _ in places]
-    blank_lines = blank_here = 0
-    first: list[str] = []
-    last: deque[tuple[int, list[str]]] = deque(maxlen=_MOST_FOOTER)
-    for number, line in lines:
-        if not line.strip():
-            blank_here += bool(found[0])
-            continue
-        blank_lines, blank_here = blank_lines + blank_here, 0
-        if len(found[0]) == MAX_SAMPLES:
-            raise ColumnError(_too_many(MAX_SAMPLES))
-        row = _cells(line, delimiter)
-        first = first or row
-        last.append((number, row))
-        if len(row) > len(names) and any(cell.strip() for cell in row[len(names) :]):
-            raise ColumnError(
-                f"line {number} has {len(row)} cells, the first line {len(names)}: cells with decimal commas need"
-                " another separator, such as semicolons"
-            )
-        for place, column in zip(places, found, strict=True):
-            try:
-                column.append(_number(row[place], delimiter))
-            except (IndexError, ValueError):
-                if not found[0] and all(map(_is_word, row)):
-                    raise ColumnError(
-                        f"line {number} holds no number, perhaps units: delete it, or pass --skip-lines {number} and"
-                        " name the columns 0, 1, ..."
-                    ) from None
-                where = f"line {number}, column {names[place][:_MOST_NAME]}"
-                why = f"{row[place][:40]!r} is no number" if place < len(row) else "the line has no such cell"
-                raise ColumnError(f"{where}: {why}; mend or delete the line") from None
-    _check_footer(first, last, names, delimiter)
-    return found, blank_lines
-
-
-def _check_footer(
-    first: Sequence[str], last: Iterable[tuple[int, Sequence[str]]], names: Sequence[str], delimiter: str
-) -> None:
-    """Refuse a summary below the samples, which may have numbers in the wanted columns.
-
-    :param last: last rows with the numbers of their lines.
-    :raises ColumnError: a column that begins with a number has text in them.
-    """
-    numeric = [place for place, cell in enumerate(first) if _are_numbers([cell], delimiter)]
-    for number, row in last:
-        for place in numeric:
-            if place < len(row) and row[place].strip() and not _are_numbers([row[place]], delimiter):
-                raise ColumnError(
-                    f"line {number}, column {names[place][:_MOST_NAME]}: {row[place][:40]!r} is no number, perhaps a"
-                    " footer: mend or delete the line"
-                )
-
-
-def _check_text(path: Path, skip_lines: int) -> None:
-    """Refuse at once what is no text, or has too many lines: to parse it would take a minute.
-
-    :raises ColumnError: it is such a file.
-    """
-    rows = -skip_lines
-    with path.open("rb") as file:
-        start = file.read(_CHUNK_BYTES)
-        for first_bytes, what in _NO_TEXT.items():
-            if start.startswith(first_bytes):
-                raise ColumnError(what)
-        if b"\0" in start[:4096]:
-            raise ColumnError("holds bytes of zero: UTF-16, or no text; save it as text in UTF-8")
-        for chunk in chain([start], iter(partial(file.read, _CHUNK_BYTES), b"")):
-            rows += chunk.count(b"\n") - sum(chunk.count(blank) for blank in (b"\n\n", b"\n\r", b"\n#"))
-            if rows > MAX_SAMPLES + 1:
-                raise ColumnError(_too_many(MAX_SAMPLES))
-
-
-def _too_many(samples: int) -> str:
-    return f"has more than {samples} samples; cut it into files of fewer lines"
-
-
-def _delimiter(first: str, rows: Sequence[str]) -> str:
-    """Delimiter that gives as many cells in each row as in the first line; of several, the one with most numbers.
-
-    If none does, the one with most numbers.
-    """
-
-    def merit(delimiter: str) -> tuple[bool, float]:
-        rows_of_cells = [_cells(row, delimiter) for row in rows]
-        cells = [cell for row in rows_of_cells for cell in row]
-        numbers = sum(_are_numbers([cell], delimiter) for cell in cells) / len(cells) if cells else 0.0
-        return {len(row) for row in rows_of_cells} <= {len(_cells(first, delimiter))}, numbers
-
-    possible = [each for each in _DELIMITERS if len(_cells(first, each)) > 1]
-    return max(possible, key=merit, default=_SPACES)
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    return line.split() if delimiter == _SPACES else next(csv.reader([line], delimiter=delimiter))
-
-
-def _cure_of_names(names: Sequence[str]) -> str:
-    """Cure if names suggest a wrong first line or a wrong encoding."""
-    if any("\ufffd" in name for name in names):
-        return "; the file is no UTF-8: save it as UTF-8"
-    return "; --skip-lines N leaves out text above the header"
-
-
-def unit_in_name(column: str) -> str:
-    """Unit in brackets at the end of a column's name, such as mm of ``stroke [mm]``; empty without one."""
-    found = _NAME_AND_UNIT.fullmatch(column.strip())
-    return found[2].strip() if found else ""
-
-
-def _without_unit(column: str) -> str:
-    found = _NAME_AND_UNIT.fullmatch(column.strip())
-    return found[1] if found and "\ufffd" not in column else column
-
-
-def _place(name: str, names: Sequence[str], cure: str = "") -> int:
-    """Place of a name, which may lack its unit.
-
-    :raises ColumnError: there is no such name, or more than one.
-    """
-    places = [i for i, each in enumerate(names) if each == name]
-    places = places or [i for i, each in enumerate(names) if _without_unit(each) == name]
-    if len(places) == 1:
-        return places[0]
-    if places:
-        raise ColumnError(f"{len(places)} columns are called {name[:_MOST_NAME]!r}")
-    shown = ", ".join(each[:_MOST_NAME] for each in names[:20]) + (", ..." if len(names) > 20 else "")
-    raise ColumnError(f"no column is called {name[:_MOST_NAME]!r}; there are {shown or 'none'}{cure}")
-
-
-def _refusal(refused: Mapping[str, str]) -> str:
+def _refusal(path: Path, refused: Mapping[str, str]) -> str:
     """Names and kinds of what is not loaded, and the cure."""
-    shown = [f"{name[:_MOST_NAME] or 'the array'} ({kind})" for name, kind in refused.items()]
-    return f"not loaded: {', '.join(shown[:20])}{', ...' if len(shown) > 20 else ''}; save numbers, as float64"
+    shown = [f"{name[:MOST_NAME] or 'the array'} ({kind})" for name, kind in refused.items()]
+    name, kind = next(iter(refused.items()))
+    cure = _CURES.get(kind, "save numbers, as float64").replace("FILE", path.name).replace("NAME", name[:MOST_NAME])
+    return f"not loaded: {', '.join(shown[:20])}{', ...' if len(shown) > 20 else ''}; {cure}"
 
 
 # --------------------------------------------------------------------------------------------------------------- NumPy
@@ -386,7 +167,7 @@ def open_npz(path: Path) -> Table:
             shape, dtype = _npy_header(member)
         name = info.filename.removesuffix(".npy")
         if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > info.file_size:
-            raise ColumnError(f"{name[:_MOST_NAME]} declares the shape {shape}, larger than its member of the archive")
+            raise ColumnError(f"{name[:MOST_NAME]} declares the shape {shape}, larger than its member of the archive")
         table.add_typed(name, dtype, shape, partial(_npz_member, archive, info))
         if name == "channels" and dtype.kind == "U" and info.file_size < _MOST_TEXT_BYTES:
             channels = _npz_member(archive, info).reshape(-1).tolist()
@@ -422,7 +203,12 @@ def open_matlab(path: Path) -> Table:
 
     table = Table()
     for name, shape, kind in scipy.io.whosmat(path):
-        if kind not in {"cell", "struct", "object", "function", "char", "opaque", "unknown", "sparse"}:
+        if kind == "struct":
+            before = len(table.columns)
+            _add_struct(table, name, _mat_variable(path, name))
+            if len(table.columns) == before:
+                table.refused[name] = kind
+        elif kind not in {"cell", "object", "function", "char", "opaque", "unknown", "sparse"}:
             table.add(name, shape, partial(_mat_variable, path, name))
         else:
             table.refused[name] = kind
@@ -435,23 +221,48 @@ def _mat_variable(path: Path, name: str) -> Any:
     return scipy.io.loadmat(path, variable_names=[name])[name]
 
 
+def _add_struct(table: Table, name: str, struct: Any, depth: int = 0) -> None:
+    """Add the numbers in the fields of a struct as ``name.field``, of an array of them as ``name[i].field``."""
+    elements = np.asarray(struct).reshape(-1)
+    for i, element in enumerate(elements[:MOST_COLUMNS]):
+        label = name if len(elements) == 1 else f"{name}[{i}]"
+        for field_name in struct.dtype.names or ():
+            value = np.asarray(element[field_name])
+            if value.dtype.names and depth < _MOST_DEPTH:
+                _add_struct(table, f"{label}.{field_name}", value, depth + 1)
+            elif value.dtype.kind in "buif":
+                table.add(f"{label}.{field_name}", value.shape, partial(np.asarray, value))
+            elif value.dtype.kind != "U":
+                table.refused[f"{label}.{field_name}"] = "cell" if value.dtype.hasobject else value.dtype.name
+
+
 def _open_hdf5(path: Path) -> Table:
     """Table of the data sets at the top of an HDF5 file; links to other files are not followed."""
     try:
         import h5py
     except ImportError:
         raise ColumnError("MATLAB files of version 7.3 need h5py: pip install h5py") from None
-    file = h5py.File(path, "r")
     table = Table()
-    for name in islice(file, MOST_COLUMNS + 1):
-        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+    _add_group(table, "", h5py.File(path, "r"))
+    return table
+
+
+def _add_group(table: Table, prefix: str, group: Any, depth: int = 0) -> None:
+    """Add the data sets of a group of HDF5, which is a struct of MATLAB, and those of its groups as ``name.field``."""
+    import h5py
+
+    for key in islice(group, MOST_COLUMNS + 1):
+        name = f"{prefix}{key}"
+        if not isinstance(group.get(key, getlink=True), h5py.HardLink) or key.startswith("#"):
             continue
-        found = file[name]
+        found = group[key]
         if isinstance(found, h5py.Group):
-            table.refused[name] = "struct"
+            if depth < _MOST_DEPTH:
+                _add_group(table, f"{name}.", found, depth + 1)
+        elif found.dtype.kind == "O":
+            table.refused[name] = "cell"
         elif found.shape and not found.external and not found.is_virtual:
             table.add(name, found.shape, partial(found.__getitem__, ()))
-    return table
 
 
 # ------------------------------------------------------------------------------------------------------- measurements
@@ -487,7 +298,7 @@ def _mf4_channel(measurement: Any, group: int, index: int) -> Any:
         return signal.samples
     if kind == 1:
         return conversion.a * np.asarray(signal.samples, np.float64) + conversion.b
-    raise ColumnError(f"{signal.name[:_MOST_NAME]} has a conversion other than a straight line; export physical values")
+    raise ColumnError(f"{signal.name[:MOST_NAME]} has a conversion other than a straight line; export physical values")
 
 
 def open_parquet(path: Path) -> Table:
@@ -518,16 +329,34 @@ def _parquet_instants(file: Any, name: str) -> Any:
     return (instants - instants[0]) * 1e-9
 
 
+def _whole_wav(path: Path) -> BytesIO:
+    """The file, with the sizes that a writer to a pipe could not know.
+
+    :raises ColumnError: it ends before the size that its header states.
+    """
+    data = bytearray(path.read_bytes())
+    at = 12  # of the first chunk
+    while data[:4] == b"RIFF" and at + 8 <= len(data):
+        stated, rest = int.from_bytes(data[at + 4 : at + 8], "little"), len(data) - at - 8
+        is_streamed = stated >= _STREAMED_BYTES or (stated == 0 and rest > 0)
+        if data[at : at + 4] == b"data":
+            if is_streamed:
+                data[at + 4 : at + 8] = rest.to_bytes(4, "little")
+            elif stated > rest:
+                raise ColumnError(
+                    f"is cut off: {len(data)} of the {at + 8 + stated} bytes that its header states; copy it once more"
+                )
+            data[4:8] = (len(data) - 8).to_bytes(4, "little")
+            break
+        at += 8 + stated + stated % 2
+    return BytesIO(bytes(data))
+
+
 def open_wav(path: Path) -> Table:
     """Table of the channels 0, 1, ...; whole numbers are scaled to -1..1."""
     from scipy.io import wavfile
 
-    with path.open("rb") as file:
-        start = file.read(8)
-    stated, size = int.from_bytes(start[4:], "little"), path.stat().st_size
-    if start.startswith(b"RIFF") and stated > size:
-        raise ColumnError(f"is cut off: {size} of the {stated + 8} bytes that its header states; copy it once more")
-    rate_hz, values = wavfile.read(path)
+    rate_hz, values = wavfile.read(_whole_wav(path))
     scaled = np.asarray(values)
     if scaled.dtype.kind == "u":
         scaled = (scaled - 128.0) / 128.0
@@ -539,10 +368,14 @@ def open_wav(path: Path) -> Table:
     return table
 
 
-FORMATS: Mapping[str, tuple[str, Callable[[Path], Table] | None]] = {
+Opening = Callable[[Path], Table]
+
+FORMATS: Mapping[str, tuple[str, Opening | None]] = {
     ".csv": ("CSV", None),
     ".tsv": ("CSV", None),
     ".txt": ("CSV", None),
+    ".dat": ("CSV", None),
+    ".lvm": ("LabVIEW", None),
     ".npy": ("NumPy", open_npy),
     ".npz": ("NumPy", open_npz),
     ".mat": ("MATLAB", open_matlab),
@@ -551,6 +384,40 @@ FORMATS: Mapping[str, tuple[str, Callable[[Path], Table] | None]] = {
     ".wav": ("WAV", open_wav),
 }
 """Name and opening of each format by suffix; delimited text has none."""
+
+_STARTS: Mapping[bytes, tuple[str, Opening | None]] = {
+    b"\x93NUMPY": FORMATS[".npy"],
+    b"MATLAB 5.0": FORMATS[".mat"],
+    b"MATLAB 7.3": FORMATS[".mat"],
+    b"\x89HDF": FORMATS[".mat"],
+    b"MDF ": FORMATS[".mf4"],
+    b"PAR1": FORMATS[".parquet"],
+    b"RIFF": FORMATS[".wav"],
+}
+"""The same by the first bytes, whatever the suffix is."""
+
+_FOREIGN = {
+    b"TDSm": "is a TDMS file of LabVIEW: pip install npTDMS pandas, and python -c 'from nptdms import TdmsFile;"
+    ' TdmsFile.read("FILE").as_dataframe().to_csv("STEM.csv")\'',
+    b"\xd0\xcf\x11\xe0": "is a workbook or an archive: export its table as CSV",
+    b"PK\x03\x04": "is a workbook or an archive: export its table as CSV",
+    b"\x1f\x8b": "is compressed: unpack it",
+}
+"""What is read by no opening, and the cure, by the first bytes."""
+
+
+def format_of(path: Path) -> tuple[str, Opening | None]:
+    """Name and opening of the format that a file has: by its first bytes, or else by its suffix; text by default.
+
+    :raises ColumnError: no format here has these first bytes.
+    """
+    with path.open("rb") as file:
+        start = file.read(16)
+    by_suffix = FORMATS.get(path.suffix.lower(), FORMATS[".csv"])
+    found = next((each for first, each in _STARTS.items() if start.startswith(first)), by_suffix)
+    if found[1] is None and (foreign := next((each for each in _FOREIGN if start.startswith(each)), None)):
+        raise ColumnError(_FOREIGN[foreign].replace("FILE", path.name).replace("STEM", path.stem))
+    return found
 
 
 class Columns(NamedTuple):
@@ -575,17 +442,15 @@ def read(path: Path, wanted: Sequence[str], skip_lines: int = 0) -> Columns:
 
     :raises ColumnError: a wanted column is not there, or cannot be read.
     """
-    opening = FORMATS[path.suffix.lower()][1]
+    opening = format_of(path)[1]
     if opening is None:
-        names, columns, blank_lines = read_text(path, wanted, skip_lines)
-        full = {name: names[_place(name, names)] for name in wanted}
-        units = {name: unit for name, each in full.items() if (unit := unit_in_name(each))}
-        return Columns(names, columns, None, blank_lines, units)
+        text = read_text(path, wanted, skip_lines)
+        return Columns(text.names, text.columns, text.rate_hz, text.blank_lines, text.units)
     table = opening(path)
     names = list(table.columns)
-    refusal = f"; {_refusal(table.refused)}" if table.refused else ""
-    full = {name: names[_place(name, names, refusal)] for name in wanted}
-    units = {name: unit[:_MOST_NAME] for name, each in full.items() if (unit := _unit(table, each))}
+    refusal = f"; {_refusal(path, table.refused)}" if table.refused else ""
+    full = {name: names[place(name, names, refusal)] for name in wanted}
+    units = {name: unit[:MOST_NAME] for name, each in full.items() if (unit := _unit(table, each))}
     columns = {name: table.columns[each]() for name, each in full.items()}
     return Columns(names, columns, table.rate_hz, 0, units, table.channels)
 
@@ -596,8 +461,9 @@ def _unit(table: Table, name: str) -> str:
 
 def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Answer to a request, as the module describes it."""
-    path = Path(asked["file"])
+    path, kind = Path(asked["file"]), ""
     try:
+        kind = format_of(path)[0]
         found = read(path, asked["wanted"], asked["skip_lines"])
         if found.columns:
             named: dict[str, Any] = {str(i): column for i, column in enumerate(found.columns.values())}
@@ -608,7 +474,7 @@ def answer(asked: Mapping[str, Any]) -> dict[str, Any]:
         return {"error": f"needs more than {MOST_MEMORY_BYTES >> 30} GiB of memory"}
     except Exception as error:  # noqa: BLE001 - the libraries raise anything on damaged files
         cause = re.sub(r"\s+", " ", str(error))[:200] or type(error).__name__
-        return {"error": f"damaged, or no {FORMATS[path.suffix.lower()][0]} file: {cause}"}
+        return {"error": f"damaged, or no {kind} file: {cause}"}
     told = found._asdict() | {"units": dict(found.units)}
     del told["columns"]
     return told

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import RecordingError
-from analogrig.recordings.column_reader import FORMATS
+from analogrig import RecordingError
 
 MOST_S = 600.0
 """Longest time of the process that reads a file."""
@@ -39,13 +38,11 @@ class ColumnFile:
 
 
 def read_columns(path: Path, wanted: Sequence[str] = (), skip_lines: int = 0) -> ColumnFile:
-    """Read columns of a CSV, NumPy, MATLAB, MF4, Parquet or WAV file, by its suffix.
+    """Read columns of text, or of a NumPy, MATLAB, MF4, Parquet or WAV file, by its first bytes or its suffix.
 
     :param skip_lines: lines of text before the header or the first row.
     :raises RecordingError: the file or a column cannot be read.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise RecordingError(f"{path}: the suffix must be one of {', '.join(FORMATS)}")
     if not path.is_file():
         raise RecordingError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     with tempfile.TemporaryDirectory(prefix="analogrig-") as folder:
@@ -70,7 +67,7 @@ def _ask(path: Path, request: str) -> dict[str, Any]:
     # Modules of the current folder are as little trusted as the file, which often lies beside them.
     paths = [each for each in sys.path if each not in ("", str(Path.cwd()))]
     settings = {"OPENBLAS_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::", "PYTHONPATH": os.pathsep.join(paths)}
-    command = [sys.executable, "-P", "-m", "analogrig.recordings.column_reader", request]
+    command = [sys.executable, "-P", "-m", "analogrig_imports.column_reader", request]
     try:
         reader = subprocess.run(
             command,

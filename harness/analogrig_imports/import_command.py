@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import (
+from analogrig.cli import (
     FILE,
+    PASSED,
     PROGRAM,
     RIG_NAMES,
     SCENARIO,
@@ -15,15 +17,15 @@ from analogrig.cli.options import (
     add_json,
     add_rig,
     files_read,
+    show,
+    show_result,
+    show_work,
     trust_of,
 )
-from analogrig.cli.terminal import PASSED, show, show_result, show_work
 
 if TYPE_CHECKING:
-    from analogrig.program import Program
-    from analogrig.recordings.imported import ImportDescription
-    from analogrig.run import Run
-    from analogrig.scenario import Scenario
+    from analogrig import Program, Run, Scenario
+    from analogrig_imports.imported import ImportDescription
 
 _SIDES = ("input", "output")
 
@@ -32,14 +34,14 @@ def add(commands: Any) -> None:
     command = add_command(
         commands,
         "import",
-        "make a recording of measured data: CSV, NumPy, MATLAB, MF4, Parquet or WAV",
+        "make a recording of measured data: CSV, LabVIEW, NumPy, MATLAB, MF4, Parquet or WAV",
         "import SNLS80mV.csv --input V1 --output V2 --rate 610.3515625 --out build/silverbox.npz",
         "import bench.mat --map bench.toml --scenario mine.toml --out build/bench.npz",
         "import build/signals.csv --scenario thesis --out build/again.npz",
         "import build/pendulum.csv --program pendulum --out build/pendulum.npz",
     )
     command.add_argument(
-        "file", type=Path, metavar=FILE, help=".csv, .tsv, .txt, .npy, .npz, .mat, .mf4, .parquet or .wav"
+        "file", type=Path, metavar=FILE, help=".csv, .tsv, .txt, .dat, .lvm, .npy, .npz, .mat, .mf4, .parquet or .wav"
     )
     command.add_argument("--out", type=Path, required=True, metavar="FILE.npz", help="file of the recording")
     command.add_argument("--map", type=Path, metavar="FILE.toml", help="the settings below as a file")
@@ -59,6 +61,7 @@ def add(commands: Any) -> None:
         )
     command.add_argument("--rate", type=float, metavar="HZ", help="sample rate (default: that of the file)")
     command.add_argument("--time", metavar="COLUMN", help="column of the instants, instead of --rate")
+    command.add_argument("--time-unit", metavar="UNIT", help="its unit (default: that of the header, or s)")
     command.add_argument(
         "--clock",
         choices=("plant", "machine"),
@@ -88,11 +91,9 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError, Program, Scenario
     from analogrig.identity import Identity
     from analogrig.output import move_aside
-    from analogrig.program import Program
-    from analogrig.scenario import Scenario
 
     if arguments.out.suffix != ".npz":
         raise ConfigurationError(f"--out {arguments.out}: the file's name must end with .npz")
@@ -114,12 +115,11 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _import(arguments: argparse.Namespace, scenario: Scenario | None, program: Program | None) -> Run:
-    from analogrig.cli.options import DEFAULT_SCENARIO
-    from analogrig.errors import RecordingError
-    from analogrig.recordings.columns import read_columns
-    from analogrig.recordings.imported import import_columns, import_signals, is_emulated
-    from analogrig.rigs.description import DEFAULT_RIG, open_rig
-    from analogrig.scenario import Scenario
+    from analogrig import RecordingError, Scenario, open_rig
+    from analogrig.cli import DEFAULT_SCENARIO
+    from analogrig.rigs import DEFAULT_RIG
+    from analogrig_imports.columns import read_columns
+    from analogrig_imports.imported import import_columns, import_signals, is_emulated
 
     table = _table(arguments)
     if not table:
@@ -140,7 +140,8 @@ def _table(arguments: argparse.Namespace) -> dict[str, Any]:
 
     table = read_toml(arguments.map) if arguments.map else {}
     given = {"rate_hz": arguments.rate} | {
-        name: getattr(arguments, name) for name in ("time", "clock", "bits", "first", "samples", "skip_lines")
+        name: getattr(arguments, name)
+        for name in ("time", "time_unit", "clock", "bits", "first", "samples", "skip_lines")
     }
     table |= {name: value for name, value in given.items() if value is not None}
     for side in _SIDES:
@@ -153,9 +154,9 @@ def _table(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _described(table: dict[str, Any], arguments: argparse.Namespace) -> ImportDescription:
+    from analogrig import ConfigurationError
     from analogrig.config import build
-    from analogrig.errors import ConfigurationError
-    from analogrig.recordings.imported import ImportDescription
+    from analogrig_imports.imported import ImportDescription
 
     where = str(arguments.map) if arguments.map else "the command line"
     for side in _SIDES:
@@ -182,8 +183,8 @@ def _caveats(run: Run) -> list[str]:
     """Reasons to doubt a recording, one line each."""
     import numpy as np
 
-    from analogrig.recordings.imported import known_unit
     from analogrig.wording import number_of
+    from analogrig_imports.column_names import known_unit
 
     names, rig = run.conditions.program.channels, run.conditions.rig
     lines = [
@@ -206,8 +207,7 @@ def _caveats(run: Run) -> list[str]:
                 f"caveat: {number_of(beyond_n, 'sample')} of column {column} at or beyond the ends of its range,"
                 f" {low:g} to {high:g} {unit}: missing"
             )
-    if stated_hz := rig.get("stated_rate_hz"):
-        lines.append(f"caveat: the file states {stated_hz:g} Hz, another rate than the one given")
+    lines += _caveats_of_time(rig)
     scenario, first = run.conditions.scenario, rig.get("first", 0)
     if run.conditions.segments and run.samples < run.conditions.samples_asked:
         lines.append(
@@ -226,6 +226,19 @@ def _caveats(run: Run) -> list[str]:
     return lines
 
 
+def _caveats_of_time(rig: Mapping[str, Any]) -> list[str]:
+    from analogrig.wording import number_of
+
+    lines = []
+    if rig.get("time") and not rig.get("time_unit") and not rig.get("time_header"):
+        lines.append(f"caveat: column {rig['time']} states no unit: read as seconds; pass --time-unit for another")
+    if gaps_n := rig.get("gaps_n"):
+        lines.append(f"caveat: {number_of(gaps_n, 'row is', 'rows are')} missing on the grid of column {rig['time']}")
+    if stated_hz := rig.get("stated_rate_hz"):
+        lines.append(f"caveat: the file states {stated_hz:g} Hz, another rate than the one given")
+    return lines
+
+
 def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
     conditions = run.conditions
     rate = f"{1.0 / conditions.sample_period_s:.6g} Hz"
@@ -234,11 +247,17 @@ def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
     lines = [f"{arguments.out}: {run.samples} samples at {rate}, {int(run.missing.sum())} of them missing"]
     described = [conditions.rig[side] for side in _SIDES if side in conditions.rig]
     units = {name: each["unit"] for name, each in zip(conditions.program.measured, described, strict=False)}
+    unstated = [
+        name
+        for name, header in zip(conditions.program.measured, conditions.rig.get("assumed", ()), strict=False)
+        if header
+    ]
     for name, channel in conditions.channels.items():
         high = channel.low_v + channel.codes * channel.lsb_v
         low, high = (volts * channel.unit_per_v for volts in (channel.low_v, high))
         converted = "" if units.get(name, channel.unit) == channel.unit else f", converted from {units[name]}"
-        span = f"{channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}"
+        assumed = ", as no unit is stated" if name in unstated else ""
+        span = f"{channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}{assumed}"
         lines.append(f"{name.replace('_', ' ')}: {span}{converted}")
     known = f"that of scenario {conditions.scenario['name']}" if conditions.segments else "unknown: UNJUDGED"
     return [*lines, *_caveats(run), f"truth: {known}", f"next: analogrig replay {arguments.out} --dut inproc"]

@@ -7,50 +7,39 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig import config
-from analogrig.errors import ConfigurationError, RecordingError
+from analogrig import ConfigurationError, Program, RecordingError, Run, Scenario
+from analogrig.config import plain
 from analogrig.plant import MAX_SAMPLES, Segment
-from analogrig.program import Program
-from analogrig.recordings.columns import ColumnFile, read_columns
-from analogrig.recordings.program_units import scaled_to_program
-from analogrig.run import IMPORTED, Channel, Conditions, Run
-from analogrig.scenario import DEFAULT_PROGRAM, Scenario
+from analogrig.recordings import scaled_to_program, unanswered
+from analogrig.run import IMPORTED, Channel
+from analogrig.scenario import DEFAULT_PROGRAM
 from analogrig.wording import number_of
-from analogrig_emulator import Excitation, ProgramError, Unit, parse_unit
+from analogrig_emulator import Excitation, parse_unit
+from analogrig_imports.column_names import MOST_UNIT, is_time, known_unit
+from analogrig_imports.columns import ColumnFile, read_columns
 
 if TYPE_CHECKING:
-    from analogrig.rigs.rig import Rig
+    from analogrig import Rig
 
-UNSEEN = "no device has seen these samples: pass the recording to analogrig replay"
-"""Fault of a recording that was imported and not played."""
 
 LEAST_BITS, MOST_BITS = 2, 16
 
 _LEAST_WIDTH, _MOST_MAGNITUDE = 1e-7, 1e8
 """Limits of a converter's range, which a run can hold."""
 
-_MOST_UNIT = 20
-"""Longest unit of a column."""
-
-_ASCII = MappingProxyType(
-    {"\u00b5": "u", "\u03bc": "u", "\u2126": "ohm", "\u03a9": "ohm", "\u00b7": " ", "\u00b2": "^2", "\u00b3": "^3"}
-)
-"""Symbols of headers in the words of a program file."""
-
 _MOST_RATE_ERROR = 0.01
 """Relative difference of the given rate from the one that a file states, which may be rounded."""
 
-_TIMES = ("t", "time", "timestamp", "timestamps")
-"""Usual names of a column of instants, in lower case and without unit and group."""
-
 _MOST_JITTER = 0.02
 """Largest deviation of a time from the even grid, in sample periods."""
+
+_MOST_GAPS = 0.5
+"""Largest share of the grid without a row."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +62,8 @@ class ImportedColumn:
     def __post_init__(self) -> None:
         if not self.column:
             raise ValueError("column must not be empty")
-        if self.unit is not None and not (0 < len(self.unit) <= _MOST_UNIT and self.unit.isprintable()):
-            raise ValueError(f"unit must be 1 to {_MOST_UNIT} printable characters, not {self.unit[:40]!r}")
+        if self.unit is not None and not (0 < len(self.unit) <= MOST_UNIT and self.unit.isprintable()):
+            raise ValueError(f"unit must be 1 to {MOST_UNIT} printable characters, not {self.unit[:40]!r}")
         if not 1e-9 < abs(self.scale) < 1e9:
             raise ValueError(f"scale must have a magnitude between 1e-9 and 1e9, not {self.scale:g}")
         if self.range is not None and not self.range[0] < self.range[1]:
@@ -92,7 +81,9 @@ class ImportDescription:
     rate_hz: float | None = None
     """Sample rate; None: that of ``time``, or the one that the file states."""
     time: str = ""
-    """Column of the sample instants, in seconds or the unit of its header; they must be evenly spaced."""
+    """Column of the sample instants, on an even grid, on which rows may be missing."""
+    time_unit: str = ""
+    """Unit of the instants; empty: that of the header, or s."""
     clock: Literal["plant", "machine"] | None = None
     """Clock of the rate and the instants: the plant's, or that of a machine that plays a program at its speed.
 
@@ -109,6 +100,8 @@ class ImportDescription:
     description: str = ""
 
     def __post_init__(self) -> None:
+        if self.time_unit and _seconds(self.time_unit) is None:
+            raise ValueError(f"time_unit must be a unit of time, such as ms, not {self.time_unit[:40]!r}")
         if self.input.column == self.output.column:
             raise ValueError(f"input and output are the same column, {self.input.column[:40]}: name two")
         if self.rate_hz is not None and not 1e-6 <= self.rate_hz <= 1e9:
@@ -128,12 +121,9 @@ class ImportDescription:
         return tuple(dict.fromkeys(name for name in (self.input.column, self.output.column, self.time) if name))
 
 
-def known_unit(text: str) -> Unit | None:
-    """Unit of a text in a file's header; None if no program file could write it."""
-    try:
-        return parse_unit("".join(_ASCII.get(each, each) for each in text)) if 0 < len(text) <= _MOST_UNIT else None
-    except ProgramError:
-        return None
+def _seconds(unit: str) -> float | None:
+    """Seconds of one unit of time; None if it is none."""
+    return None if (known := known_unit(unit)) is None else known.factor_to(parse_unit("s"))
 
 
 def _in_unit(described: ImportedColumn, header: str) -> ImportedColumn:
@@ -165,6 +155,10 @@ def import_columns(
     """
     found = read_columns(path, described.columns, described.skip_lines)
     headers = [found.units.get(each.column, "") for each in (described.input, described.output)]
+    assumed = [
+        each.unit is None and not header
+        for each, header in zip((described.input, described.output), headers, strict=True)
+    ]
     described = dataclasses.replace(
         described, input=_in_unit(described.input, headers[0]), output=_in_unit(described.output, headers[1])
     )
@@ -174,31 +168,43 @@ def import_columns(
     if len(count) > 1:
         lengths = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
         raise RecordingError(f"{path}: the columns differ in length: {lengths}")
-    if not (samples := count.pop()):
+    if not (samples := (count_n := count.pop())):
         raise RecordingError(f"{path}: has no row {described.first}")
     if samples == 1:
         raise RecordingError(f"{path}: has a single row: a recording needs two")
     if described.samples is not None and samples < described.samples:
         raise RecordingError(f"{path}: has {samples} rows from row {described.first} on, not {described.samples}")
+    if len(columns[described.input.column]) and all(
+        np.unique(columns[each.column][np.isfinite(columns[each.column])]).size == 1
+        for each in (described.input, described.output)
+    ):
+        raise RecordingError(
+            f"{path}: columns {described.input.column} and {described.output.column} are constant, which is no data:"
+            f" {_others(found, described)}"
+        )
+    rate_hz, at = _grid(path, described, columns, found)
+    if at is not None:
+        samples = int(at[-1]) + 1
+        columns = {name: _spread(values, at) for name, values in columns.items()}
     is_known = scenario is not None or program is not None
     program = scenario.program if scenario else program or Program.load(DEFAULT_PROGRAM)
     shape, channels = (samples, len(program.channels)), {}
     codes, clipped = np.zeros(shape, np.uint16), np.ones(shape, np.bool_)
     beyond_n = []
-    for at, (name, each) in enumerate(zip(program.measured, (described.input, described.output), strict=True)):
+    for column, (name, each) in enumerate(zip(program.measured, (described.input, described.output), strict=True)):
         values = columns[each.column] * each.scale + each.offset
         channels[name] = _channel(path, each, described.bits, values)
-        codes[:, at], clipped[:, at] = _converted(values, channels[name], is_ranged=each.range is not None)
-        if clipped[:, at].all():
+        codes[:, column], clipped[:, column] = _converted(values, channels[name], is_ranged=each.range is not None)
+        if clipped[:, column].all():
             raise RecordingError(f"{path}: column {each.column}: no value lies within its range: give a wider range")
-        beyond_n.append(int((clipped[:, at] & np.isfinite(values)).sum()))
-    rate_hz = _rate_hz(path, described, columns, found)
+        beyond_n.append(int((clipped[:, column] & np.isfinite(values)).sum()))
     rig = {"name": f"{IMPORTED}:{path.name}", "kind": IMPORTED, "file": str(path), **dataclasses.asdict(described)}
     rig |= {"blank_lines": found.blank_lines, "header_units": headers, "beyond_range_n": beyond_n}
+    rig |= {"time_header": found.units.get(described.time, ""), "gaps_n": samples - count_n, "assumed": assumed}
     if found.rate_hz is not None and abs(rate_hz / found.rate_hz - 1.0) > _MOST_RATE_ERROR:
         rig["stated_rate_hz"] = found.rate_hz
     truth = _truth(path, samples, 1.0 / rate_hz, scenario, program)
-    run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, config.plain(rig), *truth)
+    run = unanswered(codes, clipped, channels, 1.0 / rate_hz, 1.0, plain(rig), *truth)
     return dataclasses.replace(run, conditions=scaled_to_program(run.conditions)) if is_known else run
 
 
@@ -289,38 +295,71 @@ def _converted(
     return np.where(finite, codes, np.clip(held, 1, last - 1)).astype(np.uint16), beyond
 
 
-def _rate_hz(
+def _others(found: ColumnFile, described: ImportDescription) -> str:
+    """Cure by the names of the other columns, if there are any."""
+    names = [name[:40] for name in found.names if name not in described.columns][:20]
+    return f"name others: there are {', '.join(names)}" if names else "record the plant in motion"
+
+
+def _spread(values: NDArray[np.float64], at: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Values at these places of the grid, and no numbers elsewhere."""
+    spread = np.full(int(at[-1]) + 1, np.nan)
+    spread[at] = values
+    return spread
+
+
+def _grid(
     path: Path, described: ImportDescription, columns: Mapping[str, NDArray[np.float64]], found: ColumnFile
-) -> float:
-    """:raises RecordingError: no rate is known, or the samples are not evenly spaced."""
+) -> tuple[float, NDArray[np.int64] | None]:
+    """Sample rate [Hz], and the places of the rows on the grid; None: none is missing.
+
+    :raises RecordingError: no rate is known, or the samples are on no even grid.
+    """
     if described.rate_hz is not None:
-        return described.rate_hz
+        return described.rate_hz, None
     if not described.time:
         if found.rate_hz is None:
-            times = [name for name in found.names if name.partition("@")[0].partition(" ")[0].lower() in _TIMES]
+            times = [name for name in found.names if is_time(name)]
             such = f", such as --time {shlex.quote(times[0])}" if times else ""
             raise RecordingError(f"{path}: states no sample rate: pass --rate HZ, or --time COLUMN{such}")
-        return found.rate_hz
-    unit = found.units.get(described.time) or "s"
-    in_s = None if (known := known_unit(unit)) is None else known.factor_to(parse_unit("s"))
+        return found.rate_hz, None
+    where = f"{path}: column {described.time}"
+    unit = described.time_unit or found.units.get(described.time) or "s"
+    in_s = _seconds(unit)
     if in_s is None:
-        raise RecordingError(f"{path}: column {described.time}: must be a time, not in {unit}: pass --rate HZ")
+        raise RecordingError(f"{where}: must be a time, not in {unit}: pass --time-unit, or --rate HZ")
     instants_s = columns[described.time] * in_s
     if len(instants_s) < 2 or not np.isfinite(instants_s).all():
-        raise RecordingError(f"{path}: column {described.time}: instants are missing")
-    period_s = float(instants_s[-1] - instants_s[0]) / (len(instants_s) - 1)
+        raise RecordingError(f"{where}: instants are missing")
+    steps_s = np.diff(instants_s)
+    if not (steps_s > 0.0).all():
+        row = int((steps_s <= 0.0).argmax()) + 1
+        raise RecordingError(
+            f"{where}: row {described.first + row} is no later than the one before: instants must ascend; pass --rate"
+            " HZ if the rows are evenly spaced"
+        )
+    at = np.arange(len(instants_s))
+    period_s, late = _fitted(instants_s, at)
+    if np.abs(late).max() > _MOST_JITTER:
+        gapped = np.concatenate([[0], np.cumsum(np.rint(steps_s / np.median(steps_s)).astype(np.int64))])
+        gapped_s, gapped_late = _fitted(instants_s, gapped)
+        is_on_grid = np.abs(gapped_late).max() <= _MOST_JITTER and (np.diff(gapped) > 0).all()
+        if not is_on_grid or len(gapped) < _MOST_GAPS * (gapped[-1] + 1) or gapped[-1] >= MAX_SAMPLES:
+            worst = int(np.abs(late).argmax())
+            raise RecordingError(
+                f"{where}: row {described.first + worst} is {abs(late[worst]):.2g} sample periods off an even grid:"
+                " resample the data, or pass --rate HZ"
+            )
+        at, period_s = gapped, gapped_s
     if not 1e-9 <= period_s <= 1e6:
-        raise RecordingError(
-            f"{path}: column {described.time}: a sample period of {period_s:g} s: must be seconds that ascend"
-        )
-    late = np.abs(instants_s - instants_s[0] - period_s * np.arange(len(instants_s))) / period_s
-    if late.max() > _MOST_JITTER:
-        worst = int(late.argmax())
-        raise RecordingError(
-            f"{path}: column {described.time}: row {described.first + worst} is {late[worst]:.2g} sample periods off"
-            " an even grid: resample the data, or pass --rate HZ"
-        )
-    return 1.0 / period_s
+        raise RecordingError(f"{where}: a sample period of {period_s:g} s: must be seconds, or pass --time-unit")
+    return 1.0 / period_s, at if at[-1] >= len(at) else None
+
+
+def _fitted(instants_s: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[float, NDArray[np.float64]]:
+    """Sample period [s] of rows at these places of a grid, (n,), and by how many periods each is late, (n,)."""
+    period_s = float(instants_s[-1] - instants_s[0]) / max(int(at[-1]), 1)
+    return period_s, (instants_s - instants_s[0] - period_s * at) / period_s
 
 
 def _truth(
@@ -338,49 +377,6 @@ def _truth(
             " pass the scenario that was played"
         )
     return scenario, scenario.segments()
-
-
-def unanswered(
-    codes: NDArray[np.uint16],
-    clipped: NDArray[np.bool_],
-    channels: Mapping[str, Channel],
-    period_s: float,
-    time_scale: float,
-    rig: Mapping[str, Any],
-    scenario: Scenario,
-    segments: tuple[Segment, ...],
-) -> Run:
-    """Recording without answers of a device.
-
-    :param codes: (n, c), with ``clipped`` for the channels of the scenario's program.
-    :param segments: true plant; empty if it is unknown.
-    """
-    samples = len(codes)
-    return Run(
-        conditions=Conditions(
-            seed=0,
-            samples_asked=scenario.samples,
-            sample_period_s=period_s,
-            time_scale=time_scale,
-            channels=dict(channels),
-            segments=segments,
-            scenario=scenario.as_table(),
-            rig=rig,
-            dut={"name": "none", "kind": IMPORTED, "datasheet": {"alarms": False}},
-            link="none",
-            faults=(UNSEEN,),
-            program=scenario.program,
-        ),
-        codes=codes,
-        clipped=clipped,
-        theta=np.zeros((samples, 0), np.float32),
-        innovation=np.zeros(samples, np.float32),
-        statistic=np.zeros(samples, np.float32),
-        flags=np.zeros(samples, np.uint8),
-        alarm_index=np.zeros(0, np.int64),
-        alarm_kind=np.zeros(0, np.uint8),
-        alarm_statistic=np.zeros(0, np.float32),
-    )
 
 
 def _unknown(path: Path, samples: int, period_s: float, program: Program) -> Scenario:

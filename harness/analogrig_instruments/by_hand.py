@@ -7,11 +7,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from analogrig.hardware.dating.instants import NoInstant, TurnInstants, date_jump, date_turn
-from analogrig.hardware.dating.two_filter import Signals
-from analogrig.hardware.instrument import Pots
-from analogrig.links.wire import Clock
-from analogrig.plant import Plant, SampledPlant, Segment
+from analogrig import Plant
+from analogrig.links import Clock
+from analogrig.plant import SampledPlant, Segment
+from analogrig_instruments.dating.instants import NoInstant, TurnInstants, date_jump, date_turn
+from analogrig_instruments.dating.two_filter import Signals
+from analogrig_instruments.instrument import Pots
 
 BEFORE_S, AFTER_S = 0.02, 0.05
 """Margins of the search: a record may start late, and a pot may still move after it was reported set."""

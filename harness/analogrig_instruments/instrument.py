@@ -1,25 +1,32 @@
 """Interface of the bench instruments: a generator with one output, and inputs sampled at the same instant.
 
-A driver is a subclass of ``Instrument`` and a line in ``DRIVERS``. tests/harness/test_instruments.py tests all drivers.
-Volts are those at the instrument's connectors. ``analogrig.hardware.wiring`` describes the stages to the computer.
+A driver is a subclass of ``Instrument`` and an entry point of ``analogrig.instruments``, named like the scheme of its
+URLs. tests/harness/test_instruments.py tests all drivers.
+Volts are those at the instrument's connectors. ``analogrig_instruments.wiring`` describes the stages to the computer.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-import pkgutil
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError, RecordIncomplete, RigError
+from analogrig import ConfigurationError, RigError
+from analogrig.entry_points import INSTRUMENTS
+from analogrig.errors import RecordIncomplete
+from analogrig.kinds import Kinds
 from analogrig_emulator import Excitation
+
+if TYPE_CHECKING:
+    from analogrig.links import Clock
+    from analogrig_instruments.simulator.tcp_server import TcpServer
 
 _ROUNDING_V = 1e-9
 EARLY_N = 1e-4
@@ -135,6 +142,10 @@ class Instrument(ABC):
     """Base class of the drivers. All methods may raise RigError, which names the instrument and what failed."""
 
     datasheet: ClassVar[InstrumentDatasheet]
+    form: ClassVar[str]
+    """Form of the addresses after ``scheme://``, for messages: ``HOST[:PORT]``."""
+    served_port: ClassVar[int] = 0
+    """Default TCP port of ``serve``; 0: there is no emulated instrument of this kind."""
     name: str
     """Name for error messages."""
     pots: PotBox | None = None
@@ -182,6 +193,23 @@ class Instrument(ABC):
 
         :raises ConfigurationError: a package that the driver needs is not installed.
         """
+
+    @classmethod
+    def emulated(
+        cls,
+        rig: str | None,  # noqa: ARG003 - overridden
+        program: str | None,  # noqa: ARG003
+        seed: int,  # noqa: ARG003
+        defects: Sequence[str],  # noqa: ARG003
+        clock: Clock | None,  # noqa: ARG003
+    ) -> tuple[TcpServer, Mapping[str, str]]:
+        """Server of an emulated instrument, and the names of its rig and program.
+
+        :param defects: ``KEY=VALUE``.
+        :param clock: None: time passes in records alone.
+        :raises ConfigurationError: a name or a defect is wrong, or there is no emulated instrument of this kind.
+        """
+        raise ConfigurationError("there is no emulated instrument of this kind")
 
     @classmethod
     def check(cls, excitation: Excitation) -> None:
@@ -269,12 +297,8 @@ def _is_whole(samples: float) -> bool:
     return math.isclose(samples, round(samples), rel_tol=1e-12)
 
 
-DRIVERS = {
-    "redpitaya": ("analogrig.hardware.red_pitaya:RedPitaya", "HOST[:PORT]"),
-    "nidaqmx": ("analogrig.hardware.ni_daqmx:NiDaqmx", "CARD"),
-    "lucidac": ("analogrig.hardware.lucidac:LucidacInstrument", "HOST[:PORT]"),
-}
-"""Driver class and form of its addresses, by the scheme of an instrument's URL."""
+DRIVERS = Kinds(Instrument, INSTRUMENTS)  # type: ignore[type-abstract]
+"""Driver class by the scheme of an instrument's URL: entry points, ours and those of other packages."""
 
 
 def find_driver(url: str) -> tuple[type[Instrument], str]:
@@ -283,11 +307,9 @@ def find_driver(url: str) -> tuple[type[Instrument], str]:
     :raises ConfigurationError: no driver has this scheme, or the address is malformed.
     """
     scheme, _, rest = url.partition(":")
-    known = DRIVERS.get(scheme.lower())
-    if known is not None and rest.startswith("//"):
-        kind: type[Instrument] = pkgutil.resolve_name(known[0])
-        if kind.place(address := rest.removeprefix("//")):
-            return kind, address
-    forms = DRIVERS if known is None else {scheme: known}
-    written = " or ".join(f"{scheme}://{form}" for scheme, (_, form) in forms.items())
+    kind = DRIVERS.get(scheme.lower())
+    if kind is not None and rest.startswith("//") and kind.place(address := rest.removeprefix("//")):
+        return kind, address
+    known = {scheme: kind} if kind else dict(DRIVERS)
+    written = " or ".join(f"{scheme}://{kind.form}" for scheme, kind in known.items())
     raise ConfigurationError(f"instrument {url!r}: give it as {written}")

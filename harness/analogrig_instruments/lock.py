@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 
 from analogrig.errors import RigClosed
-from analogrig.hardware.tcp_address import resolved_places
+from analogrig_instruments.tcp_address import resolved_places
 
 _ENDING = (signal.SIGTERM, signal.SIGHUP)
 

@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError, RigClosed, RigRefused, RigTimeout
-from analogrig.hardware.instrument import InputRecord, Instrument, InstrumentDatasheet
+from analogrig import ConfigurationError
+from analogrig.errors import RigClosed, RigRefused, RigTimeout
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
+from analogrig_instruments.instrument import InputRecord, Instrument, InstrumentDatasheet
 
 RATE_HZ = 20e3
 LEVELS_PER_SAMPLE = 32
@@ -55,6 +56,8 @@ class NiDaqmx(Instrument):
         self._timeout_s = timeout_s
         self._pause = pause
         self.make_safe()
+
+    form = "CARD"
 
     @classmethod
     def place(cls, address: str) -> str:

@@ -1,6 +1,6 @@
 """Pots of a real rig: set by its instrument, a command, a box on a serial line, or an operator.
 
-Only an instrument knows the sample at which a pot moved. For the others ``analogrig.hardware.dating`` estimates it.
+Only an instrument knows the sample at which a pot moved. For the others ``analogrig_instruments.dating`` estimates it.
 Dials go from 0 to 1. The caller checks the limits of each pot before anything moves.
 """
 
@@ -23,11 +23,11 @@ from typing import ClassVar, Literal, Self
 
 import serial
 
+from analogrig import ConfigurationError, LinkError, RigError
 from analogrig.config import check_range
-from analogrig.errors import ConfigurationError, LinkError, RigError
-from analogrig.hardware.instrument import Pots
-from analogrig.links.wire import DEFAULT_BAUD, PortWire
+from analogrig.links import DEFAULT_BAUD, PortWire
 from analogrig.trust import Thing, absolute_path, absolute_port
+from analogrig_instruments.instrument import Pots
 
 TERMINAL = Path("/dev/tty")
 """Terminal of the operator, also if standard input and output are redirected."""

@@ -15,22 +15,22 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
-from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
-from analogrig.hardware.dating.two_filter import Signals, can_date
-from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
-from analogrig.hardware.lock import lock_instrument
-from analogrig.hardware.self_test import self_test
-from analogrig.hardware.wiring import RealDescription, check_wiring
-from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.plant import Plant, Segment
-from analogrig.program import Program
-from analogrig.rigs.emulator import Stream, emulator_errors
-from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
-from analogrig.scenario import Scenario
+from analogrig import ConfigurationError, Plant, Program, Rig, RigError, Scenario
+from analogrig.errors import RecordStale, SelfTestError
+from analogrig.judging import QUANTISATION_VARIANCE_LSB2
+from analogrig.plant import Segment
+from analogrig.rigs import BLOCK_SAMPLES, Block, Hindsight, Performance, Stream, emulator_errors
 from analogrig_emulator import Excitation, SuspensionComputer
+from analogrig_instruments.by_hand import HandChanges, PlannedChange, contradictions
+from analogrig_instruments.dating.two_filter import Signals, can_date
+from analogrig_instruments.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
+from analogrig_instruments.lock import lock_instrument
+from analogrig_instruments.self_test import self_test
+
+if TYPE_CHECKING:
+    from analogrig_instruments.wiring import RealDescription
 
 SELF_TEST_SEED = 0
 
@@ -82,7 +82,7 @@ class RealRig(Rig):
         self.capabilities = frozenset({"excite", "tweak"} if description.pots.changeable else {"excite"})
         kind, self._address = find_driver(description.instrument)
         self._place = kind.place(self._address)
-        check_wiring(description)
+        description.check_wiring()
         self._datasheet = kind.datasheet
         self._description = description
         self._connect = connect or kind.open

@@ -1,20 +1,25 @@
 """Driver of a Red Pitaya STEMlab 125-14 through its SCPI server: generator OUT1, inputs IN1 and IN2, 20 kS/s.
 
 Commands and their order follow https://redpitaya.readthedocs.io (OS 2.0). A box of digital pots on the same server
-(``POT:...``, harness/analogrig/hardware/simulator/served.py) is used if there is one.
+(``POT:...``, harness/analogrig_instruments/simulator/served.py) is used if there is one.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigRefused, RigTimeout
-from analogrig.hardware.instrument import (
+from analogrig import ConfigurationError, Program
+from analogrig.cli import PASSED, complain
+from analogrig.errors import RecordIncomplete, RecordStale, RigRefused, RigTimeout
+from analogrig.links import Clock
+from analogrig_emulator import Excitation
+from analogrig_instruments.instrument import (
     DialChange,
     InputRecord,
     Instrument,
@@ -23,10 +28,11 @@ from analogrig.hardware.instrument import (
     check_edges,
     first_phase,
 )
-from analogrig.hardware.scpi_connection import ScpiConnection
-from analogrig.hardware.tcp_address import host_and_port, tcp_place
-from analogrig.links.wire import Clock
-from analogrig_emulator import Excitation
+from analogrig_instruments.scpi_connection import ScpiConnection
+from analogrig_instruments.tcp_address import host_and_port, tcp_place
+
+if TYPE_CHECKING:
+    from analogrig_instruments.simulator.tcp_server import TcpServer
 
 PORT = 5000
 CLOCK_HZ = 125e6
@@ -51,6 +57,9 @@ class RedPitaya(Instrument):
         ranges_v={"LV": (-1.0, 1.0), "HV": (-20.0, 20.0)},
     )
 
+    form = "HOST[:PORT]"
+    served_port = PORT
+
     def __init__(self, connection: ScpiConnection, timeout_s: float, clock: Clock = time.monotonic) -> None:
         """Take over ``connection`` and bring the instrument to a known state, the generator off.
 
@@ -67,6 +76,19 @@ class RedPitaya(Instrument):
     @classmethod
     def place(cls, address: str) -> str:
         return tcp_place(address, PORT)
+
+    @classmethod
+    def emulated(
+        cls, rig: str | None, program: str | None, seed: int, defects: Sequence[str], clock: Clock | None
+    ) -> tuple[TcpServer, Mapping[str, str]]:
+        from analogrig_instruments.simulator.served import ServedDescription
+        from analogrig_instruments.simulator.server import Server
+
+        described = ServedDescription.load(rig or "emulator", defects)
+        server = Server(described.set_up(Program.load(program or "front"), seed, clock))
+        if described.unsupported:
+            complain(f"{described.name}: the instrument has no {', '.join(described.unsupported)}", PASSED)
+        return server, {"rig": described.name, "program": program or "front"}
 
     @classmethod
     def open(cls, address: str, timeout_s: float) -> RedPitaya:

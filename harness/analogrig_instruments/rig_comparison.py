@@ -15,15 +15,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.bench import Bench, raise_if_interrupted
-from analogrig.campaigns.comparison import Comparison, compare
-from analogrig.campaigns.rows import Row, changes, row
-from analogrig.hardware.calibration.averages import noise_variance
-from analogrig.judging.bursts import bound_rate
-from analogrig.judging.statistics import mean_interval, upper_rate
-from analogrig.judging.verdict import judge
-from analogrig.run import INPUT, Run
-from analogrig.scenario import Scenario
+from analogrig import Bench, Run, Scenario, judge
+from analogrig.bench import raise_if_interrupted
+from analogrig.campaigns import Comparison, Row, changes, compare, row
+from analogrig.judging import bound_rate, mean_interval, upper_rate
+from analogrig.run import INPUT
+from analogrig_instruments.calibration.averages import noise_variance
 
 _SMOOTHED_N = 5
 """Samples over which a difference is averaged before its largest value is found."""

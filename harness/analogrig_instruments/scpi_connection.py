@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import socket
 import time
 from collections.abc import Callable
 
-from analogrig.errors import RigClosed, RigError, RigRefused, RigTimeout
-from analogrig.hardware.tcp_address import place_of
-from analogrig.links.wire import Clock
+from analogrig import RigError
+from analogrig.errors import RigRefused, RigTimeout
+from analogrig.links import Clock
+from analogrig_instruments.tcp_address import InstrumentSocket
 
 _MOST_ANSWER_BYTES = 1 << 20
 
@@ -19,29 +18,16 @@ class ScpiConnection:
 
     def __init__(self, host: str, port: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
         """:raises RigError: the connection failed."""
-        self.name = place_of(host, port)
         self._clock = clock
         self._timeout_s = timeout_s
         self._input = bytearray()
-        try:
-            self._socket = socket.create_connection((host, port), timeout_s)
-        except TimeoutError as error:
-            raise RigTimeout(f"instrument {self.name}: no connection within {timeout_s:g} s") from error
-        except OSError as error:
-            raise RigClosed(f"instrument {self.name}: cannot be reached: {error.strerror or error}") from error
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = InstrumentSocket(host, port, timeout_s)
+        self.name = self._socket.name
 
     def send(self, *commands: str) -> None:
         """Send commands that have no answer, one a line."""
-        try:
-            self._socket.settimeout(self._timeout_s)
-            self._socket.sendall("".join(f"{command}\r\n" for command in commands).encode("ascii"))
-        except TimeoutError as error:
-            raise RigTimeout(f"instrument {self.name}: accepted no command for {self._timeout_s:g} s") from error
-        except OSError as error:
-            raise RigClosed(
-                f"instrument {self.name}: connection lost at {commands[0]}: {error.strerror or error}"
-            ) from error
+        lines = "".join(f"{command}\r\n" for command in commands)
+        self._socket.send(lines.encode("ascii"), commands[0], self._timeout_s)
 
     def ask(self, query: str) -> str:
         """Send a query. Return the line of its answer, without its end."""
@@ -74,8 +60,7 @@ class ScpiConnection:
             raise RigRefused(f"instrument {self.name}: {what}: error {answer[:120]}")
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._socket.close()
+        self._socket.close()
 
     def _take(self, count: int, query: str) -> bytes:
         return self._receive(lambda: count if len(self._input) >= count else None, query)
@@ -89,18 +74,10 @@ class ScpiConnection:
             left_s = deadline_s - self._clock()
             if left_s <= 0.0:
                 raise RigTimeout(f"instrument {self.name}: {query}: no whole answer within {self._timeout_s:g} s")
-            self._socket.settimeout(left_s)
             try:
-                received = self._socket.recv(65536)
+                self._input += self._socket.receive(65536, query, left_s)
             except TimeoutError as error:
                 raise RigTimeout(f"instrument {self.name}: {query}: no answer within {self._timeout_s:g} s") from error
-            except OSError as error:
-                raise RigClosed(
-                    f"instrument {self.name}: connection lost at {query}: {error.strerror or error}"
-                ) from error
-            if not received:
-                raise RigClosed(f"instrument {self.name}: connection closed at {query}")
-            self._input += received
         taken = bytes(self._input[:count])
         del self._input[:count]
         return taken

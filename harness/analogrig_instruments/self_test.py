@@ -26,15 +26,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig import Plant, Program, Rig, Scenario
 from analogrig.errors import SelfTestError
-from analogrig.hardware.square_wave import Response, SquareWave, Uncertain
-from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.plant import Plant
-from analogrig.program import Program
-from analogrig.rigs.rig import Rig
+from analogrig.judging import QUANTISATION_VARIANCE_LSB2
 from analogrig.run import Channel
-from analogrig.scenario import DEFAULT_PROGRAM, Scenario
+from analogrig.scenario import DEFAULT_PROGRAM
 from analogrig_emulator import Excitation
+from analogrig_instruments.square_wave import Response, SquareWave, Uncertain
 
 State = Literal["well", "wrong", "not measured"]
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import SelfTestError
-from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
+from analogrig.judging import QUANTISATION_VARIANCE_LSB2
 
 Floats = NDArray[np.float64]
 

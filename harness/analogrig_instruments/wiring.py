@@ -13,16 +13,15 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig import ConfigurationError, Program, Rig
 from analogrig.config import check_range
-from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import InputRecord, Instrument, InstrumentDatasheet, find_driver
-from analogrig.hardware.pots import PotsDescription
-from analogrig.program import Program
-from analogrig.rigs.rig import Rig, RigDescription
+from analogrig.rigs import RigDescription
 from analogrig.run import Channel
 from analogrig.scenario import DEFAULT_PROGRAM
 from analogrig.trust import Thing, absolute_path
 from analogrig_emulator import Excitation, SuspensionComputer
+from analogrig_instruments.instrument import InputRecord, Instrument, InstrumentDatasheet, find_driver
+from analogrig_instruments.pots import PotsDescription
 
 _MOST_CODE = 0xFFFF
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
@@ -176,9 +175,48 @@ class RealDescription(RigDescription):
         self.pots.check()
 
     def open(self, *, self_test: bool = True) -> Rig:
-        from analogrig.hardware.real import RealRig
+        from analogrig_instruments.real import RealRig
 
         return RealRig(dataclasses.replace(self, self_test=self.self_test and self_test))
+
+    def check_wiring(self) -> None:
+        """Check the description against the datasheet of its instrument.
+
+        :raises ConfigurationError: they contradict each other; the message names the key.
+        """
+        instrument = self.driver.datasheet
+        _check_channels(self)
+        for name, wired in self.inputs.items():
+            if wired.input not in instrument.inputs:
+                has = " and ".join(map(str, instrument.inputs))
+                raise ConfigurationError(f"inputs.{name}: input must be {has}, not {wired.input}")
+            if wired.range not in instrument.ranges_v:
+                has = " or ".join(map(repr, instrument.ranges_v))
+                raise ConfigurationError(f"inputs.{name}: range must be {has}, not {wired.range!r}")
+            low_v, high_v = wired.ends_v(instrument)
+            if not low_v < 0.0 < high_v or wired.least_v > 0.0:
+                raise ConfigurationError(
+                    f"inputs.{name}: 0 V at the computer must be within the measured range: {low_v:g} V to {high_v:g} V"
+                    f" by gain and offset_v, from least_v, {wired.least_v:g} V, on"
+                )
+        pots = self.pot_names
+        named = {"limits.dials": self.limits.dials, "pots.names": getattr(self.pots, "names", {})}
+        for key, table in named.items():
+            if unknown := sorted(set(table) - set(pots)):
+                raise ConfigurationError(f"{key}: there is no pot {unknown[0]!r}: there are {', '.join(pots)}")
+        stage = self.generator
+        if not self.limits.input_v[0] <= stage.offset_v <= self.limits.input_v[1]:
+            raise ConfigurationError(
+                f"generator: when it is off, the computer's input stands at offset_v, {stage.offset_v:g} V, and"
+                f" limits.input_v allow {self.limits.input_v[0]:g} V to {self.limits.input_v[1]:g} V"
+            )
+        ends_v = sorted(stage.gain * volts + stage.offset_v for volts in instrument.output_v)
+        low_v, high_v = self.limits.input_v
+        if ends_v[0] >= high_v or ends_v[1] <= low_v:
+            raise ConfigurationError(
+                f"generator: with gain and offset it gives {ends_v[0]:g} V to {ends_v[1]:g} V, and limits.input_v allow"
+                f" {low_v:g} V to {high_v:g} V"
+            )
 
     def at_generator(self, excitation: Excitation) -> Excitation:
         """Waveform at the instrument that becomes ``excitation`` at the computer.
@@ -246,46 +284,6 @@ class RealDescription(RigDescription):
             codes[:, at] = np.clip(exact, 0.0, _MOST_CODE)
             clipped[:, at] = taken.clipped[:, at] | (exact < 0.0) | (exact > _MOST_CODE)
         return volts, codes, clipped
-
-
-def check_wiring(description: RealDescription) -> None:
-    """Check a description against the datasheet of its instrument.
-
-    :raises ConfigurationError: they contradict each other; the message names the key.
-    """
-    instrument = description.driver.datasheet
-    _check_channels(description)
-    for name, wired in description.inputs.items():
-        if wired.input not in instrument.inputs:
-            has = " and ".join(map(str, instrument.inputs))
-            raise ConfigurationError(f"inputs.{name}: input must be {has}, not {wired.input}")
-        if wired.range not in instrument.ranges_v:
-            has = " or ".join(map(repr, instrument.ranges_v))
-            raise ConfigurationError(f"inputs.{name}: range must be {has}, not {wired.range!r}")
-        low_v, high_v = wired.ends_v(instrument)
-        if not low_v < 0.0 < high_v or wired.least_v > 0.0:
-            raise ConfigurationError(
-                f"inputs.{name}: 0 V at the computer must be within the measured range: {low_v:g} V to {high_v:g} V"
-                f" by gain and offset_v, from least_v, {wired.least_v:g} V, on"
-            )
-    pots = description.pot_names
-    named = {"limits.dials": description.limits.dials, "pots.names": getattr(description.pots, "names", {})}
-    for key, table in named.items():
-        if unknown := sorted(set(table) - set(pots)):
-            raise ConfigurationError(f"{key}: there is no pot {unknown[0]!r}: there are {', '.join(pots)}")
-    stage = description.generator
-    if not description.limits.input_v[0] <= stage.offset_v <= description.limits.input_v[1]:
-        raise ConfigurationError(
-            f"generator: when it is off, the computer's input stands at offset_v, {stage.offset_v:g} V, and"
-            f" limits.input_v allow {description.limits.input_v[0]:g} V to {description.limits.input_v[1]:g} V"
-        )
-    ends_v = sorted(stage.gain * volts + stage.offset_v for volts in instrument.output_v)
-    low_v, high_v = description.limits.input_v
-    if ends_v[0] >= high_v or ends_v[1] <= low_v:
-        raise ConfigurationError(
-            f"generator: with gain and offset it gives {ends_v[0]:g} V to {ends_v[1]:g} V, and limits.input_v allow"
-            f" {low_v:g} V to {high_v:g} V"
-        )
 
 
 def _check_channels(description: RealDescription) -> None:

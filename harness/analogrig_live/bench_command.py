@@ -7,21 +7,23 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import (
+from analogrig.cli import (
+    PASSED,
     add_command,
     add_dut,
     add_json,
     add_what_to_play,
     changes_of_dut,
     open_what_to_play,
+    port,
+    show,
+    show_json,
     trust_of,
 )
-from analogrig.cli.serve import port
-from analogrig.cli.terminal import PASSED, show, show_json
 
 if TYPE_CHECKING:
-    from analogrig.devices.device import Device
-    from analogrig.live.session import LiveSession, Saved
+    from analogrig import Device
+    from analogrig_live.session import LiveSession, Saved
 
 TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
 """Environment variable with the token of the address; by default a random one."""
@@ -75,9 +77,9 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     import asyncio
 
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
     from analogrig.identity import Identity
-    from analogrig.live.session import LiveSession
+    from analogrig_live.session import LiveSession
 
     if arguments.real_time is not None:
         raise ConfigurationError("--real-time: the page sets the time factor")
@@ -107,9 +109,8 @@ def _open_device(name: str, arguments: argparse.Namespace) -> Device:
     :param name: empty: a device that raises a false alarm every ``ARL0`` samples.
     :raises ConfigurationError, LinkError, DeviceError: as ``open_dut``.
     """
-    from analogrig.devices.opening import open_dut
-    from analogrig.devices.registry import trusted
-    from analogrig.estimator_config import EstimatorConfig
+    from analogrig import EstimatorConfig, open_dut
+    from analogrig.devices import trusted
 
     trust, changes = trust_of(arguments), changes_of_dut(arguments)
     if not name:
@@ -128,8 +129,8 @@ async def _serve(session: LiveSession, arguments: argparse.Namespace) -> int:
     import asyncio
     import webbrowser
 
-    from analogrig.live.server import BenchServer
     from analogrig.signals import signal_future
+    from analogrig_live.server import BenchServer
 
     ended = signal_future()
     server = BenchServer(session, token=os.environ.get(TOKEN_VARIABLE, ""), origins=arguments.origin)

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from analogrig import config
-from analogrig.errors import ConfigurationError
-from analogrig.links.wire_faults import Direction
+from analogrig import ConfigurationError
+from analogrig.config import build, check_range
+from analogrig.links import Direction
 from analogrig.scenario import MAX_RAMP_N
 
 MOST_STEPS = 1_000_000
@@ -78,7 +78,7 @@ class Tempo:
     factor: float
 
     def __post_init__(self) -> None:
-        config.check_range(self, "factor", FASTEST, SLOWEST)
+        check_range(self, "factor", FASTEST, SLOWEST)
 
 
 @dataclass(frozen=True)
@@ -147,4 +147,4 @@ def command_of(name: object, table: Mapping[str, Any]) -> Command:
     """
     if not isinstance(name, str) or name not in _COMMANDS:
         raise ConfigurationError(f"no command is called {name!r}: there are {', '.join(_COMMANDS)}")
-    return config.build(_COMMANDS[name], table, name)
+    return build(_COMMANDS[name], table, name)

@@ -15,19 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError
-from analogrig.judging.played import Machine
-from analogrig.live.commands import Fault, Mode
-from analogrig.live.faults import ChannelFaults, labels
-from analogrig.live.knobs import Knob, knobs_of
-from analogrig.live.take import MOST_KEPT_CHANGES
-from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
-from analogrig.rigs.rig import Block, Performance, Rig
+from analogrig import ConfigurationError, PotChange, Rig, Scenario
+from analogrig.judging import Machine
+from analogrig.rigs import Block, EmulatorRig, Performance, emulator_errors, is_emulated
 from analogrig.run import OUTPUT
-from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import Mode as Relays
 from analogrig_emulator import Moment, SuspensionComputer, probes_per_sample
 from analogrig_emulator.machine.patching import patches
+from analogrig_live.commands import Fault, Mode
+from analogrig_live.faults import ChannelFaults, labels
+from analogrig_live.knobs import Knob, knobs_of
+from analogrig_live.take import MOST_KEPT_CHANGES
 
 RECORD_N = 4000
 """Samples of a record of a rig that plays records."""

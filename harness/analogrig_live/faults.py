@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.live.commands import Fault
 from analogrig.run import OUTPUT
+from analogrig_live.commands import Fault
 
 NOISE_LSB = 20.0
 """Rms of the noise."""

@@ -19,15 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed
 
-from analogrig.errors import AnalogrigError, ConfigurationError
-from analogrig.live.commands import Turn
-from analogrig.live.scope import read_signal, signals_of
+from analogrig import AnalogrigError, ConfigurationError
 from analogrig.wording import one_line
+from analogrig_live.commands import Turn
+from analogrig_live.scope import read_signal, signals_of
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
-    from analogrig.live.session import LiveSession
+    from analogrig_live.session import LiveSession
 
 SUBPROTOCOL = "foxglove.websocket.v1"
 

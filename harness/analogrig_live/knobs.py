@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from analogrig.errors import ConfigurationError
-from analogrig.plant import Plant
+from analogrig import ConfigurationError, Plant
 
 
 @dataclass(frozen=True)

@@ -11,20 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers
-from analogrig.catalogue import Cause, Change
-from analogrig.devices.device import Device
-from analogrig.errors import ConfigurationError
-from analogrig.judging import information
-from analogrig.judging.courses import Model, PlantChange, first_at_level
-from analogrig.judging.linear import LinearPlant
-from analogrig.judging.verdict import DIAGNOSABLE
-from analogrig.live.desk import Desk
-from analogrig.live.ring import Ring
-from analogrig.live.take import Take
+from analogrig import ConfigurationError, Device
+from analogrig.devices import Answers, Cause, Change
+from analogrig.judging import DIAGNOSABLE, LinearPlant, Model, PlantChange, first_at_level, information_of, weights
 from analogrig.plant import estimated_parameters
-from analogrig.rigs.rig import Block
+from analogrig.rigs import Block
 from analogrig.run import INPUT, LOST, OUTPUT, missing_samples
+from analogrig_live.desk import Desk
+from analogrig_live.ring import Ring
+from analogrig_live.take import Take
 
 _BOUND_AFTER_N = (64, 256, 1024)
 """Samples after a change at which its bound is looked for."""
@@ -111,15 +106,15 @@ class Notes:
         self.missing_n += int(np.count_nonzero(~block.samples().valid[: len(answers)] | (answers.flags & LOST != 0)))
         self.felt_s.extend(now_s - at_s for sample, at_s in self._unfelt if sample < end)
         self._unfelt = deque((each for each in self._unfelt if each[0] >= end), _MOST_TIMED)
-        for alarm in answers.alarms:
-            self._note_alarm(alarm.index)
+        for index in answers.alarms.index.tolist():
+            self._note_alarm(index)
         for diagnosis in answers.diagnoses:
             named = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
             self.diagnosis = self._desk.program.diagnosed.get(named, named)
         for misfit in answers.misfits:
             self.misfit = "" if misfit.cause == Cause.NONE else Cause(misfit.cause).name.lower().replace("_", " ")
         has_searched = self._search_bounds(end)
-        return has_searched or bool(answers.alarms or answers.diagnoses or answers.misfits)
+        return has_searched or any(map(len, (answers.alarms, answers.diagnoses, answers.misfits)))
 
     def _note_alarm(self, sample: int) -> None:
         self.alarm_count += 1
@@ -179,8 +174,8 @@ class Notes:
             else:
                 return None
             course_lsb = model.course(moment, before, after, segments[number].ramp_n).advance(end - change - 1)
-            weight = information.weights(missing_samples(clipped), output.noise_lsb)
-            found = information.information_of(model, PlantChange(0, before, after, moment, course_lsb), weight)
+            weight = weights(missing_samples(clipped), output.noise_lsb)
+            found = information_of(model, PlantChange(0, before, after, moment, course_lsb), weight)
         except (LookupError, ConfigurationError):  # no longer in the ring; or a machine that cannot play so
             return None
         return first_at_level(found, self._sheet.log_arl0(self.take.scenario.expect.arl0))

@@ -7,9 +7,12 @@ import shlex
 from collections.abc import Mapping
 from typing import Any, get_args
 
-from analogrig.live.commands import Mode
-from analogrig.live.faults import LINE_LABELS
-from analogrig.live.scope import (
+from analogrig.wording import counter_text
+from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
+from analogrig_emulator.machine.patching import patches
+from analogrig_live.commands import Mode
+from analogrig_live.faults import LINE_LABELS
+from analogrig_live.scope import (
     LEAST_COLUMNS,
     LEAST_WINDOW_N,
     MOST_COLUMNS,
@@ -17,10 +20,7 @@ from analogrig.live.scope import (
     MOST_WINDOW_N,
     signals_of,
 )
-from analogrig.live.session import LiveSession, Saved
-from analogrig.wording import counter_text
-from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
-from analogrig_emulator.machine.patching import patches
+from analogrig_live.session import LiveSession, Saved
 
 
 def bench_table(session: LiveSession) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from analogrig.devices.device import Device
+from analogrig import Device
 
 _OVER_S = 1.0
 """Time over which rates are measured."""

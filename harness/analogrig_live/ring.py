@@ -7,8 +7,8 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers
-from analogrig.rigs.rig import Block
+from analogrig.devices import Answers
+from analogrig.rigs import Block
 
 RING_N = 1 << 17
 """Samples in the ring: 6.5 s at 20,000 samples/s, 12 MB."""

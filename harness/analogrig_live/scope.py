@@ -15,9 +15,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig import config
-from analogrig.live.ring import RING_N
-from analogrig.live.session import LiveSession
+from analogrig.config import check_range
+from analogrig_live.ring import RING_N
+from analogrig_live.session import LiveSession
 
 MOST_SIGNALS = 16
 LEAST_WINDOW_N, MOST_WINDOW_N = 16, RING_N // 2
@@ -73,8 +73,8 @@ class Trigger:
     """Position on the screen, 0 to 1."""
 
     def __post_init__(self) -> None:
-        config.check_range(self, "level", -1e12, 1e12)
-        config.check_range(self, "position", 0.0, 1.0)
+        check_range(self, "level", -1e12, 1e12)
+        check_range(self, "position", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ class View:
     def __post_init__(self) -> None:
         if not 1 <= len(self.signals) <= MOST_SIGNALS:
             raise ValueError(f"signals must be 1 to {MOST_SIGNALS}, not {len(self.signals)}")
-        config.check_range(self, "samples", LEAST_WINDOW_N, MOST_WINDOW_N)
-        config.check_range(self, "columns", LEAST_COLUMNS, MOST_COLUMNS)
+        check_range(self, "samples", LEAST_WINDOW_N, MOST_WINDOW_N)
+        check_range(self, "columns", LEAST_COLUMNS, MOST_COLUMNS)
 
 
 def signals_of(session: LiveSession) -> dict[str, Signal]:

@@ -22,7 +22,7 @@ Limits of a client:
     address  the token, a Host of this server, an Origin of the page (viewers outside a browser have none)
     memory   messages of MOST_MESSAGE_BYTES, one frame on its way, the buffers of the connection
     time     a client that accepts no data for SLOW_S, or answers no ping for SILENT_S, is dropped
-    place    one of MOST_CLIENTS, and of MOST_SOCKETS before it is let in
+    place    one of MOST_CLIENTS; before it is let in, one of MOST_SOCKETS, the oldest of which gives way to a newcomer
     work     watchers get their frames one after another, for at most half of the time; a message each WATCHER_PAUSE_S
 """
 
@@ -48,17 +48,17 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from analogrig import config
-from analogrig.errors import AnalogrigError, ConfigurationError
-from analogrig.live import foxglove
-from analogrig.live.commands import command_of
-from analogrig.live.panel import bench_table, state_table
-from analogrig.live.scope import Screen, View, signals_of
-from analogrig.pages import PLOTS, assemble_page
+from analogrig import AnalogrigError, ConfigurationError
+from analogrig.config import build
+from analogrig.reporting import PLOTS, assemble_page
 from analogrig.wording import one_line
+from analogrig_live import foxglove
+from analogrig_live.commands import command_of
+from analogrig_live.panel import bench_table, state_table
+from analogrig_live.scope import Screen, View, signals_of
 
 if TYPE_CHECKING:
-    from analogrig.live.session import LiveSession
+    from analogrig_live.session import LiveSession
 
 MOST_CLIENTS = 16
 MOST_SOCKETS = 4 * MOST_CLIENTS
@@ -93,7 +93,7 @@ class _PageClient:
 
 
 class _Connection(ServerConnection):
-    """Connection that is noted as long as its socket is open; one too many is closed at once."""
+    """Connection that is noted as long as its socket is open. One too many replaces the oldest without a place."""
 
     def __init__(self, *arguments: Any, noted: dict[ServerConnection, bool], **settings: Any) -> None:
         super().__init__(*arguments, **settings)
@@ -101,10 +101,11 @@ class _Connection(ServerConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        if len(self._noted) < MOST_SOCKETS:
-            self._noted[self] = False
-        else:
-            self.transport.abort()
+        if len(self._noted) >= MOST_SOCKETS:
+            oldest = next(each for each, has_place in self._noted.items() if not has_place)
+            del self._noted[oldest]  # at once, as it ends only after other newcomers may have come
+            oldest.transport.abort()
+        self._noted[self] = False
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._noted.pop(self, None)
@@ -319,7 +320,7 @@ class BenchServer:
     def _carry_out(self, client: _PageClient, name: object, table: dict[str, Any]) -> None:
         """:raises ConfigurationError: the message is wrong, or this client does not drive."""
         if name == "view":
-            view = config.build(View, table, "view")
+            view = build(View, table, "view")
             known = signals_of(self.session)
             for signal in (*view.signals, view.trigger.source):
                 if signal not in known:

@@ -16,30 +16,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analogrig import config
-from analogrig.answers import Answers
-from analogrig.bench import Bench
-from analogrig.devices.device import Device
-from analogrig.errors import AnalogrigError, ConfigurationError
+from analogrig import AnalogrigError, Bench, ConfigurationError, Device, PotChange, Rig, Run, Scenario
+from analogrig.config import to_toml
+from analogrig.devices import Answers
 from analogrig.identity import Identity
-from analogrig.live import commands
-from analogrig.live.clock import LiveClock, WallClock
-from analogrig.live.commands import Command
-from analogrig.live.desk import CHANGE_N, open_desk
-from analogrig.live.faults import LINE_LABELS
-from analogrig.live.notes import Notes
-from analogrig.live.rates import RateMeter
-from analogrig.live.ring import Ring
-from analogrig.live.take import MOST_RECORDED_N, Take, TakeBuilder
 from analogrig.plant import MAX_CHANGES
-from analogrig.rigs.emulator import emulator_errors
-from analogrig.rigs.recording import WRONG_SAMPLES
-from analogrig.rigs.rig import Block, Performance, Rig
-from analogrig.run import Run
-from analogrig.scenario import PotChange, Scenario
+from analogrig.rigs import WRONG_SAMPLES, Block, Performance, emulator_errors
 from analogrig.storage import replace_file
 from analogrig.wording import number_of
 from analogrig_emulator import EmulatorError, Excitation
+from analogrig_live import commands
+from analogrig_live.clock import LiveClock, WallClock
+from analogrig_live.commands import Command
+from analogrig_live.desk import CHANGE_N, open_desk
+from analogrig_live.faults import LINE_LABELS
+from analogrig_live.notes import Notes
+from analogrig_live.rates import RateMeter
+from analogrig_live.ring import Ring
+from analogrig_live.take import MOST_RECORDED_N, Take, TakeBuilder
 
 ANOTHER_MODE = "computer in another mode"
 """Explanation of alarms from samples that the computer has not played in OPERATE, or just after."""
@@ -564,7 +558,7 @@ class LiveSession:
             number = self._reserve_number()
             table = {k: v for k, v in concluded.conditions.scenario.items() if v != "" and k not in ("name", "rig")}
             with replace_file(self._file(number, "toml")) as file:
-                file.write(config.to_toml(table).encode())
+                file.write(to_toml(table).encode())
             concluded.save(self._file(number, "npz"))  # last: no recording is without its scenario
         except (AnalogrigError, OSError) as error:
             self.notify(f"the recording could not be saved: {error}")

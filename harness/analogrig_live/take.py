@@ -7,14 +7,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from analogrig.answers import Answers
+from analogrig import PotChange, Run, Scenario
 from analogrig.bench import RunBuilder
-from analogrig.datasheet import Datasheet
-from analogrig.judging.verdict import unexplained_alarms
+from analogrig.devices import Answers, Datasheet
+from analogrig.judging import unexplained_alarms
 from analogrig.plant import MAX_CHANGES, Segment
-from analogrig.rigs.rig import Block
-from analogrig.run import Run
-from analogrig.scenario import MAX_RAMP_N, PotChange, Scenario, segments_of
+from analogrig.rigs import Block
+from analogrig.scenario import MAX_RAMP_N, segments_of
 
 MOST_RECORDED_N = 2_000_000
 """Samples of the longest recording: 100 s at 20,000 samples/s, 80 MB."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import socket
 import time
 import uuid
 from collections.abc import Generator
@@ -13,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import RecordIncomplete, RigClosed, RigError, RigRefused, RigTimeout
-from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, parse_envelope, protocol
-from analogrig.hardware.tcp_address import place_of
-from analogrig.links.wire import Clock
+from analogrig import RigError
+from analogrig.errors import RecordIncomplete, RigRefused, RigTimeout
+from analogrig.links import Clock
+from analogrig_instruments import InstrumentSocket
+from analogrig_lucidac.messages import FrameError, FrameReader, frame, parse_envelope, protocol
 
 _MOST_ANSWER_BYTES = 1 << 20
 
@@ -53,19 +53,13 @@ class LucidacConnection:
         :raises RigError: the connection failed.
         """
         self._pb = protocol()
-        self.name = place_of(host, port)
         self._clock = clock
         self._timeout_s = timeout_s
         self._reader = FrameReader(_MOST_ANSWER_BYTES)
         self._doubt = "; is a LUCIDAC at this address?"
         """Question of the error messages until the device has told what it is."""
-        try:
-            self._socket = socket.create_connection((host, port), timeout_s)
-        except TimeoutError as error:
-            raise RigTimeout(f"instrument {self.name}: no connection within {timeout_s:g} s") from error
-        except OSError as error:
-            raise RigClosed(f"instrument {self.name}: cannot be reached: {error.strerror or error}") from error
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = InstrumentSocket(host, port, timeout_s)
+        self.name = self._socket.name
 
     def ask_once(self, kind: str, **fields: Any) -> Any:
         """Send a command. Return the message that answers it, be it an error."""
@@ -211,8 +205,7 @@ class LucidacConnection:
         return [f"{each.entity.path.strip('/')}/{each.idx}" for each in status.elements if each.overload]
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._socket.close()
+        self._socket.close()
 
     def _samples(self, data: Any, channels: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Values by probe, and which of them are at an end of the converter's range."""
@@ -240,14 +233,7 @@ class LucidacConnection:
         command = getattr(message, kind)
         command.SetInParent()
         command.MergeFrom(type(command)(**fields))
-        within_s = self._timeout_s if within_s is None else within_s
-        try:
-            self._socket.settimeout(within_s)
-            self._socket.sendall(frame(message))
-        except TimeoutError as error:
-            raise RigTimeout(f"instrument {self.name}: accepted no command for {within_s:g} s") from error
-        except OSError as error:
-            raise RigClosed(f"instrument {self.name}: connection lost at {kind}: {error.strerror or error}") from error
+        self._socket.send(frame(message), kind, self._timeout_s if within_s is None else within_s)
         return str(message.id)
 
     def _next(self, what: str, deadline_s: float) -> Any:
@@ -268,18 +254,10 @@ class LucidacConnection:
                 if envelope is None or not envelope.HasField("message_v1"):
                     raise RigError(f"instrument {self.name}: {what}: sent no message of this protocol{self._doubt}")
                 return envelope.message_v1
-            self._socket.settimeout(left_s)
             try:
-                received = self._socket.recv(1 << 18)
+                self._reader.feed(self._socket.receive(1 << 18, what, left_s))
             except TimeoutError as error:
                 raise RigTimeout(self._silence(what)) from error
-            except OSError as error:
-                raise RigClosed(
-                    f"instrument {self.name}: connection lost at {what}: {error.strerror or error}"
-                ) from error
-            if not received:
-                raise RigClosed(f"instrument {self.name}: connection closed at {what}")
-            self._reader.feed(received)
 
     def _silence(self, what: str) -> str:
         return f"instrument {self.name}: {what}: no answer within {self._timeout_s:g} s{self._doubt}"

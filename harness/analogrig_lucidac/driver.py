@@ -12,12 +12,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.instrument import (
+from analogrig import ConfigurationError, Program, RigError
+from analogrig.links import Clock
+from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
+from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
+from analogrig_emulator.lucidac.wiring import FULL_SCALE, UNIT_V
+from analogrig_instruments import (
     DialChange,
     InputRecord,
     Instrument,
@@ -25,16 +30,15 @@ from analogrig.hardware.instrument import (
     PotBox,
     check_edges,
     first_phase,
+    host_and_port,
+    tcp_place,
 )
-from analogrig.hardware.lucidac_connection import LucidacConnection
-from analogrig.hardware.lucidac_messages import PORT
-from analogrig.hardware.lucidac_patch import LinearPatch, coefficients_of, module_of
-from analogrig.hardware.tcp_address import host_and_port, tcp_place
-from analogrig.links.wire import Clock
-from analogrig.program import Program
-from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
-from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
-from analogrig_emulator.lucidac.wiring import FULL_SCALE, UNIT_V
+from analogrig_lucidac.connection import LucidacConnection
+from analogrig_lucidac.messages import PORT
+from analogrig_lucidac.patching import LinearPatch, coefficients_of, module_of
+
+if TYPE_CHECKING:
+    from analogrig_instruments import TcpServer
 
 _HALF_RANGE = 1 << 15
 _MOST_INITIAL = 1.001
@@ -60,6 +64,9 @@ class LucidacInstrument(Instrument):
         ranges_v={"unit": (-FULL_SCALE * UNIT_V, FULL_SCALE * UNIT_V)},
     )
 
+    form = "HOST[:PORT]"
+    served_port = PORT
+
     def __init__(self, connection: LucidacConnection) -> None:
         """Take over ``connection``.
 
@@ -76,6 +83,17 @@ class LucidacInstrument(Instrument):
     @classmethod
     def place(cls, address: str) -> str:
         return tcp_place(address, PORT)
+
+    @classmethod
+    def emulated(
+        cls, rig: str | None, program: str | None, seed: int, defects: Sequence[str], clock: Clock | None
+    ) -> tuple[TcpServer, Mapping[str, str]]:
+        from analogrig_lucidac.served_machine import LucidacServer, specimen
+
+        if rig or program:
+            option = "--rig" if rig else "--program"
+            raise ConfigurationError(f"{option}: a LUCIDAC gets its program from its client: leave out {option}")
+        return LucidacServer(specimen(seed, defects), clock), {"rig": "lucidac", "program": ""}
 
     @classmethod
     def open(cls, address: str, timeout_s: float, clock: Clock = time.monotonic) -> LucidacInstrument:

@@ -9,7 +9,7 @@ import functools
 import importlib
 from typing import Any
 
-from analogrig.errors import ConfigurationError
+from analogrig import ConfigurationError
 
 PORT = 5732
 MOST_FRAME_BYTES = 262_084

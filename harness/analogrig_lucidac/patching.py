@@ -18,9 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError
-from analogrig.hardware.lucidac_messages import protocol
-from analogrig.program import Program
+from analogrig import ConfigurationError, Program
 from analogrig_emulator.lucidac.configuration import (
     ADC_CHANNELS,
     COEFFICIENT_STEPS,
@@ -38,6 +36,7 @@ from analogrig_emulator.lucidac.configuration import (
     SignalGenerator,
     rounded_coefficient,
 )
+from analogrig_lucidac.messages import protocol
 
 SQUARE_PORT = 2
 """Port of the front panel for the square wave, as in the manufacturer's example."""

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from analogrig.hardware.lucidac_messages import enum_name, protocol
 from analogrig_emulator.errors import CircuitError
 from analogrig_emulator.lucidac.configuration import (
     ADC_CHANNELS,
@@ -21,6 +20,7 @@ from analogrig_emulator.lucidac.configuration import (
     LucidacLane,
     SignalGenerator,
 )
+from analogrig_lucidac.messages import enum_name, protocol
 
 _CONSTANTS = {"GROUND": 0.0, "POS_REF": 1.0, "NEG_REF": -1.0}
 _WAVE_FORMS = {"SINE": "sine", "SINE_AND_SQUARE": "sine and square", "TRIANGLE": "triangle"}

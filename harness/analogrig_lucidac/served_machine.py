@@ -29,8 +29,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig import config
-from analogrig.hardware.lucidac_messages import (
+from analogrig.config import build
+from analogrig.links import Clock
+from analogrig_emulator import EmulatorError
+from analogrig_emulator.lucidac.machine import Lucidac
+from analogrig_emulator.lucidac.wiring import LucidacParts
+from analogrig_instruments import (
+    IDLE_S,
+    SLOW_S,
+    Client,
+    Keys,
+    TcpServer,
+    is_http,
+    may_become_http,
+    merge,
+    now_s,
+    parse_defect,
+)
+from analogrig_lucidac.messages import (
     FrameError,
     FrameReader,
     enum_name,
@@ -39,13 +55,7 @@ from analogrig.hardware.lucidac_messages import (
     parse_envelope,
     protocol,
 )
-from analogrig.hardware.simulator.lucidac_registers import Registers, entity_of
-from analogrig.hardware.simulator.served import Keys, merge, parse_defect
-from analogrig.hardware.simulator.tcp_server import IDLE_S, SLOW_S, Client, TcpServer, now_s
-from analogrig.links.wire import Clock
-from analogrig_emulator import EmulatorError
-from analogrig_emulator.lucidac.machine import Lucidac
-from analogrig_emulator.lucidac.wiring import LucidacParts
+from analogrig_lucidac.registers import Registers, entity_of
 
 MAC = "04-E9-E5-00-00-01"
 MOST_RATE_HZ = 500_000
@@ -77,12 +87,14 @@ def specimen(seed: int, settings: Sequence[str] = ()) -> Lucidac:
     table: Keys = {}
     for setting in settings:
         table = merge(table, parse_defect(setting))
-    parts = config.build(LucidacParts, table, "lucidac")
+    parts = build(LucidacParts, table, "lucidac")
     return Lucidac(replace(parts, components=replace(parts.components, seed=seed)))
 
 
 class LucidacServer(TcpServer):
     """Server of one emulated LUCIDAC."""
+
+    what = "an emulated LUCIDAC of analogrig serve, which speaks protobuf"
 
     def __init__(
         self, machine: Lucidac, clock: Clock | None = None, *, slow_s: float = SLOW_S, idle_s: float = IDLE_S
@@ -132,9 +144,20 @@ class LucidacServer(TcpServer):
     async def converse(self, client: Client) -> None:
         reader = FrameReader()
         with contextlib.suppress(FrameError):
+            start: bytes | None = b""
             while data := await client.reader.read(self.most_read_bytes):
+                if start is not None:
+                    start += data
+                    if may_become_http(start):
+                        continue
+                    if is_http(start):
+                        self.admit(client, start)
+                        return
+                    data, start = start, None
                 reader.feed(data)
                 while (content := self._next(client, reader)) is not None:
+                    if not self.admit(client, b""):
+                        return
                     client.heard_s = now_s()
                     client.writer.write(self._answer(client, content))
                     await self.drain(client)

@@ -5,6 +5,15 @@ reproduction = reproduce()
 reproduction.write(Path("build/thesis"))
 """
 
-from analogrig_thesis.reproduction import Reproduction, reproduce
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analogrig_thesis.reproduction import Reproduction, reproduce
+else:
+    from analogrig.lazy import loader
+
+    __getattr__ = loader(__name__, {"analogrig_thesis.reproduction": "Reproduction reproduce"})
 
 __all__ = ["Reproduction", "reproduce"]

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import Plant, Segment
+from analogrig import EstimatorConfig, Plant
+from analogrig.plant import Segment
 from analogrig_thesis.double_precision import PlainEstimator
 from analogrig_thesis.models import (
     ERROR,

@@ -12,16 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, lfilter
 
-from analogrig.bench import Bench, raise_if_interrupted
+from analogrig import Bench, EstimatorConfig, Plant, PotChange, Program, Rig, Run, Scenario, open_rig
+from analogrig.bench import raise_if_interrupted
 from analogrig.config import fixtures
-from analogrig.devices.host import HostDevice
-from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import Plant, SampledPlant, Segment
-from analogrig.program import Program
-from analogrig.rigs.description import open_rig
-from analogrig.rigs.rig import Rig
-from analogrig.run import Channel, Run
-from analogrig.scenario import PotChange, Scenario
+from analogrig.devices import HostDevice
+from analogrig.plant import SampledPlant, Segment
+from analogrig.run import Channel
 from analogrig_emulator import Excitation
 from analogrig_thesis.models import (
     DEFAULT,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.estimator_config import EstimatorConfig
+from analogrig import EstimatorConfig
 
 
 class PlainEstimator:

@@ -16,13 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import freqz, lfilter, lfiltic
 
-from analogrig.datasheet import ModelOrders
-from analogrig.devices.estimator import Estimator
-from analogrig.estimator_config import EstimatorConfig
-from analogrig.judging.verdict import trajectory
-from analogrig.plant import Plant, SampledPlant, Segment, estimated_parameters
-from analogrig.program import Program
-from analogrig.run import Run
+from analogrig import EstimatorConfig, Plant, Program, Run
+from analogrig.devices import Estimator, ModelOrders
+from analogrig.judging import trajectory
+from analogrig.plant import SampledPlant, Segment, estimated_parameters
 from analogrig_thesis.texts import Mark, Signal
 
 PERIOD_S = 0.01

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.pages import PLOTS, assemble_page
-from analogrig.reporting.markup import cell, heading, row, table, text
-from analogrig.reporting.payload import as_script, deflate
+from analogrig.reporting import PLOTS, as_script, assemble_page, deflate
+from analogrig_thesis.markup import cell, heading, row, table, text
 from analogrig_thesis.models import NAMES, TrackQuality
 from analogrig_thesis.texts import Chapter, Drawing, Table
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.judging.verdict import judge
+from analogrig import judge
 from analogrig.storage import replace_file
 from analogrig_thesis import chapter3, chapter4, chapter5
 from analogrig_thesis.chapter4 import Simulation

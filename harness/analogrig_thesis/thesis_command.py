@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import add_command
-from analogrig.cli.terminal import PASSED, show, show_plain, show_work
+from analogrig.cli import PASSED, add_command, show, show_plain, show_work
 
 
 def add(commands: Any) -> None:

@@ -14,12 +14,10 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError, RigError
-from analogrig.program import Program
-from analogrig.recordings.imported import unanswered
-from analogrig.rigs.rig import Block, Performance, Rig
-from analogrig.run import INPUT, OUTPUT, Channel, Run
-from analogrig.scenario import Scenario
+from analogrig import ConfigurationError, Program, Rig, RigError, Run, Scenario
+from analogrig.recordings import unanswered
+from analogrig.rigs import Block, Performance
+from analogrig.run import INPUT, OUTPUT, Channel
 from analogrig_emulator import Excitation
 from analogrig_emulator.machine.compiler import MACHINE_V
 

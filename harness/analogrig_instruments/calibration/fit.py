@@ -26,8 +26,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from analogrig.errors import RigError
-from analogrig.hardware.calibration.averages import (
+from analogrig import Plant, RigError, Scenario
+from analogrig.rigs import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig, MeasuredValues
+from analogrig.run import INPUT, OUTPUT
+from analogrig_emulator import CHANNELS, OP_AMP_GRADES, Excitation, Sampler, SuspensionComputer
+from analogrig_instruments.calibration.averages import (
     DISPLACEMENT,
     FORCE,
     SquareWaveRecording,
@@ -36,17 +39,6 @@ from analogrig.hardware.calibration.averages import (
     estimate_noise,
     rounding_variance,
 )
-from analogrig.plant import Plant
-from analogrig.rigs.emulator import (
-    CardDescription,
-    ComputerDescription,
-    EmulatorDescription,
-    EmulatorRig,
-    MeasuredValues,
-)
-from analogrig.run import INPUT, OUTPUT
-from analogrig.scenario import Scenario
-from analogrig_emulator import CHANNELS, OP_AMP_GRADES, Excitation, Sampler, SuspensionComputer
 
 Stock = Literal["nominal", "polyester", "polypropylene"]
 Pots = Literal["coefficient", "dial"]

@@ -16,12 +16,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import ConfigurationError
-from analogrig.hardware.calibration.averages import noise_variance
-from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.recordings.program_units import in_units
-from analogrig.rigs.emulator import ComputerDescription
-from analogrig.run import Run
+from analogrig import ConfigurationError, Run
+from analogrig.judging import QUANTISATION_VARIANCE_LSB2
+from analogrig.recordings import in_units
+from analogrig.rigs import ComputerDescription
 from analogrig_emulator import (
     MULTIPLIERS,
     EngineError,
@@ -30,6 +28,7 @@ from analogrig_emulator import (
     SuspensionComputer,
 )
 from analogrig_emulator.machine.compiler import MACHINE_V
+from analogrig_instruments.calibration.averages import noise_variance
 
 SETTLING_N = 200
 """Samples at the beginning of a span that are played and not compared, by default: the machine starts from rest."""

@@ -8,12 +8,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.fitting import fit_recording, fit_rig
-from analogrig.cli.options import FILE, add_command, add_json, add_rig, add_seed, count, files_read, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
+from analogrig.cli import (
+    FAILED,
+    FILE,
+    INCONCLUSIVE,
+    PASSED,
+    add_command,
+    add_json,
+    add_rig,
+    add_seed,
+    complain,
+    count,
+    files_read,
+    progress_line,
+    show,
+    show_result,
+    trust_of,
+)
 
 if TYPE_CHECKING:
-    from analogrig.hardware.calibration.fit import Calibration
+    from analogrig_instruments.calibration.fit import Calibration
 
 MOST_LSB = 1.0
 """Largest rms difference between rig and twin, on data that the fit has not seen."""
@@ -103,12 +117,11 @@ def _add_program_fit(command: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig.errors import ConfigurationError, RigError
-    from analogrig.hardware.calibration.averages import check_scenario, record, scenarios
-    from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate, difference_lsb
+    from analogrig import ConfigurationError, RigError, open_rig
     from analogrig.output import move_aside
-    from analogrig.rigs.description import open_rig
     from analogrig.storage import replace_file
+    from analogrig_instruments.calibration.averages import check_scenario, record, scenarios
+    from analogrig_instruments.calibration.fit import POTS, STOCKS, calibrate, difference_lsb
 
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
@@ -154,19 +167,23 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _fit_recording(arguments: argparse.Namespace) -> int:
     """Fit the parameters of a program to a recording."""
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
 
     if arguments.rig not in (None, os.environ.get("ANALOGRIG_RIG")):
         raise ConfigurationError(f"--rig {arguments.rig}: is not played with --recording; leave out one of them")
+    from analogrig_instruments.commands.fitting import fit_recording
+
     return fit_recording(arguments)
 
 
 def _fit_rig(arguments: argparse.Namespace) -> int:
     """Fit the parameters of a program to a rig."""
-    from analogrig.errors import RigError
+    from analogrig import RigError
 
     _check_for_a_rig(arguments, ("span", "check"))
     try:
+        from analogrig_instruments.commands.fitting import fit_rig
+
         return fit_rig(arguments)
     except RigError as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
@@ -174,7 +191,7 @@ def _fit_rig(arguments: argparse.Namespace) -> int:
 
 def _check_for_a_rig(arguments: argparse.Namespace, options: Sequence[str]) -> None:
     """:raises ConfigurationError: one of these options is given."""
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
 
     for option in options:
         if getattr(arguments, option) not in (None, []):
@@ -194,7 +211,7 @@ def _values(found: Calibration) -> list[str]:
 
 def _said(found: Calibration, check_lsb: float) -> list[str]:
     """Quality and limits of a calibration, one line each."""
-    from analogrig.hardware.calibration.fit import LEAST_GAIN_OF_DIALS
+    from analogrig_instruments.calibration.fit import LEAST_GAIN_OF_DIALS
 
     computer = found.twin.computer
     others = [
@@ -236,7 +253,7 @@ def _toml(found: Calibration, arguments: argparse.Namespace, check_lsb: float) -
 
     from analogrig.config import to_toml
     from analogrig.identity import Identity
-    from analogrig.reporting.tables import provenance
+    from analogrig.reporting import provenance
 
     made_by = provenance(Identity.here(arguments.command_line, arguments.started))
     heading = [

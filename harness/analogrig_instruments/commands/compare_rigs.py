@@ -6,7 +6,10 @@ import argparse
 import os
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import (
+from analogrig.cli import (
+    FAILED,
+    INCONCLUSIVE,
+    PASSED,
     RIG,
     RIG_NAMES,
     SCENARIO,
@@ -16,14 +19,17 @@ from analogrig.cli.options import (
     add_json,
     add_seed,
     changes_of_dut,
+    complain,
     count,
+    progress_line,
+    show,
+    show_result,
     trust_of,
 )
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
-    from analogrig.hardware.rig_comparison import RigComparison
+    from analogrig_instruments.rig_comparison import RigComparison
 
 
 def add(commands: Any) -> None:
@@ -57,12 +63,8 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from analogrig.bench import Bench
-    from analogrig.devices.opening import open_dut
-    from analogrig.errors import ConfigurationError
-    from analogrig.hardware.rig_comparison import RigComparison, compare_rigs
-    from analogrig.rigs.description import open_rig
-    from analogrig.scenario import Scenario
+    from analogrig import Bench, ConfigurationError, Scenario, open_dut, open_rig
+    from analogrig_instruments.rig_comparison import RigComparison, compare_rigs
 
     if not 0.5 < arguments.confidence < 1.0:
         raise ConfigurationError(f"--confidence must be between 0.5 and 1, not {arguments.confidence:g}")
@@ -100,7 +102,7 @@ def _differ(found: RigComparison, arguments: argparse.Namespace) -> bool:
 
 
 def _text(found: RigComparison) -> str:
-    from analogrig.cli.compare import differences_text
+    from analogrig.cli import differences_text
 
     lines = [found.sentence, "", *_signal_lines(found), *_latency_lines(found)]
     for name, of in zip("AB", found.false_alarms, strict=True):

@@ -6,11 +6,24 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import PROGRAM, add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, show_work
+from analogrig.cli import (
+    FAILED,
+    INCONCLUSIVE,
+    PASSED,
+    PROGRAM,
+    add_command,
+    add_json,
+    add_rig,
+    add_seed,
+    complain,
+    show,
+    show_result,
+    show_work,
+    trust_of,
+)
 
 if TYPE_CHECKING:
-    from analogrig.hardware.self_test import Check, Findings
+    from analogrig_instruments.self_test import Check, Findings
 
 
 def add(commands: Any) -> None:
@@ -34,10 +47,9 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig.errors import RigError
-    from analogrig.hardware.self_test import self_test
-    from analogrig.rigs.description import open_rig
+    from analogrig import RigError, open_rig
     from analogrig.scenario import DEFAULT_PROGRAM
+    from analogrig_instruments.self_test import self_test
 
     with open_rig(arguments.rig, self_test=False, allow=trust_of(arguments)) as rig:
         program = arguments.program or str(rig.description().get("program", DEFAULT_PROGRAM))

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analogrig.cli.terminal import FAILED, PASSED, show, show_result, show_work
+from analogrig.cli import FAILED, PASSED, show, show_result, show_work
 
 if TYPE_CHECKING:
-    from analogrig.hardware.calibration.recorded import (
+    from analogrig import Program, Run
+    from analogrig_instruments.calibration.recorded import (
         FittedParameter,
         ProgramTwin,
         Reconstruction,
@@ -18,21 +19,19 @@ if TYPE_CHECKING:
         Residual,
         Span,
     )
-    from analogrig.program import Program
-    from analogrig.run import Run
 
 
 _MOST_OF_OUTPUT = 0.5
 """Largest rms difference of a twin to keep by default, in the rms of the fitted output about its mean."""
+_MOST_UNEXPLAINED = 0.12
+"""The same where the difference is not noise: the plant changed, or the program does not describe it."""
 
 
 def fit_recording(arguments: argparse.Namespace) -> int:
     """Fit a program to a recording, and keep it as a program file with the fitted values."""
+    from analogrig import ConfigurationError, Program, Run
     from analogrig.config import locate
-    from analogrig.errors import ConfigurationError
     from analogrig.output import move_aside
-    from analogrig.program import Program
-    from analogrig.run import Run
 
     file = locate("programs", arguments.program)
     move_aside(arguments.out, (file, arguments.recording))
@@ -53,12 +52,11 @@ def fit_recording(arguments: argparse.Namespace) -> int:
 
 def fit_rig(arguments: argparse.Namespace) -> int:
     """Fit a program to two recordings of a rig, of which one is only compared, and keep it likewise."""
-    from analogrig.cli.options import files_read, trust_of
+    from analogrig import Program, open_rig
+    from analogrig.cli import files_read, trust_of
     from analogrig.config import locate
-    from analogrig.hardware.calibration.averages import record_program
     from analogrig.output import move_aside
-    from analogrig.program import Program
-    from analogrig.rigs.description import open_rig
+    from analogrig_instruments.calibration.averages import record_program
 
     file = locate("programs", arguments.program)
     program = Program.load(str(file))
@@ -72,10 +70,10 @@ def fit_rig(arguments: argparse.Namespace) -> int:
 
 
 def _plant(program: Program, run: Run, arguments: argparse.Namespace) -> RecordedPlant:
-    from analogrig.errors import ConfigurationError
-    from analogrig.hardware.calibration.recorded import RecordedPlant
-    from analogrig.rigs.emulator import ComputerDescription, emulator_errors
+    from analogrig import ConfigurationError
+    from analogrig.rigs import ComputerDescription, emulator_errors
     from analogrig_emulator import compile_program
+    from analogrig_instruments.calibration.recorded import RecordedPlant
 
     if arguments.pots is not None:
         raise ConfigurationError("--pots is for a rig with front or shock: the pots of this twin are continuous")
@@ -86,7 +84,7 @@ def _plant(program: Program, run: Run, arguments: argparse.Namespace) -> Recorde
 
 
 def _settling_n(arguments: argparse.Namespace) -> int:
-    from analogrig.hardware.calibration.recorded import SETTLING_N
+    from analogrig_instruments.calibration.recorded import SETTLING_N
 
     return SETTLING_N if arguments.settle is None else int(arguments.settle)
 
@@ -103,8 +101,8 @@ def _fit(
 
     :param reconstruction: default course of the input between its samples; None: the one that fits better.
     """
-    from analogrig.hardware.calibration.recorded import fit_program
     from analogrig.storage import replace_file
+    from analogrig_instruments.calibration.recorded import fit_program
 
     fixed = dict(_fixed(text, plant.program.values) for text in arguments.fix)
     chosen = arguments.reconstruction or reconstruction
@@ -113,7 +111,8 @@ def _fit(
         checked = check and check[0].difference(twin.values, check[1], twin.reconstruction)
     unit = plant.output_unit
     if arguments.most_rms is None:
-        judged, most_rms = twin.fit, _MOST_OF_OUTPUT * twin.output_rms
+        most = _MOST_OF_OUTPUT if twin.fit.is_noise or not twin.fit.is_settled else _MOST_UNEXPLAINED
+        judged, most_rms = twin.fit, most * twin.output_rms
     else:
         judged, most_rms = checked or twin.fit, arguments.most_rms
     is_twin = judged.rms <= most_rms
@@ -152,7 +151,7 @@ def _parameter_line(each: FittedParameter) -> str:
 
 
 def _reconstruction_line(twin: ProgramTwin, unit: str) -> str:
-    from analogrig.hardware.calibration.recorded import RECONSTRUCTIONS
+    from analogrig_instruments.calibration.recorded import RECONSTRUCTIONS
 
     line = f"input between the samples: {twin.reconstruction}"
     if twin.other_rms is None:
@@ -220,7 +219,7 @@ def _check_lines(fit: Residual, checked: Residual | None, settling_n: int) -> li
 
 def _fixed(text: str, values: Mapping[str, float]) -> tuple[str, float]:
     """Name and value of an option NAME=VALUE; without a value that of the program."""
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
 
     name, equals, value = text.partition("=")
     try:
@@ -234,8 +233,8 @@ def _words(difference: Residual, unit: str) -> str:
 
 
 def _span(arguments: argparse.Namespace, option: str, samples: int) -> tuple[int, int]:
-    from analogrig.errors import ConfigurationError
-    from analogrig.hardware.calibration.recorded import span_of
+    from analogrig import ConfigurationError
+    from analogrig_instruments.calibration.recorded import span_of
 
     text = getattr(arguments, option)
     try:
@@ -248,7 +247,7 @@ def _program_toml(file: Path, values: Mapping[str, float], lines: Sequence[str],
     """The program file with fitted values, and their origin as comments."""
     from analogrig.config import read_toml, to_toml
     from analogrig.identity import Identity
-    from analogrig.reporting.tables import provenance
+    from analogrig.reporting import provenance
 
     table = read_toml(file)
     for name, value in values.items():

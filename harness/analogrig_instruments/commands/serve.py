@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import PROGRAM, RIG, add_command, add_json, add_seed
-from analogrig.cli.terminal import PASSED, complain, show, show_json
+from analogrig import ConfigurationError
+from analogrig.cli import (
+    PROGRAM,
+    RIG,
+    add_command,
+    add_json,
+    add_seed,
+    output_for_command,
+    port,
+    show,
+    show_json,
+)
 
 if TYPE_CHECKING:
     import asyncio
 
-    from analogrig.hardware.simulator.tcp_server import TcpServer
-    from analogrig.links.wire import Clock
-
-_DEFAULT_PORTS = {"red-pitaya": 5000, "lucidac": 5732}
-"""Default TCP port of each machine that can be served."""
+    from analogrig_instruments.instrument import Instrument
+    from analogrig_instruments.simulator.tcp_server import TcpServer
 
 
 def add(commands: Any) -> None:
@@ -33,9 +40,10 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--as",
         dest="machine",
-        choices=_DEFAULT_PORTS,
         default="red-pitaya",
-        help="machine to serve (default: %(default)s); a lucidac has neither --rig nor --program",
+        metavar="INSTRUMENT",
+        help="instrument to emulate: red-pitaya (default), lucidac (without --rig and --program), or one that"
+        " a package adds",
     )
     command.add_argument(
         "--rig",
@@ -56,7 +64,7 @@ def add(commands: Any) -> None:
         "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)"
     )
     command.add_argument(
-        "--port", type=port, metavar="N", help="TCP port; 0: any free one (default: 5000; lucidac: 5732)"
+        "--port", type=port, metavar="N", help="TCP port; 0: any free one (default: that of the instrument)"
     )
     command.add_argument(
         "--real-time",
@@ -70,12 +78,6 @@ def add(commands: Any) -> None:
     command.set_defaults(command=_run)
 
 
-def port(text: str) -> int:
-    if text.isascii() and text.isdecimal() and len(text) <= 5 and int(text) < 1 << 16:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, not {text[:40]!r}")
-
-
 def _run(arguments: argparse.Namespace) -> int:
     import asyncio
 
@@ -83,39 +85,31 @@ def _run(arguments: argparse.Namespace) -> int:
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
     clock = time.monotonic if arguments.real_time else None
-    server, names = (_lucidac if arguments.machine == "lucidac" else _red_pitaya)(arguments, drawn_from, clock)
+    machine = _machine(arguments.machine)
+    server, names = machine.emulated(arguments.rig, arguments.program, drawn_from, arguments.defect, clock)
     if arguments.port is None:
-        arguments.port = _DEFAULT_PORTS[arguments.machine]
+        arguments.port = machine.served_port
     return asyncio.run(_serve(server, arguments, {**names, "seed": drawn_from}))
 
 
-def _red_pitaya(arguments: argparse.Namespace, seed: int, clock: Clock | None) -> tuple[TcpServer, dict[str, Any]]:
-    from analogrig.hardware.simulator.served import ServedDescription
-    from analogrig.hardware.simulator.server import Server
-    from analogrig.program import Program
+def _machine(name: str) -> type[Instrument]:
+    """Instrument to emulate.
 
-    program = Program.load(arguments.program or "front")
-    described = ServedDescription.load(arguments.rig or "emulator", arguments.defect)
-    server = Server(described.set_up(program, seed, clock))
-    if described.unsupported:
-        complain(f"{described.name}: the instrument has no {', '.join(described.unsupported)}", PASSED)
-    return server, {"rig": described.name, "program": arguments.program or "front"}
+    :raises ConfigurationError: there is none.
+    """
+    from analogrig_instruments.instrument import DRIVERS
 
-
-def _lucidac(arguments: argparse.Namespace, seed: int, clock: Clock | None) -> tuple[TcpServer, dict[str, Any]]:
-    from analogrig.errors import ConfigurationError
-    from analogrig.hardware.simulator.served_lucidac import LucidacServer, specimen
-
-    if arguments.rig or arguments.program:
-        option = "--rig" if arguments.rig else "--program"
-        raise ConfigurationError(f"{option}: a LUCIDAC gets its program from its client: leave out {option}")
-    return LucidacServer(specimen(seed, arguments.defect), clock), {"rig": "lucidac", "program": ""}
+    kind = DRIVERS.get(name.replace("-", ""))
+    if kind is None or not kind.served_port:
+        there = ", ".join(known for known in sorted(DRIVERS) if DRIVERS[known].served_port)
+        raise ConfigurationError(f"--as {name}: there is no emulated instrument of this name: there are {there}")
+    return kind
 
 
-async def _serve(server: TcpServer, arguments: argparse.Namespace, names: dict[str, Any]) -> int:
+async def _serve(server: TcpServer, arguments: argparse.Namespace, names: Mapping[str, Any]) -> int:
     """Serve until a signal ends the command or, if there is one, until the client ends. Return the exit status."""
-    from analogrig.hardware.tcp_address import place_of
     from analogrig.signals import signal_future
+    from analogrig_instruments.tcp_address import place_of
 
     ended = signal_future()
     host, number = await server.listen(arguments.host, arguments.port)
@@ -144,15 +138,15 @@ async def _client(command: Sequence[str], signalled: asyncio.Future[int]) -> int
     import ctypes
     import signal
 
-    from analogrig.errors import ConfigurationError
-
     libc = ctypes.CDLL(None)
 
     def end_with_parent() -> None:
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
     try:
-        process = await asyncio.create_subprocess_exec(*command, preexec_fn=end_with_parent)
+        process = await asyncio.create_subprocess_exec(
+            *command, stdout=output_for_command(), preexec_fn=end_with_parent
+        )
     except OSError as error:
         raise ConfigurationError(f"{command[0]}: cannot be started: {error.strerror or error}") from error
     ended = asyncio.ensure_future(process.wait())

@@ -1,7 +1,7 @@
 """Dates of a pot change: the most likely instants, with confidence intervals.
 
 A pot that an operator or a slow command sets changes the plant at unknown samples. The plant before the change explains
-the samples up to it, the plant after it those that follow (``analogrig.hardware.dating.two_filter``). Other unknowns
+the samples up to it, the plant after it those that follow (``analogrig_instruments.dating.two_filter``). Other unknowns
 are estimated jointly: the parameters before and after, since a real rig deviates from its nominal values by some per
 cent; the offsets of both channels; the place of the force's edges in a sample period.
 
@@ -23,7 +23,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.dating.two_filter import (
+from analogrig import Plant
+from analogrig_instruments.dating.two_filter import (
     COMMON,
     DIFFUSE,
     OWN,
@@ -37,7 +38,6 @@ from analogrig.hardware.dating.two_filter import (
     join,
     scan,
 )
-from analogrig.plant import Plant
 
 CONFIDENCE = 0.95
 

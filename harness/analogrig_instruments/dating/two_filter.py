@@ -19,9 +19,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.plant import Plant, discretise
-from analogrig.program import Program
+from analogrig import Plant, Program
+from analogrig.judging import QUANTISATION_VARIANCE_LSB2
+from analogrig.plant import discretise
 from analogrig.run import INPUT, OUTPUT, Channel, missing_samples
 
 Array = NDArray[np.float64]

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.config import check_range
-from analogrig.hardware.instrument import DialChange
 from analogrig.run import INPUT, OUTPUT
 from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Edges, Excitation, Mode, SuspensionComputer
+from analogrig_instruments.instrument import DialChange
 
 MEASURED_AT = (INPUT, OUTPUT)
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.config import check_range
-from analogrig.hardware.simulator.computer import WiredComputer
 from analogrig_emulator import Card, Sampler
+from analogrig_instruments.simulator.computer import WiredComputer
 
 BITS = 14
 RANGES_V = {"LV": 1.0, "HV": 20.0}

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 
 from analogrig.config import check_range
-from analogrig.hardware.simulator.inputs import Codes, Inputs, Volts
-from analogrig.hardware.simulator.scpi import ScpiError
-from analogrig.links.wire import Clock
+from analogrig.links import Clock
+from analogrig_instruments.simulator.inputs import Codes, Inputs, Volts
+from analogrig_instruments.simulator.scpi import ScpiError
 
 CLOCK_HZ = 125_000_000
 BUFFER_N = 16_384

@@ -28,12 +28,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig import config
-from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import DialChange
-from analogrig.hardware.simulator.computer import MEASURED_AT, WiredComputer, Wiring
-from analogrig.hardware.simulator.inputs import RANGES_V, Codes, InputFaults, Inputs
-from analogrig.hardware.simulator.records import (
+from analogrig import ConfigurationError, Program
+from analogrig.config import build, locate, read_toml
+from analogrig.links import Clock
+from analogrig.rigs import EmulatorDescription, Stream, emulator_errors
+from analogrig_emulator import CHANNELS, Card, EmulatorError, Excitation, SuspensionComputer
+from analogrig_instruments.instrument import DialChange
+from analogrig_instruments.simulator.computer import MEASURED_AT, WiredComputer, Wiring
+from analogrig_instruments.simulator.inputs import RANGES_V, Codes, InputFaults, Inputs
+from analogrig_instruments.simulator.records import (
     BUFFER_N,
     CLOCK_HZ,
     LEAST_DECIMATION,
@@ -44,11 +47,7 @@ from analogrig.hardware.simulator.records import (
     Acquisition,
     AcquisitionFaults,
 )
-from analogrig.hardware.simulator.scpi import HERTZ, VOLTS, Call, Command, DropOut, Response, ScpiError
-from analogrig.links.wire import Clock
-from analogrig.program import Program
-from analogrig.rigs.emulator import EmulatorDescription, Stream, emulator_errors
-from analogrig_emulator import CHANNELS, Card, EmulatorError, Excitation, SuspensionComputer
+from analogrig_instruments.simulator.scpi import HERTZ, VOLTS, Call, Command, DropOut, Response, ScpiError
 
 MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4
@@ -343,11 +342,11 @@ class ServedDescription(EmulatorDescription):
 
         :raises ConfigurationError: it does not exist, or is wrong.
         """
-        path = config.locate("rigs", name)
-        table: Keys = {"name": path.stem, **config.read_toml(path)}
+        path = locate("rigs", name)
+        table: Keys = {"name": path.stem, **read_toml(path)}
         for defect in defects:
             table = merge(table, {"instrument": parse_defect(defect)})
-        return config.build(cls, table, str(path))
+        return build(cls, table, str(path))
 
     def set_up(self, program: Program, seed: int, clock: Clock | None = None) -> ServedRedPitaya:
         """The instrument with the computer that an EmulatorRig plays with the same seed.

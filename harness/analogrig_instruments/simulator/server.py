@@ -6,12 +6,11 @@ When the client that switched the generator on disconnects, the server switches 
 from __future__ import annotations
 
 import asyncio
-import itertools
 from collections.abc import Mapping
 from typing import Protocol
 
-from analogrig.hardware.simulator.scpi import MOST_LINE_BYTES, Command, DropOut, Interpreter, ScpiError
-from analogrig.hardware.simulator.tcp_server import IDLE_S, SLOW_S, Client, TcpServer, now_s
+from analogrig_instruments.simulator.scpi import MOST_LINE_BYTES, Command, DropOut, Interpreter, ScpiError
+from analogrig_instruments.simulator.tcp_server import IDLE_S, SLOW_S, Client, TcpServer, now_s
 
 
 class Servable(Protocol):
@@ -33,6 +32,7 @@ class Server(TcpServer):
     """Server of one instrument; every connection has its own error queue."""
 
     most_read_bytes = MOST_LINE_BYTES
+    what = "an emulated Red Pitaya of analogrig serve, which speaks SCPI"
 
     def __init__(self, instrument: Servable, *, slow_s: float = SLOW_S, idle_s: float = IDLE_S) -> None:
         super().__init__(slow_s=slow_s, idle_s=idle_s)
@@ -53,8 +53,15 @@ class Server(TcpServer):
 
     async def converse(self, client: Client) -> None:
         interpreter = Interpreter(self._instrument.commands)
-        while (line := await _read_line(client.reader, interpreter)) is not None:
+        while (line := await _read_line(client.reader)) is not None:
+            if not line.strip():
+                continue
+            if not self.admit(client, line):
+                break
             client.heard_s = now_s()
+            if len(line) > MOST_LINE_BYTES:
+                interpreter.refuse(ScpiError(-363))
+                continue
             try:
                 await self._execute(client, interpreter, line)
             except DropOut as drop_out:
@@ -75,21 +82,19 @@ class Server(TcpServer):
             was_live = self._instrument.live
 
 
-async def _read_line(reader: asyncio.StreamReader, interpreter: Interpreter) -> bytes | None:
-    """Next line without its end; None at the end of input. A line that is too long is refused."""
-    for too_long in itertools.count():
+async def _read_line(reader: asyncio.StreamReader) -> bytes | None:
+    """Next line without its end; None at the end of input. Of a line that is too long, a start that is too long."""
+    start = b""
+    while True:
         try:
             line = await reader.readuntil(b"\n")
         except asyncio.IncompleteReadError:
             return None
         except asyncio.LimitOverrunError as error:
-            await reader.readexactly(error.consumed)
+            part = await reader.readexactly(error.consumed)
+            start = start if len(start) > MOST_LINE_BYTES else start + part
         else:
-            if not too_long:
-                return line.rstrip(b"\r\n")
-            interpreter.refuse(ScpiError(-363))
-            return b""
-    return None
+            return start + line if start else line.rstrip(b"\r\n")
 
 
 async def _discard(reader: asyncio.StreamReader) -> None:

@@ -3,8 +3,12 @@
 Limits of a client:
 
     memory   a limited line or message, one unsent response, and the system's buffers of BUFFERED_BYTES
-    place    one of MOST_CLIENTS. A newcomer replaces the client that has been silent longest, at least IDLE_S, or is
-             turned away. A client that the instrument works for keeps its place.
+    place    one of MOST_CLIENTS from its first line or message on. It replaces the client that has been silent longest,
+             at least IDLE_S, or is turned away. A client that the instrument works for keeps its place.
+    wait     until then, one of MOST_WAITING; a newcomer replaces the one that has waited longest
+
+A client that begins with a request line of HTTP is told what the port is, and disconnected: any web page can make a
+browser send such a request, with commands in its body.
 
 A client that reads nothing of a response for SLOW_S is dropped, and one whose machine does not respond after half a
 minute (TCP keepalive).
@@ -15,16 +19,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import re
 import socket
 from dataclasses import dataclass
 
-from analogrig.errors import ConfigurationError
-from analogrig.hardware.tcp_address import place_of
+from analogrig import ConfigurationError
+from analogrig_instruments.tcp_address import place_of
 
 MOST_CLIENTS = 16
+MOST_WAITING = 64
 IDLE_S = 10.0
 SLOW_S = 10.0
+LINGER_S = 1.0
+"""Time for a client of HTTP to take its answer, whose own data would otherwise reset the connection."""
 BUFFERED_BYTES = 65_536
+_METHODS = tuple(f"{name} ".encode() for name in "GET POST HEAD PUT DELETE OPTIONS PATCH CONNECT TRACE PRI".split())
+_REQUEST = re.compile(rb"\S+\s+\S.*\sHTTP/\d", re.IGNORECASE | re.DOTALL)
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 15), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 """Idle seconds, seconds between probes, probes."""
 
@@ -40,6 +50,10 @@ class Client:
     heard_s: float
     """Time of its last complete line or message."""
 
+    is_admitted: bool = False
+    """True once it has a place."""
+    speaks_http: bool = False
+
     def hang_up(self) -> None:
         """Close the connection at once; unsent data is lost."""
         self.writer.transport.abort()
@@ -51,9 +65,14 @@ class TcpServer:
     most_read_bytes: int = BUFFERED_BYTES
     """Limit of the reader's buffer."""
 
+    what: str = "an instrument"
+    """Noun phrase that says what the port is."""
+
     def __init__(self, *, slow_s: float = SLOW_S, idle_s: float = IDLE_S) -> None:
         self.slow_s = slow_s
         self._idle_s = idle_s
+        self._waiting: dict[asyncio.Task[None], Client] = {}
+        """Clients that have not spoken yet, in order of their arrival."""
         self._clients: dict[asyncio.Task[None], Client] = {}
         self._server: asyncio.Server | None = None
 
@@ -92,30 +111,50 @@ class TcpServer:
         """Close all connections, and leave the instrument safe."""
         if self._server is not None:
             self._server.close()
-        for task in self._clients:
+        tasks = [*self._waiting, *self._clients]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._clients, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
         self.silence()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         client, task = Client(reader, writer, now_s()), asyncio.current_task()
-        if task is None or not self._make_place():
-            client.hang_up()
-            return
-        self._clients[task] = client
+        assert task is not None  # noqa: S101 - a coroutine runs in one
+        if len(self._waiting) >= MOST_WAITING:
+            self._waiting.pop(next(iter(self._waiting))).hang_up()
+        self._waiting[task] = client
         try:
             _keep_alive(writer)
             await self.converse(client)
             self.release(client)
+            if client.speaks_http:
+                await _linger(client)
             client.writer.close()
             async with asyncio.timeout(self.slow_s):
                 await client.writer.wait_closed()
         except (OSError, asyncio.CancelledError) as error:
             _log.info("client disconnected: %r", error)
         finally:
+            self._waiting.pop(task, None)
             self._clients.pop(task, None)
             client.hang_up()
             self.release(client)
+
+    def admit(self, client: Client, first: bytes) -> bool:
+        """Give a client that has spoken a place. Return False if its conversation ends instead.
+
+        :param first: its first line or message, or the start of it.
+        """
+        if client.is_admitted:
+            return True
+        task = asyncio.current_task()
+        if is_http(first):
+            client.speaks_http = True
+            client.writer.write(f"HTTP/1.0 400 this port is {self.what}, not a web server\r\n".encode())
+        elif task is not None and self._waiting.get(task) is client and self._make_place():
+            self._clients[task] = self._waiting.pop(task)
+            client.is_admitted = True
+        return client.is_admitted
 
     def _make_place(self) -> bool:
         """Disconnect an idle client if all places are taken. Return True if there is a place for a newcomer."""
@@ -144,6 +183,25 @@ class TcpServer:
                 return
             if transport.get_write_buffer_size() >= left:
                 raise TimeoutError("it reads nothing")
+
+
+def is_http(first: bytes) -> bool:
+    """True if a first line, or its start, is a request of HTTP."""
+    return first.upper().startswith(_METHODS) or _REQUEST.match(first) is not None
+
+
+def may_become_http(first: bytes) -> bool:
+    """True if more bytes may make a request of HTTP of the first ones."""
+    return any(method.startswith(first.upper()) for method in _METHODS)
+
+
+async def _linger(client: Client) -> None:
+    """End the output, and discard the rest of a request: data left unread would reset the connection."""
+    client.writer.write_eof()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LINGER_S):
+            while await client.reader.read(BUFFERED_BYTES):
+                pass
 
 
 def now_s() -> float:

@@ -1,0 +1,1 @@
+"""Commands on rigs: doctor, calibrate, compare-rigs, serve."""

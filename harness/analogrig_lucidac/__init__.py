@@ -1,0 +1,1 @@
+"""LUCIDAC as an instrument, and a served one that is emulated."""
