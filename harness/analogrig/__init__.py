@@ -14,9 +14,10 @@ A rig plays a scenario, a device under test answers with alarms and estimates, a
     >>> all(change.latency_n is not None for change in verdict.tweaks)
     True
 
-The names in ``__all__``, also of ``analogrig.devices`` and ``analogrig.rigs``, are the public interface, and so are
-their documented members. Everything else in the packages ``analogrig``, ``analogrig_emulator`` and
-``analogrig_thesis`` is private: it may move or change in any version.
+The names in ``__all__`` of a module are public, and so are their documented members. Everything else is private: it
+may move or change in any version. This module has what tests and scripts need. Packages that add commands, rigs,
+devices or instruments take the rest from ``analogrig.cli``, ``devices``, ``rigs``, ``judging``, ``reporting`` and the
+other modules with an ``__all__``.
 
 =============  =========================================================================================
 play           ``open_rig``, ``open_dut``, ``Bench``; their types ``Rig``, ``Device``, ``EstimatorConfig``
@@ -39,7 +40,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from analogrig.bench import Bench
     from analogrig.devices.device import Device
-    from analogrig.devices.opening import open_dut
+    from analogrig.devices.registry import open_dut
     from analogrig.errors import (
         AnalogrigError,
         ConfigurationError,
@@ -80,7 +81,7 @@ else:
         "analogrig.plant": "Plant",
         "analogrig.program": "Program",
         "analogrig.devices.device": "Device",
-        "analogrig.devices.opening": "open_dut",
+        "analogrig.devices.registry": "open_dut",
         "analogrig.reporting.page": "write_report",
         "analogrig.rigs.description": "open_rig",
         "analogrig.rigs.rig": "Rig",

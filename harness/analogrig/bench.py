@@ -3,44 +3,35 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import dataclasses
 import gc
 import itertools
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, TypeGuard
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
+from analogrig.answers import NO_EVENTS, AlarmLevel, Answers, Events, Samples
 from analogrig.datasheet import Datasheet
-from analogrig.devices.description import DeviceDescription
 from analogrig.devices.device import Device
+from analogrig.devices.pace import Pace
 from analogrig.errors import DeviceError, LinkError, RigError, TimeLimitReached
 from analogrig.links.wire import Clock
-from analogrig.protocol.pace import Pace
-from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import Conditions, Run
-from analogrig.scenario import Scenario
+from analogrig.scenario import Scenario, check_seed
+
+__all__ = ["RunBuilder", "raise_if_interrupted"]
+"""Names for packages beside the core."""
 
 Progress = Callable[[int, int], None]
 """Callback after each block, with the number of samples done and of samples asked."""
 
-_RETAINED_BYTES = 30_000_000
-"""Size of the largest array whose memory the allocator keeps for the next play."""
-
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-"""Parameters of mallopt() in malloc.h of glibc."""
-
 _INTERRUPTED_BY = "interrupted by "
 """Start of the fault of an interrupted run; the name of the signal follows."""
-
-DIRECT_BLOCK_SAMPLES = 131_072
-"""Block length in samples of a direct bench. The circuit of a longer run is prepared anew for each seed."""
 
 
 class RunBuilder:
@@ -57,9 +48,7 @@ class RunBuilder:
         self._innovation = np.empty(n, np.float32) if sheet.innovation else np.zeros(n, np.float32)
         self._statistic = np.empty(n, np.float32) if sheet.statistic else np.zeros(n, np.float32)
         self._flags = np.empty(n, np.uint8)
-        self._alarms: list[RaisedAlarm] = []
-        self._diagnoses: list[ReportedDiagnosis] = []
-        self._misfits: list[ReportedMisfit] = []
+        self._events: dict[str, list[Events]] = {name: [none] for name, none in NO_EVENTS.items()}
         self.samples = 0
         self.records: list[int] = []
         """First samples of the records."""
@@ -85,9 +74,8 @@ class RunBuilder:
         if answers.statistic is not None:
             self._statistic[to] = answers.statistic
         shifted = answers.shifted(self.records[-1])
-        self._alarms += shifted.alarms
-        self._diagnoses += shifted.diagnoses
-        self._misfits += shifted.misfits
+        for name, found in self._events.items():
+            found.append(getattr(shifted, name))
         self.samples += answered
 
     def end_record(self, line_s: float, counters: Mapping[str, int]) -> None:
@@ -105,34 +93,19 @@ class RunBuilder:
             innovation=self._innovation[: self.samples],
             statistic=self._statistic[: self.samples],
             flags=self._flags[: self.samples],
-            **_reports(self._alarms, self._diagnoses, self._misfits),
+            **reports({name: np.concatenate(found) for name, found in self._events.items()}),
         )
 
 
-def _reports(
-    alarms: Sequence[RaisedAlarm], diagnoses: Sequence[ReportedDiagnosis], misfits: Sequence[ReportedMisfit]
-) -> dict[str, Any]:
+def reports(events: Mapping[str, Events]) -> dict[str, Any]:
     """Fields of a run that hold the alarms, diagnoses and misfits; those of nothing have a default."""
-    found = {
-        "alarm_index": np.array([alarm.index for alarm in alarms], dtype=np.int64),
-        "alarm_kind": np.array([alarm.kind for alarm in alarms], dtype=np.uint8),
-        "alarm_statistic": np.array([alarm.statistic for alarm in alarms], dtype=np.float32),
+    prefixes = {"alarms": "alarm", "diagnoses": "diagnosis", "misfits": "misfit"}
+    return {
+        f"{prefixes[name]}_{key}": np.ascontiguousarray(found[key])
+        for name, found in events.items()
+        if len(found) or name == "alarms"
+        for key in found.dtype.names
     }
-    if diagnoses:
-        found |= {
-            "diagnosis_index": np.array([diagnosis.index for diagnosis in diagnoses], dtype=np.int64),
-            "diagnosis_change": np.array([diagnosis.change for diagnosis in diagnoses], dtype=np.uint8),
-            "diagnosis_onset": np.array([diagnosis.onset for diagnosis in diagnoses], dtype=np.int64),
-            "diagnosis_extent": np.array([diagnosis.extent for diagnosis in diagnoses], dtype=np.float32),
-        }
-    if misfits:
-        found |= {
-            "misfit_index": np.array([misfit.index for misfit in misfits], dtype=np.int64),
-            "misfit_cause": np.array([misfit.cause for misfit in misfits], dtype=np.uint8),
-            "misfit_frequency": np.array([misfit.frequency for misfit in misfits], dtype=np.float32),
-            "misfit_strength": np.array([misfit.strength for misfit in misfits], dtype=np.float32),
-        }
-    return found
 
 
 def was_interrupted(run: Run) -> bool:
@@ -167,8 +140,8 @@ class Bench:
     """Rig and device, joined to play scenarios.
 
     The device is one behind a link, configured and with its handshake done, as ``open_dut`` returns it; or one without
-    messages (``direct_bench``). ``progress`` is called after each block with the samples done and the samples asked.
-    ``real_time`` is the wall-clock time per machine time; None: lock-step, where no sample is late.
+    messages (``analogrig.campaigns.together``). ``progress`` is called after each block with the samples done and the
+    samples asked. ``real_time`` is the wall-clock time per machine time; None: lock-step, where no sample is late.
     """
 
     def __init__(
@@ -199,8 +172,8 @@ class Bench:
         self._builder = builder or RunBuilder
         self._scenario: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
-    def play(self, scenario: Scenario, seed: int) -> Run:
-        """Play ``scenario`` and collect the answers of the device, in lock-step or in real time.
+    def play(self, scenario: Scenario | str, seed: int) -> Run:
+        """Play a scenario or one of this name, and collect the answers of the device, in lock-step or in real time.
 
         In real time, late messages are counted and make the run invalid. The emulated machine is computed in advance.
 
@@ -209,12 +182,16 @@ class Bench:
         the Run then holds every answered sample.
 
         :raises DeviceError, LinkError, RigError: before the first sample.
-        :raises ConfigurationError: real time does not fit the line.
+        :raises ConfigurationError: real time does not fit the line, there is no such scenario, or the seed is no whole
+            number from 0 to 2^63 - 1.
         """
+        seed = check_seed(seed)
+        if not isinstance(scenario, Scenario):
+            scenario = Scenario.load(scenario)
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._pace_blocks(performance)
-        self.dut.suit(_poles(scenario, performance))
+        self.dut.suit(scenario.poles(performance.sample_period_s * performance.time_scale))
         self.dut.prepare(performance.of_device, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
@@ -301,9 +278,11 @@ class Bench:
             },
             segments=known.segments,
             faults=(*faults, *known.caveats),
-            overloads=_overloads(known, builder.samples),
+            overloads=overloads_until(known, builder.samples),
             records=tuple(builder.records) or (0,),
             line_s=builder.line_s,
+            losses=self.dut.losses,
+            remarks=self.dut.remarks,
             counters=builder.counters,
             link_counters=self.dut.link_counters,
         )
@@ -340,113 +319,17 @@ class Bench:
                     sent.append(block)
                 yield block.samples(start)
 
+        level = AlarmLevel()
         for answers in self.dut.play(samples_of_record()):
             if not len(answers):
                 continue
-            builder.add(sent.popleft(), answers)
+            block = sent.popleft()
+            events = level.rises(answers, block.first - start) if self.dut.holds_alarms else answers
+            builder.add(block, events)
             if self._progress is not None:
                 self._progress(builder.samples, samples)
 
 
-def can_be_direct(rig: Rig, device: DeviceDescription) -> TypeGuard[EmulatorRig]:
-    """True if a direct bench yields the runs of the device over its line.
-
-    The rig must be emulated, and the line must not alter the samples.
-    """
-    return is_emulated(rig) and "blocks" in device.capabilities
-
-
-class DirectBench(Bench):
-    """Bench of an emulated rig and a device without messages."""
-
-    def play_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Run]:
-        """Runs of ``play`` with each seed, to the bit. Those of one block are computed together, in half of the time.
-
-        :raises ConfigurationError, DeviceError, RigError: one of them would raise it, or have it as a fault.
-        """
-        if scenario.samples > DIRECT_BLOCK_SAMPLES:
-            return [self.play(scenario, seed) for seed in seeds]
-        performances = self.rig.perform_all(scenario, seeds)
-        self.dut.suit(_poles(scenario, performances[0]))
-        self.dut.prepare(performances[0].of_device, performances[0].sample_period_s)
-        blocks = [next(each.blocks) for each in performances]
-        played = list(zip(blocks, self.dut.play_records([block.samples() for block in blocks]), strict=True))
-        common = self._common_conditions(performances[0], scenario, seeds[0], played[0])
-        return [
-            _run_of_block(
-                dataclasses.replace(
-                    common,
-                    seed=seed,
-                    overloads=_overloads(performance.hindsight(), scenario.samples),
-                    counters=counters,
-                ),
-                block,
-                answers,
-            )
-            for seed, performance, (block, (answers, counters)) in zip(seeds, performances, played, strict=True)
-        ]
-
-    def _common_conditions(
-        self, performance: Performance, scenario: Scenario, seed: int, played: _Played
-    ) -> Conditions:
-        """Conditions of runs that are played together, with the seed, overloads and counters of one of them."""
-        block, (answers, counters) = played
-        builder = RunBuilder(scenario.samples, len(scenario.program.channels), self.dut.datasheet)
-        builder.begin_record()
-        builder.add(block, answers)
-        builder.end_record(self.dut.line_s, counters)
-        initial = self._initial_conditions(performance, scenario, seed)
-        return self._final_conditions(initial, performance.hindsight(), (), builder)
-
-
-def _poles(scenario: Scenario, performance: Performance) -> tuple[complex, ...]:
-    """Poles of the plant as the scenario begins, one step a sample."""
-    return scenario.program.poles(scenario.plant.values, performance.sample_period_s * performance.time_scale)
-
-
-_Played = tuple[Block, tuple[Answers, Mapping[str, int]]]
-"""Block that is a whole run, with the answers to it and the counters of its record."""
-
-
-def _run_of_block(conditions: Conditions, block: Block, answers: Answers) -> Run:
-    """Run of one block."""
-    n = len(block.codes)
-    return Run(
-        conditions=conditions,
-        codes=block.codes,
-        clipped=block.clipped,
-        theta=np.empty((n, 0), np.float32) if answers.theta is None else answers.theta,
-        innovation=np.zeros(n, np.float32) if answers.innovation is None else answers.innovation,
-        statistic=np.zeros(n, np.float32) if answers.statistic is None else answers.statistic,
-        flags=answers.flags,
-        **_reports(answers.alarms, answers.diagnoses, answers.misfits),
-    )
-
-
-def _overloads(known: Hindsight, samples: int) -> dict[str, int]:
+def overloads_until(known: Hindsight, samples: int) -> dict[str, int]:
     """First sample with a lit overload lamp, by amplifier, in a run of so many samples."""
     return {amplifier: sample for amplifier, sample in known.lamps.items() if sample < samples}
-
-
-def _retain_freed_memory() -> None:
-    """Make glibc keep the arrays of a play for the next one; otherwise each play faults their pages in again.
-
-    Its thresholds would grow by themselves, but not in a worker of Dask: they are fixed at 128 kB by the variable
-    MALLOC_TRIM_THRESHOLD_, whatever its value, and Dask sets it.
-    """
-    if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        mallopt(_M_MMAP_THRESHOLD, _RETAINED_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, 2 * _RETAINED_BYTES)
-
-
-def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bool = False) -> DirectBench:
-    """Bench with the estimator in this process and whole blocks: the fastest way.
-
-    If ``can_be_direct``, the runs are those over the line to the bit, without what needs messages.
-
-    :param alarms_only: omit the estimates, which take a twentieth of the time: theta of the runs has no columns.
-    :raises ConfigurationError: the estimator refuses its configuration.
-    :raises LinkError: the library of the device was not built.
-    """
-    _retain_freed_memory()
-    return DirectBench(rig.in_blocks(DIRECT_BLOCK_SAMPLES), device.direct(alarms_only=alarms_only))

@@ -6,7 +6,8 @@ estimator_c/catalogue/analogrig.dbc defines the messages and their meaning; the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from math import isfinite
 from struct import Struct
 from typing import Any, NamedTuple
@@ -58,10 +59,17 @@ def unpack(packet: bytes) -> Message | None:
 
 def unpack_any(packet: bytes) -> Message | None:
     """Message in a packet; None if the catalogue has none of that length. Its value may be NaN or infinite."""
-    codec = _BY_IDENTIFIER.get(packet[0]) if packet else None
-    if codec is None or len(packet) != codec.length:
-        return None
-    return codec.make(codec.unpack(packet, 1))
+    return next(iter(unpack_all([packet])), None)
+
+
+def unpack_all(packets: Iterable[bytes]) -> list[Message]:
+    """Messages in the packets, as ``unpack_any``, without those that hold none."""
+    messages = []
+    for packet in packets:
+        codec = _BY_IDENTIFIER.get(packet[0]) if packet else None
+        if codec is not None and len(packet) == codec.length:
+            messages.append(codec.make(codec.unpack(packet, 1)))
+    return messages
 
 
 def is_finite(message: Message) -> bool:
@@ -93,7 +101,7 @@ def _codec(message_type: Any) -> _Codec:
     struct = Struct(layout.format)
     identifier, length = bytes([layout.id]), 1 + layout.length
     if message_type is not SampleBlock:
-        return _Codec(identifier, length, struct.pack, struct.unpack_from, message_type._make)
+        return _Codec(identifier, length, struct.pack, struct.unpack_from, partial(tuple.__new__, message_type))
     return _Codec(
         identifier,
         length,

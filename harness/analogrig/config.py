@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from analogrig.errors import ConfigurationError
-from analogrig_emulator import EmulatorError
+
+__all__ = ["build", "check_range", "fixtures", "locate", "plain", "read_toml", "to_toml"]
+"""Names for packages beside the core."""
 
 T = TypeVar("T")
 
@@ -35,22 +37,8 @@ MOST_INTEGER = 2**63 - 1
 
 MOST_SHOWN = 200
 
-MAX_DEPTH = 32
-"""Largest nesting depth of tables and arrays in a file."""
-
-MAX_WORD = 2_000
-"""Most characters of a bare key or a number in a file."""
-
-_QUOTES = "\"'#"
-"""First characters of strings and comments, which may be long."""
-
-_TOKENS = re.compile(
-    r"""\"{3}(?:[^"\\]|\\.|"(?!""))*+(?:\"{3}|\Z) | '{3}(?:[^']|'(?!''))*+(?:'{3}|\Z)
-    | "(?:[^"\\\n]|\\.)*+"? | '[^'\n]*+'? | \#[^\n]*+ | [][{}.,=\n] | [\w+:-]++""",
-    re.DOTALL | re.VERBOSE,
-)
-"""Tokens of TOML: brackets and other nesting characters, bare words, and strings and comments, which may contain
-either."""
+MOST_PARTS = 32
+"""Most parts of a dotted key, for which tomllib needs quadratic time."""
 
 
 def fixtures() -> Path:
@@ -82,11 +70,12 @@ def suggest(name: str, known: Collection[str], *, cutoff: float = 0.6) -> str:
     return f": did you mean {near[0]!r}?" if near else ""
 
 
-def locate(kind: Kind, name: str) -> Path:
+def locate(kind: Kind, name: str | Path) -> Path:
     """The TOML file of a shipped ``name``, or of a user's own path.
 
     :raises ConfigurationError: there is no such file.
     """
+    name = str(name)
     if name.endswith(".toml") or "/" in name:
         path = Path(name)
         if _is_file(path):
@@ -155,32 +144,18 @@ def toml_of(data: bytes, path: Path) -> dict[str, Any]:
     """
     try:
         text = data.decode("utf-8-sig")
-        _check_nesting(text)
+        _check_keys(text)
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number
+    except RecursionError as error:
+        raise ConfigurationError(f"{path}: not valid TOML: nested too deep") from error
+    except ValueError as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
 
 
-def _check_nesting(text: str) -> None:
-    """Reject text for which tomllib would need excessive memory and time.
-
-    :raises ValueError: brackets or dots of a key are nested too deep, or a bare word is too long.
-    """
-    brackets = dots = 0
-    for token in _TOKENS.finditer(text):
-        match token[0]:
-            case "[" | "{":
-                brackets, dots = brackets + 1, 0
-            case "]" | "}":
-                brackets -= 1
-            case ".":
-                dots += 1
-            case "," | "\n" | "=":
-                dots = 0
-            case word if len(word) > MAX_WORD and word[0] not in _QUOTES:
-                raise ValueError(f"a word or number is longer than {MAX_WORD} characters")
-        if max(brackets, dots) > MAX_DEPTH:
-            raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
+def _check_keys(text: str) -> None:
+    """:raises ValueError: a key has too many parts."""
+    if max(part.partition("#")[0].count(".") for part in re.split(r"[=,{\n]", text)) >= MOST_PARTS:
+        raise ValueError(f"a key has more than {MOST_PARTS} parts")
 
 
 def plain(value: Any) -> Any:
@@ -253,9 +228,16 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     values = {key: convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
         return cls(**values)
-    except (ValueError, ArithmeticError, ConfigurationError, EmulatorError) as error:
+    except (ValueError, ArithmeticError, ConfigurationError, _emulator_error()) as error:
         table_name = where.rpartition(": ")[2]
         raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
+
+
+def _emulator_error() -> type[Exception]:
+    """Type of the emulator's errors, whose import takes longer than all others of this module together."""
+    from analogrig_emulator import EmulatorError
+
+    return EmulatorError
 
 
 @functools.cache

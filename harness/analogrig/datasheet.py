@@ -17,6 +17,9 @@ from analogrig import config
 MOST_THETA = 64
 """Largest number of elements of theta."""
 
+DEFAULT_ARL0 = 1e5
+"""Mean samples between false alarms, where neither device nor scenario states another."""
+
 _MOST_SAMPLES = 2**31
 
 
@@ -64,9 +67,10 @@ class Datasheet:
     statistic: bool = False
     """True if the device reports the statistic of its trigger."""
     armed: bool = False
-    """True if the device reports for each sample whether its trigger was armed; the next four are not used then."""
+    """True if the device reports for each sample whether its trigger was armed. Of the next four, only warm_up_n is
+    used then."""
     warm_up_n: int = 0
-    """Samples from the start in which the trigger is not armed."""
+    """Samples from the start in which the trigger is not armed. ``least_exposure`` of a scenario leaves them out."""
     hold_off_n: int = 0
     """Samples after each alarm in which the trigger is not armed."""
     edge_codes: float = 0.0
@@ -75,6 +79,9 @@ class Datasheet:
     """Samples without such a step after which the trigger is not armed; 0: it stays armed."""
     alarms: bool = True
     """False if the device has no trigger."""
+    latches: bool = False
+    """True if the device does not learn the plant anew after an alarm. From its first alarm to the end of a record,
+    neither alarms nor changes are judged."""
     arl0: float | None = None
     """Mean samples between false alarms at the operating point; None: not known."""
     ceiling: float | None = None
@@ -112,6 +119,18 @@ class Datasheet:
         if self.is_ceiling_log_arl0 and self.ceiling is not None:
             return self.ceiling
         return math.log(self.arl0 or expected)
+
+    def most_alarms(self, samples: int) -> int:
+        """Largest number of alarms that are judged in a record of so many samples, by warm-up and hold-off."""
+        if self.latches:  # no alarm after the first is judged
+            return 1
+        if self.armed:
+            return max(1, samples)
+        return 1 + max(0, samples - 1 - self.warm_up_n) // (self.hold_off_n + 1)
+
+    def with_untold(self, *faults: str) -> Self:
+        """The same with these faults in ``cannot_tell``."""
+        return dataclasses.replace(self, cannot_tell=tuple(dict.fromkeys((*self.cannot_tell, *faults))))
 
     def as_table(self) -> dict[str, Any]:
         """Plain values without the defaults, from which ``config.build`` makes the same."""

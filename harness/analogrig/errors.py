@@ -2,6 +2,7 @@
 
 AnalogrigError
 ├── ConfigurationError          a file, key, value or command-line argument is wrong
+│   └── LimitError              a limit of a statement about a play is wrong; also a ValueError
 ├── RecordingError              a recording cannot be read or written
 ├── RigError                    the rig failed
 │   ├── RigTimeout              the instrument did not answer, or finish, in time
@@ -27,6 +28,9 @@ from __future__ import annotations
 
 from analogrig.wording import one_line
 
+__all__ = ["RecordIncomplete", "RecordStale", "RigClosed", "RigRefused", "RigTimeout", "SelfTestError"]
+"""Names for packages beside the core."""
+
 
 class AnalogrigError(Exception):
     """Root of all errors that the harness raises on purpose."""
@@ -37,6 +41,10 @@ class AnalogrigError(Exception):
 
 class ConfigurationError(AnalogrigError):
     """A file, a key, a value or a command-line argument is wrong."""
+
+
+class LimitError(ConfigurationError, ValueError):
+    """A limit of a statement about a play is wrong."""
 
 
 class RecordingError(AnalogrigError):

@@ -12,6 +12,7 @@ import numpy as np
 
 from analogrig import config
 from analogrig.catalogue import Element, Key, Trigger
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.errors import ConfigurationError
 
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
@@ -42,8 +43,6 @@ _WORDS: Mapping[str, Sequence[str]] = {
     "reset": get_args(ResetName),
 }
 """Fields whose value in the device is the index of a word: in the order of est_edge_instants_t and est_reset_t."""
-
-DEFAULT_ARL0 = 1e5
 
 MAX_NA = sum(key.name[0] == "C" and key.name[1:].isdecimal() for key in Key)
 """Largest order of C in the catalogue. A build of the device may have a lower limit."""

@@ -13,6 +13,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+__all__ = ["Identity"]
+"""Names for packages beside the core."""
+
 _PACKAGE = Path(__file__).parent
 STAMP = _PACKAGE / "_commit.txt"
 """Commit that a wheel was built from; setup.py writes it."""

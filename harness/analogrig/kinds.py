@@ -1,16 +1,17 @@
-"""Kinds of rigs and devices by name: ours, and those of other installed packages."""
+"""Kinds of rigs, devices and instruments by name: ours, and those of other installed packages."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import importlib.metadata
 import pkgutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Generic, TypeVar
 
+from analogrig.entry_points import EntryPoint, of_group
 from analogrig.errors import ConfigurationError
-from analogrig.wording import error_text
+
+__all__ = ["Kinds"]
+"""Names for packages beside the core."""
 
 T = TypeVar("T")
 
@@ -22,11 +23,11 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
     trusts it: a file may then name the kind.
     """
 
-    def __init__(self, base: type[T], group: str, own: Mapping[str, str]) -> None:
+    def __init__(self, base: type[T], group: str, own: Mapping[str, str] | None = None) -> None:
         """``own`` are our kinds as ``module:class``."""
         self._base = base
         self._group = group
-        self._own = own
+        self._own = own or {}
 
     def __getitem__(self, kind: str) -> type[T]:
         """Class of a kind.
@@ -50,43 +51,30 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
 
     @property
     def added(self) -> tuple[str, ...]:
-        """Kinds that other packages add."""
+        """Kinds that packages add."""
         return tuple(self._added)
 
     @property
     def ignored(self) -> Mapping[str, str]:
-        """Kinds that other packages add in vain, with the reason."""
+        """Kinds that packages add in vain, with the reason."""
         return {
-            point.name: f"ignored: {self._package(point)} cannot replace a kind that there is"
+            point.name: f"ignored: {point} cannot replace a kind that there is"
             for point in self._points
             if point.name in self._own or self._added[point.name] is not point
         }
 
-    def package_of(self, modules: Iterable[str]) -> str:
-        """Package that adds kinds from one of these modules; empty if there is none."""
-        packages = {module.partition(".")[0] for module in modules}
-        found = (point for point in self._points if point.module.partition(".")[0] in packages)
-        return next(map(self._package, found), "")
+    @functools.cached_property
+    def _points(self) -> list[EntryPoint]:
+        return of_group(self._group)
 
     @functools.cached_property
-    def _points(self) -> tuple[importlib.metadata.EntryPoint, ...]:
-        """Entry points of other packages in a fixed order."""
-        return tuple(sorted(_entry_points(self._group), key=lambda point: (point.name, point.value)))
-
-    @functools.cached_property
-    def _added(self) -> Mapping[str, importlib.metadata.EntryPoint]:
-        """Entry points of other packages by kind; the first of each is used."""
+    def _added(self) -> Mapping[str, EntryPoint]:
+        """Entry points by kind; the first of each is used."""
         return {point.name: point for point in reversed(self._points) if point.name not in self._own}
 
-    def _package(self, point: importlib.metadata.EntryPoint) -> str:
-        return f"the package {point.dist.name if point.dist else point.module} ({self._group}: {point.value})"
-
-    def _load(self, point: importlib.metadata.EntryPoint) -> type[T]:
-        where = f"kind {point.name!r}: {self._package(point)}"
-        try:
-            loaded = point.load()
-        except (Exception, SystemExit) as error:  # foreign code raises what it likes
-            raise ConfigurationError(f"{where} cannot be imported: {error_text(error)}") from error
+    def _load(self, point: EntryPoint) -> type[T]:
+        loaded = point.load("kind")
+        where = f"kind {point.name!r}: {point}"
         if not (isinstance(loaded, type) and issubclass(loaded, self._base)):
             raise ConfigurationError(f"{where} is no subclass of {self._base.__name__}")
         if (kind := getattr(loaded, "kind", point.name)) != point.name:
@@ -95,14 +83,3 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
             if str(hint).startswith("ClassVar") and not hasattr(loaded, name):
                 raise ConfigurationError(f"{where} has no {name}")
         return loaded
-
-
-def _entry_points(group: str) -> Iterable[importlib.metadata.EntryPoint]:
-    """Entry points of all packages but those that state them wrongly."""
-    with contextlib.suppress(Exception):
-        return importlib.metadata.entry_points(group=group)
-    found: list[importlib.metadata.EntryPoint] = []
-    for package in importlib.metadata.distributions():
-        with contextlib.suppress(Exception):
-            found += package.entry_points.select(group=group)
-    return found

@@ -6,6 +6,9 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping
 
+__all__ = ["loader"]
+"""Names for packages beside the core."""
+
 
 def loader(package: str, modules: Mapping[str, str]) -> Callable[[str], object]:
     """Function for ``__getattr__`` of a package.

@@ -22,6 +22,9 @@ from analogrig.identity import Identity
 from analogrig.pages import FOLDER, assemble_page
 from analogrig.signals import hold_signals, interruption
 
+__all__ = ["OutputFolder", "move_aside"]
+"""Names for packages beside the core."""
+
 VERDICT_FILE, RUN_FILE, REPORT_FILE, CAN_LOG = "verdict.json", "run.npz", "report.html", "can"
 
 RUN_FILES = (RUN_FILE, *(f"{CAN_LOG}.{suffix}" for suffix in ("log", "blf", "asc", "mf4")))

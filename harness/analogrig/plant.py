@@ -19,8 +19,11 @@ from analogrig.config import suggest
 from analogrig.datasheet import ModelOrders
 from analogrig.program import Program
 
+__all__ = ["MAX_CHANGES", "MAX_SAMPLES", "SampledPlant", "Segment", "discretise", "estimated_parameters"]
+"""Names for packages beside the core."""
+
 MAX_SAMPLES = 10_000_000
-"""Largest number of samples. A run is kept in memory; tests/harness/test_long_runs.py bounds its size."""
+"""Largest number of samples. A run is kept in memory; tests/soak/test_long_runs.py bounds its size."""
 
 MAX_CHANGES = 1_000
 """Largest number of changes, and of records, in a run. The bounds of each take milliseconds to compute."""
@@ -47,8 +50,9 @@ class Plant:
             check_parameter(name, value)
 
     @classmethod
-    def of(cls, program: Program, changed: Mapping[str, float] | None = None) -> Plant:
-        """Plant with the values of the program, but for the ``changed`` ones."""
+    def of(cls, program: Program | str, changed: Mapping[str, float] | None = None) -> Plant:
+        """Plant with the values of the program, which may be given by its name, but for the ``changed`` ones."""
+        program = Program.of(program, "program")
         return cls(program, tuple(row.value for row in program.parameters.values())).changed(changed or {})
 
     def parameters(self) -> dict[str, float]:

@@ -58,7 +58,7 @@ class Program:
         return f"Program({self.name!r})"
 
     @classmethod
-    def load(cls, name: str) -> Program:
+    def load(cls, name: str | Path) -> Program:
         """Load a shipped program by name, or a user's .toml file.
 
         :raises ConfigurationError: absent, not TOML, or not a program; names the file, the place and the cure.
@@ -85,11 +85,13 @@ class Program:
 
     @classmethod
     def of(cls, value: Any, where: str) -> Program:
-        """Program of a scenario's key ``program``: a name, a file, or the tables of one.
+        """Program of a scenario's key ``program``: a name, a file, or the tables of one; a Program itself.
 
         :raises ConfigurationError: it is none of them.
         """
-        if isinstance(value, str):
+        if isinstance(value, Program):
+            return value
+        if isinstance(value, (str, Path)):
             return cls.load(value)
         if isinstance(value, Mapping):
             return cls.from_table(value, where)

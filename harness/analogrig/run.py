@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
+from analogrig.answers import LOST as LOST  # noqa: PLC0414 - callers take it, like its neighbours, from here
+from analogrig.answers import MOST_FREQUENCY
 from analogrig.catalogue import Cause, Change
 from analogrig.datasheet import Datasheet
 from analogrig.errors import ConfigurationError, RecordingError
@@ -31,6 +33,9 @@ from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment
 from analogrig.program import Program
 from analogrig.scenario import DEFAULT_PROGRAM, program_of
 from analogrig.storage import replace_file
+
+__all__ = ["IMPORTED", "INPUT", "LOST", "OUTPUT", "Channel", "missing_samples"]
+"""Names for packages beside the core."""
 
 FORMAT = "analogrig-run"
 FORMAT_VERSION = 1
@@ -49,8 +54,6 @@ IMPORTED = "import"
 INPUT, OUTPUT = 0, 1
 """Columns of the plant's input and output, which every rig measures and every device receives."""
 
-LOST = 0x20
-"""Flag of a sample, beside SteppedFlag: lost on the way to the device."""
 UNREPORTED = 0x40
 """Flag of a sample, beside SteppedFlag: the device reported no estimate, and theta repeats the previous row."""
 UNARMED = 0x80
@@ -67,9 +70,6 @@ _ARRAYS: dict[str, tuple[str, int]] = {
     "alarm_kind": ("uint8", 1),
     "alarm_statistic": ("float32", 1),
 }
-
-MOST_FREQUENCY = 0.5
-"""Largest frequency of a disturbance in cycles per sample."""
 
 _DIAGNOSIS_ARRAYS: dict[str, tuple[str, int]] = {
     "diagnosis_index": ("int64", 1),
@@ -161,6 +161,10 @@ class Conditions:
     """Counters of the device at the end."""
     faults: tuple[str, ...] = ()
     """Reasons that the run is not valid; empty if it is."""
+    losses: tuple[str, ...] = ()
+    """Known causes of lost samples and of unused frames, each with its count and first place."""
+    remarks: tuple[str, ...] = ()
+    """What the line showed besides, and cost no sample."""
     overloads: Mapping[str, int] = field(default_factory=dict)
     """First sample with a lit overload lamp, by amplifier."""
     real_time: float = 0.0
@@ -311,11 +315,12 @@ class Run:
         """SHA-256 over the little-endian int64 sample indices of the alarms."""
         return hashlib.sha256(np.ascontiguousarray(self.alarm_index, dtype="<i8").data).hexdigest()
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the run to one file, atomically.
 
         :raises RecordingError: the file cannot be written.
         """
+        path = Path(path)
         header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
         arrays = {name: getattr(self, name) for name in _ARRAYS | _OPTIONAL_ARRAYS}
         with replace_file(path) as file, zipfile.ZipFile(file, "w") as archive:
@@ -324,11 +329,12 @@ class Run:
                     _write_array(member, array)
 
     @classmethod
-    def load(cls, path: Path) -> Run:
+    def load(cls, path: str | Path) -> Run:
         """Read a recording.
 
         :raises RecordingError: the file is absent, truncated, damaged, or not a recording of this format.
         """
+        path = Path(path)
         if path.exists() and not path.is_file():
             raise RecordingError(f"{path}: not a file")
         try:

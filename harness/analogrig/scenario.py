@@ -6,17 +6,22 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from analogrig import config
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.errors import ConfigurationError
 from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment, check_parameter
 from analogrig.program import Program
 from analogrig.trust import FiledName, resolve_name
 from analogrig.wording import number_of
 from analogrig_emulator import Excitation
+
+__all__ = ["DEFAULT_PROGRAM", "DEFAULT_SEED", "MAX_RAMP_N", "segments_of"]
+"""Names for packages beside the core."""
 
 MAX_RAMP_N = 100_000
 
@@ -69,7 +74,9 @@ class Expectations:
     """Largest number of detectable changes (the bound was reached) without an alarm."""
     false_alarms: int = 0
     """Largest number of false alarms in the run."""
-    arl0: float = 1e5
+    estimate_error: float = 0.25
+    """Largest relative error of an estimated parameter at the end of a long segment that determines it."""
+    arl0: float = DEFAULT_ARL0
     """Mean samples between false alarms that the bound assumes if the device's trigger has no ceiling of its own."""
     late_information_ratio: float = 4.0
     """Information at the deadline, as a multiple of ln ARL0; see ``late_slack_n``."""
@@ -77,14 +84,20 @@ class Expectations:
     """Samples from reaching that information to the deadline. A later alarm is late."""
     max_missing_fraction: float = 0.25
     """Largest share of missing samples in a valid run; a run with more is INCONCLUSIVE."""
+    least_exposure: float = 0.5
+    """Smallest share of the samples after warm-up in which the trigger must be armed; of all samples, a tenth of it. A
+    run with less that shows no fault of the device is INCONCLUSIVE."""
 
     def __post_init__(self) -> None:
         if not self.arl0 > 1.0:
             raise ValueError(f"arl0 must be more than 1 sample, not {self.arl0:g}")
+        if not self.estimate_error > 0.0:
+            raise ValueError(f"estimate_error must be more than 0, not {self.estimate_error:g}")
         if not self.late_information_ratio >= 1.0:
             raise ValueError(f"late_information_ratio must be at least 1, not {self.late_information_ratio:g}")
-        if not 0.0 <= self.max_missing_fraction <= 1.0:
-            raise ValueError(f"max_missing_fraction must be in 0 .. 1, not {self.max_missing_fraction:g}")
+        for name in ("max_missing_fraction", "least_exposure"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be in 0 .. 1, not {getattr(self, name):g}")
         for name in ("missed", "false_alarms", "late_slack_n"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative")
@@ -119,8 +132,8 @@ class Statement:
 class Scenario:
     """Excitation, program and changes of one play, in samples, and the expectations of the device.
 
-    ``load`` reads a shipped scenario by name or a .toml file, and raises ConfigurationError. ValueError: a value is out
-    of range.
+    ``load`` reads a shipped scenario by name or a .toml file, and raises ConfigurationError. Values may also be given
+    as files spell them: ``program="dc-motor"``. ValueError: a value is out of range.
     """
 
     samples: int
@@ -144,13 +157,33 @@ class Scenario:
     name: str = ""
 
     def __post_init__(self) -> None:
-        if self.seed is not None and not 0 <= self.seed < MOST_SEED:
-            raise ValueError(f"seed must be 0 to 2^63 - 1, not {self.seed}")
+        self._convert()
+        if self.seed is not None:
+            check_seed(self.seed)
         if not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be in 1 .. {MAX_SAMPLES}, not {self.samples}")
         if self.random_phase and self.excitation.shape == "recorded":
             raise ValueError("random_phase: an excitation of the shape recorded has no phase")
         self._check_tweaks()
+
+    def _convert(self) -> None:
+        """Replace values that are spelt as in files.
+
+        :raises ConfigurationError: one is malformed.
+        """
+        program = Program.of(self.program, "program")
+        tables: dict[str, type[Excitation | Expectations]] = {"excitation": Excitation, "expect": Expectations}
+        converted: dict[str, Any] = {"program": program}
+        for name, kind in tables.items():
+            if isinstance(value := getattr(self, name), Mapping):
+                converted[name] = config.build(kind, value, name)
+        converted["set"] = {program.names.get(name, name): value for name, value in self.set.items()}
+        converted["tweaks"] = tuple(
+            config.build(PotChange, _with_set(tweak, program), f"tweaks[{i}]") if isinstance(tweak, Mapping) else tweak
+            for i, tweak in enumerate(self.tweaks)
+        )
+        for name, value in converted.items():
+            object.__setattr__(self, name, value)
 
     def _check_tweaks(self) -> None:
         if len(self.tweaks) > MAX_CHANGES:
@@ -175,7 +208,7 @@ class Scenario:
                 raise ValueError(f"tweaks[{i}]: {error}") from error
 
     @classmethod
-    def load(cls, name: str) -> Scenario:
+    def load(cls, name: str | Path) -> Scenario:
         """Load a shipped scenario by name, or a user's .toml file.
 
         :raises ConfigurationError: absent, not TOML, or not a scenario; names the file and the key.
@@ -208,11 +241,12 @@ class Scenario:
         return dataclasses.replace(self.excitation, phase=rng.random()) if self.random_phase else self.excitation
 
     @classmethod
-    def of_program(cls, program: Program) -> Scenario:
+    def of_program(cls, program: Program | str) -> Scenario:
         """Scenario that changes the first parameter once, by a fifth as far as its range allows.
 
         The excitation is a square wave between the levels of the program's trial play.
         """
+        program = Program.of(program, "program")
         driven = program.channels[0]
         volts = program.circuit.scales.volts(driven)
         low_v, high_v = (level * volts for level in program.equations.inputs[driven].trial)
@@ -224,11 +258,12 @@ class Scenario:
         excitation = Excitation(low_v=low_v, high_v=high_v)
         return cls(1500, excitation, program, tweaks=tweaks, random_phase=True, name=program.name)
 
-    def on_program(self, program: Program) -> Scenario:
+    def on_program(self, program: Program | str) -> Scenario:
         """The same scenario on another program; its parameters are those of the same name or alias.
 
         :raises ConfigurationError: the program lacks a parameter of the scenario.
         """
+        program = Program.of(program, "program")
 
         def renamed(values: Mapping[str, float]) -> dict[str, float]:
             names = {name: program.names.get(self.program.parameters[name].alias, name) for name in values}
@@ -249,6 +284,10 @@ class Scenario:
         """Plant before the first change."""
         return Plant.of(self.program, self.set)
 
+    def poles(self, period_s: float) -> tuple[complex, ...]:
+        """Poles of the plant as the scenario begins, one step a sample of ``period_s`` in problem time."""
+        return self.program.poles(self.plant.values, period_s)
+
     def segments(self) -> tuple[Segment, ...]:
         """True plant from the start and after each change."""
         return segments_of(self.plant, self.tweaks)
@@ -263,6 +302,16 @@ def segments_of(plant: Plant, tweaks: Iterable[PotChange]) -> tuple[Segment, ...
             continue  # a pot set to where it stood changes nothing, and nothing can be detected
         out.append(Segment(tweak.sample, changed, tweak.ramp_n))
     return tuple(out)
+
+
+def check_seed(seed: Any) -> int:
+    """Return ``seed``.
+
+    :raises ConfigurationError: it is no whole number from 0 to 2^63 - 1.
+    """
+    if isinstance(seed, int | np.integer) and not isinstance(seed, bool) and 0 <= seed < MOST_SEED:
+        return int(seed)
+    raise ConfigurationError(f"seed must be a whole number from 0 to 2^63 - 1, not {str(seed)[:40]!r}")
 
 
 def program_of(table: Any, where: str) -> Program:

@@ -10,6 +10,9 @@ from typing import BinaryIO
 
 from analogrig.errors import RecordingError
 
+__all__ = ["replace_file"]
+"""Names for packages beside the core."""
+
 
 @contextlib.contextmanager
 def replace_file(path: Path) -> Iterator[BinaryIO]:

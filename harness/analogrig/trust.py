@@ -22,6 +22,9 @@ from typing import Literal, Self
 from analogrig import config
 from analogrig.errors import ConfigurationError
 
+__all__ = ["Thing", "absolute_path", "absolute_port"]
+"""Names for packages beside the core."""
+
 OPTION = "--allow"
 
 MOST_NAME = 4096

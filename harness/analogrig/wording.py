@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+__all__ = ["counter_text", "number_of", "one_line"]
+"""Names for packages beside the core."""
+
 MOST_MESSAGE = 1_000
 """Characters of a message: paths and values from files are of any length."""
 

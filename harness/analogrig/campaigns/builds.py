@@ -13,7 +13,7 @@ from pathlib import Path
 
 import analogrig
 import analogrig_emulator
-from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import DeviceDescription
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 from analogrig.identity import version

@@ -343,8 +343,6 @@ def load(path: Path) -> Recorded | Campaign:
             raise RecordingError(f"{path}: holds no valid trial")
         return side
     with Store.read(path) as store:
-        if not store.is_ended:
-            raise RecordingError(f"{path}: a campaign that has not ended: the command that began it goes on")
         plan = store.plan()
         store.check_whole(plan)
         return Campaign(path, plan)

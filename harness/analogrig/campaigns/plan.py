@@ -22,14 +22,15 @@ from analogrig import config
 from analogrig.campaigns import builds
 from analogrig.campaigns.spec import MAX_CELLS, MAX_TRIALS, CampaignSpec, corners
 from analogrig.campaigns.trials import MOST_ERRORS
-from analogrig.devices.description import DeviceDescription
+from analogrig.datasheet import Datasheet
+from analogrig.devices.device import DeviceDescription
 from analogrig.devices.library import LIBRARY
 from analogrig.devices.registry import from_table, trusted
 from analogrig.errors import ConfigurationError
 from analogrig.plant import Plant
 from analogrig.rigs.description import from_table as rig_of
 from analogrig.rigs.description import open_rig
-from analogrig.rigs.emulator import is_emulated
+from analogrig.rigs.emulator import SetUp, is_emulated
 from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.scenario import PotChange, Scenario
 from analogrig.trust import Trust
@@ -40,6 +41,9 @@ _DRAWS = 20_000
 
 SHOWN, LONGEST = 3, 60
 """Number of differences named in one line, and characters shown of each value."""
+
+_NEAR_STOP = 0.005
+"""Part of a track at its ends that not every draw of parts reaches."""
 
 _ABSENT = object()
 
@@ -186,6 +190,13 @@ class Plan:
         """Number of samples of each trial."""
         return self._base.samples
 
+    @property
+    def most_alarms(self) -> list[int]:
+        """Largest number of alarms of a trial, by cell, from the data sheets of the devices."""
+        tables = (table if "estimator" in table else {"datasheet": {}, **table} for table in self.devices)
+        by_device = [Datasheet.recorded(table).most_alarms(self.samples) for table in tables]
+        return [by_device[cell.device] for cell in self.cells()]
+
     @functools.cached_property
     def _base(self) -> Scenario:
         """Scenario before the values of a cell are set."""
@@ -254,16 +265,47 @@ class Plan:
                 problem = self._problem(cell, drawn)
                 if problem:
                     raise ConfigurationError(f"{where}: {self._blame(cell, drawn, opposite)}{problem}")
+            self._check_parts(cell)
 
-    def _problem(self, cell: Cell, drawn: Mapping[str, float]) -> str:
+    def _check_parts(self, cell: Cell) -> None:
+        """Set up every trial of a cell in which a pot comes near a stop, where only some draws of parts reach.
+
+        :raises ConfigurationError: a trial cannot be set up.
+        """
+        spec = self.spec
+        if not any(self._nears_a_stop(cell, corner) for corner in (*corners(spec.draw), self.draw(spec.first_seed))):
+            return
+        for seed in range(spec.first_seed, spec.first_seed + spec.trials):
+            problem = self._problem(cell, self.draw(seed), seed)
+            if problem:
+                raise ConfigurationError(f"campaign {spec.name}: trial of seed {seed}: {problem}")
+
+    def _machine(self, cell: Cell, drawn: Mapping[str, float], seed: int) -> SetUp | None:
+        """Machine of a trial on an emulated rig; None on another rig.
+
+        :raises ConfigurationError: it cannot be set up.
+        """
+        case = self.case(cell, seed, drawn)
+        if "card" in case.rig and is_emulated(rig := open_table(case.rig)):
+            return rig.set_up(case.scenario, case.seed)
+        return None
+
+    def _problem(self, cell: Cell, drawn: Mapping[str, float], seed: int | None = None) -> str:
         """Reason why such a trial cannot be set up on an emulated rig; empty if it can."""
         try:
-            case = self.case(cell, self.spec.first_seed, drawn)
-            if "card" in case.rig and is_emulated(rig := open_table(case.rig)):
-                rig.set_up(case.scenario, case.seed)
+            self._machine(cell, drawn, self.spec.first_seed if seed is None else seed)
         except ConfigurationError as error:
             return str(error)
         return ""
+
+    def _nears_a_stop(self, cell: Cell, drawn: Mapping[str, float]) -> bool:
+        """True if a pot of a trial comes near an end of its track."""
+        machine = self._machine(cell, drawn, self.spec.first_seed)
+        if machine is None:
+            return False
+        turns = [machine.computer.dials_for(**turn.values) for turn in machine.changes]
+        dials = [dial for each in (machine.computer.dials, *turns) for dial in each.values()]
+        return not all(_NEAR_STOP < dial < 1.0 - _NEAR_STOP for dial in dials)
 
     def _blame(self, cell: Cell, corner: dict[str, float], opposite: dict[str, float]) -> str:
         """Error prefix with the drawn value at fault.

@@ -14,15 +14,16 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from analogrig.bench import Bench, DirectBench, can_be_direct, direct_bench, raise_if_interrupted
+from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.campaigns import builds
 from analogrig.campaigns.plan import Case, Cell, Part, Plan, device_of, open_table
 from analogrig.campaigns.rows import Row, row, row_of_none
+from analogrig.campaigns.together import DirectBench, can_be_direct, direct_bench, judge_all
 from analogrig.campaigns.trials import Trials
 from analogrig.devices.device import Device
 from analogrig.errors import AnalogrigError, ConfigurationError, DeviceError, LinkError, RigError
-from analogrig.judging.exposure import exposure
-from analogrig.judging.verdict import invalid_reasons, judge_all
+from analogrig.judging.exposure import exposure, exposures, until_latched
+from analogrig.judging.verdict import invalid_reasons
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run
 
@@ -201,12 +202,18 @@ class Count:
     """Reason why the trial is no evidence; empty if it is."""
 
 
-def count_alarms(case: Case) -> Count:
-    """Count the alarms of a case by the fastest available way; errors as ``_Benches.play``."""
-    run = _benches.play(case, alarms_only=True)
-    shown = exposure(run)
-    faults = invalid_reasons(run, shown, case.scenario.expect)
-    return Count(len(run.alarm_index), shown.armed, f"seed {case.seed}: {faults[0]}" if faults else "")
+def count_alarms(case: Case, seeds: Sequence[int]) -> list[Count]:
+    """Count the alarms of a case with each seed by the fastest available way; errors as ``_Benches.play``."""
+    runs = _benches.play_together(case, seeds) if len(seeds) > 1 else []
+    runs = runs or [_benches.play(dataclasses.replace(case, seed=seed), alarms_only=True) for seed in seeds]
+    alike = runs[0].records == runs[-1].records
+    shown = exposures(runs) if alike else [exposure(run) for run in runs]
+    counts = []
+    for seed, run, each in zip(seeds, runs, shown, strict=True):
+        faults = invalid_reasons(run, each, case.scenario.expect)
+        alarms = len(until_latched(run).alarm_index)
+        counts.append(Count(alarms, each.armed, f"seed {seed}: {faults[0]}" if faults else ""))
+    return counts
 
 
 @functools.lru_cache(maxsize=2)

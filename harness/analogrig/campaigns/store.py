@@ -135,10 +135,12 @@ class Store:
         return RecordingError(f"{self.path}: damaged results of a campaign ({what}): {cure}")
 
     def check_whole(self, plan: Plan) -> None:
-        """Check that an ended campaign has as many trials of each cell as its summary says.
+        """Check that the campaign has ended, with as many trials of each cell as its summary says.
 
-        :raises RecordingError: trials were removed or added.
+        :raises RecordingError: it has not, or trials were removed or added.
         """
+        if not self.is_ended:
+            raise RecordingError(f"{self.path}: a campaign that has not ended: the command that began it goes on")
         found, trials = [0] * plan.size, plan.spec.trials
         with self._wrapped(), self._checked():
             for first, count in self._file.execute("SELECT first, count FROM trials"):

@@ -6,6 +6,7 @@ numbers are taken one by one, so that the result does not depend on how the tria
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Self
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.campaigns.trials import EXISTS, FAILED, INCONCLUSIVE, LATE, MISSED, MOST_ERRORS, OUTCOMES, PASSED, Trials
-from analogrig.judging.bursts import BURST, ConfidenceSequence, dispersion
+from analogrig.judging.betting import BettingSequence
 
 CONFIDENCE = 0.95
 """Confidence level of the bounds in the tables; they hold at any stopping time of a campaign."""
@@ -25,13 +26,8 @@ COUNTED = ("samples", "armed", "false_alarms", "visible", "missed")
 ``armed``: samples in which the trigger was armed; ``visible``: detectable changes; ``missed``: those without an alarm.
 """
 
-_PER_BLOCK = ("false_alarms", "armed", "missed", "visible")
-
 MOST_NOT_PASSED = 3
 """Largest number of trials of a cell that are named because they have not passed."""
-
-MOST_BLOCKS = 1000
-"""Largest number of blocks whose counts are kept for a test of dispersion."""
 
 ERROR_STEP, ERROR_BINS = 0.01, 200
 """Width and number of the bins of relative errors, around 0; two more hold what is beyond."""
@@ -48,19 +44,15 @@ class Rate:
     exposure: str
     unit: str
     """Unit of the exposure, in words."""
-    burst: float
-    """Mean number of events of a burst that the bounds cover."""
-
-    def sequence(self, counted: Mapping[str, int], confidence: float, burst: float = 1.0) -> ConfidenceSequence:
-        """Confidence sequence for the rate; ``burst``: mean number of events of a burst, where more were observed."""
-        burst = max(burst, self.burst)
-        return ConfidenceSequence(confidence, burst, trials=counted[self.exposure], events=counted[self.events])
 
 
-RATES = {
-    rate.events: rate
-    for rate in (Rate("missed", "visible", "changes", 1.0), Rate("false_alarms", "armed", "samples", BURST))
-}
+RATES = {rate.events: rate for rate in (Rate("missed", "visible", "changes"), Rate("false_alarms", "armed", "samples"))}
+
+
+def independent(events: int, exposure: int, confidence: float = CONFIDENCE) -> BettingSequence:
+    """Confidence sequence with two-sided ``confidence`` where each unit of the exposure is a play of its own."""
+    plays = Counter({(1, 1): events, (0, 1): exposure - events})
+    return BettingSequence(0.5 * (1.0 + confidence), most=1, longest=1, plays=+plays)
 
 
 class Histogram:
@@ -95,31 +87,12 @@ class Histogram:
         return float(self.values[np.searchsorted(np.cumsum(self.counts), -(-percent * total // 100))])
 
 
-class Blocks:
-    """Counts of consecutive trials in at most MOST_BLOCKS blocks; neighbours are merged as trials are added."""
-
-    def __init__(self) -> None:
-        self.counts: NDArray[np.int64] = np.zeros((0, len(_PER_BLOCK)), np.int64)
-        """(blocks, 4): one column for each of ``false_alarms``, ``armed``, ``missed``, ``visible``."""
-        self._trials, self._size = 0, 1
-
-    def add(self, rows: NDArray[np.int64]) -> None:
-        """Add the counts (n, 4) of n trials."""
-        block = (self._trials + np.arange(len(rows))) // self._size
-        self._trials += len(rows)
-        whole = np.zeros((-(-self._trials // self._size), rows.shape[1]), np.int64)
-        whole[: len(self.counts)] = self.counts
-        np.add.at(whole, block, rows)
-        while len(whole) > MOST_BLOCKS:
-            whole = np.add.reduceat(whole, np.arange(0, len(whole), 2))
-            self._size *= 2
-        self.counts = whole
-
-
 @dataclass
 class Aggregate:
     """Aggregates of the trials of a cell, or of all cells."""
 
+    most_alarms: int = 0
+    """Largest number of alarms that a trial can have; 0: one a sample."""
     trials: int = 0
     passed: int = 0
     failed: int = 0
@@ -133,7 +106,10 @@ class Aggregate:
     error_squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(MOST_ERRORS))
     """Sums over the trials with an estimate, and their number."""
     estimates: int = 0
-    blocks: list[Blocks] = field(default_factory=lambda: [Blocks()])
+    plays: dict[str, Counter[tuple[int, int]]] = field(default_factory=lambda: {name: Counter() for name in RATES})
+    """Number of valid trials by events and exposure, for each of RATES."""
+    longest: dict[str, int] = field(default_factory=lambda: dict.fromkeys(RATES, 1))
+    """Largest exposure that a trial can have, for each of RATES."""
     doubt: str = ""
     """Seed of the first inconclusive trial, with the reason; empty if there is none."""
     not_passed: list[tuple[int, str, str]] = field(default_factory=list)
@@ -164,7 +140,12 @@ class Aggregate:
         }
         for name, counts in by_trial.items():
             self.counted[name] += int(counts.sum(dtype=np.int64))
-        self.blocks[-1].add(np.stack([by_trial[name].astype(np.int64) for name in _PER_BLOCK], axis=1))
+        self.longest["missed"] = max(self.longest["missed"], change.shape[1])
+        self.longest["false_alarms"] = max(self.longest["false_alarms"], int(by_trial["samples"].max(initial=1)))
+        for rate in RATES.values():
+            both = (by_trial[rate.events].astype(np.int64) << 32) + by_trial[rate.exposure].astype(np.int64)
+            for key, times in zip(*(each.tolist() for each in np.unique(both, return_counts=True)), strict=True):
+                self.plays[rate.events][key >> 32, key & 0xFFFFFFFF] += times
         self.late += int((exists & ((change & LATE) > 0)).sum())
         detected = exists & (latency_n >= 0)
         self.latency_n.add(latency_n[detected])
@@ -182,17 +163,25 @@ class Aggregate:
     @classmethod
     def merged(cls, parts: Iterable[Aggregate]) -> Self:
         """Aggregate of all of them, in this order."""
-        whole = cls(blocks=[])
+        whole = cls()
         for each in parts:
+            whole.most_alarms = max(whole.most_alarms, each.most_alarms)
             for name in ("trials", "passed", "failed", "inconclusive", "late", "bound_n", "bounds", "estimates"):
                 setattr(whole, name, getattr(whole, name) + getattr(each, name))
             for name in COUNTED:
                 whole.counted[name] += each.counted[name]
             whole.latency_n.add(each.latency_n.values, each.latency_n.counts)
             whole.error_squares = whole.error_squares + each.error_squares
-            whole.blocks += each.blocks
+            for name in RATES:
+                whole.plays[name] += each.plays[name]
+                whole.longest[name] = max(whole.longest[name], each.longest[name])
             whole.doubt = whole.doubt or each.doubt
         return whole
+
+    def sequence(self, name: str, confidence: float = CONFIDENCE) -> BettingSequence:
+        """Confidence sequence of one of RATES, with two-sided ``confidence``."""
+        most = self.most_alarms if name == "false_alarms" and self.most_alarms else self.longest[name]
+        return BettingSequence(0.5 * (1.0 + confidence), most, self.longest[name], self.plays[name])
 
 
 @dataclass(frozen=True)
@@ -226,8 +215,7 @@ class Summary:
     @classmethod
     def of(cls, found: Aggregate, estimates: Sequence[str]) -> Summary:
         """Summary of an aggregate; ``estimates``: names of the estimated parameters."""
-        blocks = np.concatenate([each.counts for each in found.blocks])
-        rates = {name: _bounds(rate, found.counted, blocks) for name, rate in RATES.items()}
+        rates = {name: found.sequence(name).bounds for name in RATES}
         rms = np.sqrt(found.error_squares / max(1, found.estimates)).tolist()
         return cls(
             **found.counted,
@@ -244,13 +232,6 @@ class Summary:
             error=dict(zip(estimates, rms, strict=False)) if found.estimates else {},
             doubt=found.doubt,
         )
-
-
-def _bounds(rate: Rate, counted: Mapping[str, int], blocks: NDArray[np.int64]) -> tuple[float, float]:
-    """Bounds of a rate over valid trials; they cover the bursts that its counts by block show."""
-    events, exposure = (blocks[:, _PER_BLOCK.index(name)].tolist() for name in (rate.events, rate.exposure))
-    shown = dispersion(events, exposure)
-    return rate.sequence(counted, CONFIDENCE, shown.burst).bounds
 
 
 class Distribution:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 from analogrig.campaigns.plan import Part, Plan
-from analogrig.campaigns.summary import COUNTED, RATES, Aggregate, Distribution
+from analogrig.campaigns.summary import COUNTED, Aggregate, Distribution
 from analogrig.campaigns.trials import MOST_TRIALS, Trials
 from analogrig.judging.statistics import Decision
 
@@ -27,7 +27,7 @@ class Tally:
 
         :param read: returns the trials of a part that came before those in front of it.
         """
-        self.cells = [Aggregate() for _ in range(plan.size)]
+        self.cells = [Aggregate(most) for most in plan.most_alarms]
         self.distribution = Distribution(plan.spec.draw)
         self.trials = 0
         self._plan, self._read = plan, read
@@ -59,7 +59,7 @@ class Tally:
             self.trials += len(portion)
             start, step = start + len(portion), chunk
             if stop is not None and cell.trials % chunk == 0:
-                known = RATES[stop.quantity].sequence(cell.counted, stop.confidence)
+                known = cell.sequence(stop.quantity, stop.confidence)
                 self._decided[part.cell] = known.decision(stop.rate) is not Decision.OPEN
 
     def has_ended(self, cell: int) -> bool:

@@ -149,11 +149,11 @@ def progress(plan: Plan) -> Callable[[Tally], None] | None:
     line = open_progress_line()
     if line is None:
         return None
-    from analogrig.reporting.campaign import anytime_text
+    from analogrig.reporting.campaign import counts_text
 
     most = len(plan.cells()) * plan.spec.trials
 
     def tell(tally: Tally) -> None:
-        line.show(f"{tally.trials} of {most} trials; {anytime_text(tally.total())}", is_last=tally.trials == most)
+        line.show(f"{tally.trials} of {most} trials; {counts_text(tally.total())}", is_last=tally.trials == most)
 
     return tell

@@ -9,14 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.campaign import add_workers, begin, workers
 from analogrig.cli.options import DUT, RIG_NAMES, SCENARIO, add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, open_progress_line, show, show_result
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, USAGE, complain, open_progress_line, show, show_result
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     from analogrig.campaigns.certificate import Certificate, Question
-
-_ESTIMATES = 64
-"""Default number of estimates of a rare rate."""
 
 _STATUS = {"certified": PASSED, "refuted": FAILED, "inconclusive": INCONCLUSIVE}
 
@@ -27,8 +24,7 @@ def add(commands: Any) -> None:
         "certify",
         "prove with confidence that a device raises false alarms rarely enough",
         "certify --far 1e-4 --confidence 0.99 --dut inproc",
-        "certify --sequential --dut inproc",
-        "certify --rare --far 5e-6 --dut inproc",
+        "certify --far 1e-5 --bounds bursts --dut inproc",
     )
     command.add_argument(
         "--far", type=float, default=1e-5, metavar="RATE", help="false-alarm rate per sample (default: %(default)g)"
@@ -39,26 +35,18 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--allowed",
         type=int,
-        default=50,
         metavar="N",
-        help="most alarms with which a test of fixed length passes (default: %(default)d)",
+        help="most alarms with which a test of fixed length passes (default: 50); only with bursts or independent",
     )
     command.add_argument(
-        "--burst",
-        type=float,
-        default=5.0,
-        metavar="N",
-        help="mean number of alarms of a burst that the bounds cover (default: %(default)g; 1: independent alarms)",
+        "--bounds",
+        choices=("betting", "bursts", "independent"),
+        help="method by its assumption on alarms within a play (default: betting, which has none)",
     )
-    command.add_argument("--sequential", action="store_true", help="stop as soon as the data decide at --confidence")
     command.add_argument(
-        "--rare",
-        type=int,
-        nargs="?",
-        const=_ESTIMATES,
-        metavar="N",
-        help=f"number of plays for a rare rate, at least 64 (default: {_ESTIMATES})",
+        "--burst", type=float, metavar="N", help="bounds that assume bursts of N alarms on average (default: 5)"
     )
+    command.add_argument("--samples", type=int, metavar="N", help="samples of each play (default: chosen)")
     command.add_argument(
         "--scenario", default="healthy", metavar=SCENARIO, help="scenario without changes (default: %(default)s)"
     )
@@ -80,9 +68,12 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.campaigns.certificate import Question, certify
     from analogrig.campaigns.plan import device_of, device_table, one_worker_only, rig_table
     from analogrig.errors import DeviceError, LinkError, RigError, WorkerError
+    from analogrig.judging.bursts import BURST
     from analogrig.rigs.description import DEFAULT_RIG
     from analogrig.scenario import Scenario
 
+    if arguments.burst is not None and arguments.bounds not in (None, "bursts"):
+        return complain(f"certify: --burst belongs to --bounds bursts, not to {arguments.bounds}", USAGE)
     trust = trust_of(arguments)
     scenario = Scenario.load(arguments.scenario)
     question = Question(
@@ -92,9 +83,10 @@ def _run(arguments: argparse.Namespace) -> int:
         far=arguments.far,
         confidence=arguments.confidence,
         allowed=arguments.allowed,
-        burst=arguments.burst,
-        sequential=arguments.sequential,
-        rare=arguments.rare,
+        burst=arguments.burst
+        if arguments.burst is not None
+        else {"bursts": BURST, "independent": 1.0}.get(arguments.bounds),
+        samples=arguments.samples,
         first_seed=arguments.seed,
     )
     try:
@@ -110,22 +102,24 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _sentence(question: Question, answer: Certificate) -> str:
-    way = "sequential test" if question.sequential else f"fixed length, at most {question.allowed} alarms allowed"
-    way = way if question.rare is None else "a rare rate"
     return (
         f"{question.device['name']} on {question.rig['name']}: at most {question.far:g} false alarms per sample,"
-        f" confidence {question.confidence:g} ({way}): {answer.outcome.upper()}\n  {answer.reason}"
-        + (f"\n  bounds for {answer.basis}" if answer.basis else "")
+        f" confidence {question.confidence:g} ({_way(question)}): {answer.outcome.upper()}\n  {answer.reason}"
     )
 
 
+def _way(question: Question) -> str:
+    """Method with its assumption."""
+    if question.burst is None:
+        return f"betting, nothing assumed within a play of {number_of(question.play_n, 'sample')}"
+    assumed = "independent alarms" if question.burst == 1.0 else f"bursts of {question.burst:g} alarms on average"
+    return f"{assumed} assumed, fixed length, at most {question.allowed_alarms} alarms allowed"
+
+
 def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
-    asked = {
-        name: getattr(question, name)
-        for name in ("far", "confidence", "allowed", "burst", "sequential", "rare", "first_seed")
-    }
+    asked = {name: getattr(question, name) for name in ("far", "confidence", "allowed", "burst", "first_seed")}
     names = {"rig": question.rig["name"], "dut": question.device["name"], "scenario": question.scenario.name}
-    return {**names, **asked, **vars(answer)}
+    return {**names, **asked, "play_samples": question.play_n, **vars(answer)}
 
 
 def _progress() -> Callable[[int, int, int], None] | None:

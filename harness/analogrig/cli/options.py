@@ -114,6 +114,7 @@ seed = _number_in(0, 2**63 - 1, "a whole number from 0 to 2^63 - 1", int)
 count = _number_in(0, 999_999_999, "a whole number from 0 to 999999999", int)
 factor = _number_in(1e-3, 1e6, "a number from 0.001 to 1000000", float)
 seconds = _number_in(1e-3, 1e9, "a number of seconds from 0.001 to 1e9", float)
+port = _number_in(0, 65535, "a whole number from 0 to 65535", int)
 
 
 def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = "$ANALOGRIG_DUT or host") -> None:
@@ -214,6 +215,13 @@ def add_capture(command: argparse.ArgumentParser) -> None:
     command.add_argument("--dbc", type=Path, metavar=FILE, help="message catalogue of a CAN log (default: ours)")
     command.add_argument("--run", type=count, metavar="N", help="number of the run in a CAN log, from 1")
     command.add_argument(
+        "--channel",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="channel of a CAN log with several buses, such as can0; may be repeated",
+    )
+    command.add_argument(
         "--most-lost", type=count, default=0, metavar="N", help="samples that a CAN log may lack (default: %(default)s)"
     )
 
@@ -229,16 +237,19 @@ def load_capture(arguments: argparse.Namespace) -> Run:
     :raises RecordingError: it cannot be read.
     :raises ConfigurationError: it is a CAN log, and the scenario is not given, or not the one.
     """
-    from analogrig.errors import ConfigurationError
-    from analogrig.recordings import import_run, replace_scenario
-    from analogrig.rigs.description import open_rig
     from analogrig.run import Run
     from analogrig.scenario import Scenario
 
     scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
-    if not is_capture(arguments.file):
-        run = Run.load(arguments.file)
-        return run if scenario is None else replace_scenario(run, scenario)
+    if scenario is None and not is_capture(arguments.file):
+        return Run.load(arguments.file)  # without the readers of CAN logs, which take a second to import
+
+    from analogrig.errors import ConfigurationError
+    from analogrig.recordings import import_run, replace_scenario
+    from analogrig.rigs.description import open_rig
+
+    if scenario is not None and not is_capture(arguments.file):
+        return replace_scenario(Run.load(arguments.file), scenario)
     if scenario is None:
         raise ConfigurationError(f"{arguments.file}: a CAN log does not name its scenario: name one with --scenario")
     device = None if arguments.log_dut is None else _described_ecu(arguments.log_dut)
@@ -253,6 +264,7 @@ def load_capture(arguments: argparse.Namespace) -> Run:
             device=device,
             number=arguments.run,
             most_lost_n=arguments.most_lost,
+            channels=arguments.channel,
         )
 
 

@@ -70,11 +70,18 @@ def add_replay(commands: Any) -> None:
         "replay build/run/run.npz",
         "replay build/run/run.npz --dut mean-between-faults --out build/mean",
         "replay build/can/can.log --scenario thesis --dut inproc",
+        "replay --compare build/run/run.npz",
     )
     command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
     add_capture(command)
     command.set_defaults(log_dut=None)
     add_dut(command, default=None, shown="that of the recording")
+    command.add_argument(
+        "--compare",
+        action="store_true",
+        help="compare the answers with those of the bundled library in process, as [estimator] of the device file"
+        " configures it, and name the cause of differences: the recorded answers, or with --dut those of a new play",
+    )
     _add_output(command, "build/replay")
     _add_play(command)
     command.set_defaults(command=_replay)
@@ -125,15 +132,17 @@ def _add_play(command: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     with _output_folder(arguments) as output, open_what_to_play(arguments) as (rig, scenario, seed):
-        from analogrig.devices.opening import open_dut
+        from analogrig.devices.registry import open_dut
 
         device = functools.partial(open_dut, arguments.dut or scenario.dut or "host")
         return _play(rig, scenario, seed, device, output, arguments)
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    if arguments.compare:
+        return _compare(arguments)
     with _output_folder(arguments) as output:
-        from analogrig.devices.opening import open_dut, reopen_dut
+        from analogrig.devices.registry import open_dut, reopen_dut
         from analogrig.errors import ConfigurationError
         from analogrig.rigs.recording import RecordingRig
 
@@ -147,6 +156,32 @@ def _replay(arguments: argparse.Namespace) -> int:
             if arguments.dut:
                 device = functools.partial(open_dut, arguments.dut)
             return _play(rig, rig.scenario(), conditions.seed, device, output, arguments)
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    """Compare the recorded answers, or those of a new play, with the bundled library. Nothing is written."""
+    from analogrig.bench import Bench, raise_if_interrupted
+    from analogrig.claims.comparison import compare_with_library
+    from analogrig.devices.registry import open_dut
+    from analogrig.rigs.recording import RecordingRig
+
+    run = load_capture(arguments)
+    if arguments.dut is not None:
+        rig = RecordingRig.of(run, arguments.file)
+        with open_dut(arguments.dut, allow=trust_of(arguments), **changes_of_dut(arguments)) as dut:
+            bench = Bench(rig, dut, progress_line(), time_limit_s=arguments.time_limit)
+            run = raise_if_interrupted(bench.play(rig.scenario(), run.conditions.seed))
+    with show_work("comparing"):
+        comparison = compare_with_library(run)
+    if arguments.json:
+        show_json(comparison.as_table() | {"faults": list(run.conditions.faults)})
+    else:
+        show(comparison.text())
+    if not comparison.agrees:
+        return STATUS["failed"]
+    if run.conditions.faults:
+        return complain(f"INCONCLUSIVE: {run.conditions.faults[0]}", INCONCLUSIVE)
+    return 0
 
 
 def _judge(arguments: argparse.Namespace) -> int:

@@ -6,7 +6,8 @@ Verdicts are coloured and progress is shown on terminals only. Files, pipes and 
 from __future__ import annotations
 
 import contextlib
-import json
+import errno
+import fcntl
 import math
 import os
 import re
@@ -51,7 +52,7 @@ def complain(message: str, status: int) -> int:
 
 def show(text: str) -> None:
     """Print text for people on standard output."""
-    _show(_colour(f"{printable(text)}\n", sys.stdout))
+    _show(_colour(f"{printable(text)}\n", _Results.stream()))
 
 
 def show_plain(text: str) -> None:
@@ -61,6 +62,8 @@ def show_plain(text: str) -> None:
 
 def show_json(value: Any) -> None:
     """Print one JSON object on standard output. JSON has no NaN or infinity: they become null."""
+    import json  # here, for --help needs none
+
     show_plain(json.dumps(_finite(value), allow_nan=False))
 
 
@@ -83,10 +86,65 @@ def _finite(value: Any) -> Any:
     return value
 
 
+class _Results:
+    """Standard output of the results, while ``keep_results_apart`` is in force."""
+
+    own: ClassVar[TextIO | None] = None
+    are_lost: ClassVar[bool] = False
+    """True if some could not be written."""
+
+    @classmethod
+    def stream(cls) -> TextIO:
+        return cls.own or sys.stdout
+
+
+@contextlib.contextmanager
+def keep_results_apart() -> Iterator[None]:
+    """Send to standard error what anything but this module prints on standard output: libraries and foreign code."""
+    before = sys.stdout
+    with contextlib.ExitStack() as stack:
+        _Results.own = before
+        if _is_descriptor(before, 1):
+            before.flush()
+            saved = fcntl.fcntl(1, fcntl.F_DUPFD_CLOEXEC, 3)
+            _Results.own = stack.enter_context(open(saved, "w", encoding=before.encoding, errors=before.errors))  # noqa: PTH123 - a descriptor
+            os.dup2(2, 1)
+            stack.callback(os.dup2, saved, 1)  # before the stream closes ``saved``
+            import ctypes  # here, for --help needs none
+
+            stack.callback(ctypes.CDLL(None).fflush, None)  # and before that: what a C library still holds
+        sys.stdout = sys.stderr
+        try:
+            yield
+        finally:
+            sys.stdout, _Results.own = before, None
+
+
+def output_for_command() -> TextIO | None:
+    """Standard output for a command of the user; None: that of this process."""
+    own = _Results.own
+    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor
+        return own if own is not None and own.fileno() != 1 else None
+    return None
+
+
+def _is_descriptor(stream: TextIO, number: int) -> bool:
+    with contextlib.suppress(OSError, ValueError):  # io.UnsupportedOperation is both
+        return stream.fileno() == number
+    return False
+
+
+def end_output(status: int) -> int:
+    """Write what standard output still holds; return INCONCLUSIVE instead of PASSED if some of it could not be."""
+    _show("")
+    return INCONCLUSIVE if status == PASSED and _Results.are_lost else status
+
+
 def _show(text: str) -> None:
     """Print on standard output. A reader that is gone changes nothing about the command's status."""
-    error = _print(text, sys.stdout)
+    error = _print(text, _Results.stream())
     if error is not None:
+        _Results.are_lost = _Results.are_lost or error.errno != errno.EPIPE
         _print(f"analogrig: standard output: {error.strerror}\n", sys.stderr)
 
 
@@ -135,6 +193,7 @@ def _is_terminal(stream: TextIO) -> bool:
 
 def open_standard_streams() -> None:
     """Open the standard streams that the caller closed, so that no file opened later takes their number."""
+    _Results.are_lost = False
     for name, number in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)

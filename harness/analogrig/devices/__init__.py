@@ -11,7 +11,8 @@ describe       ``AdaptedDescription`` (base class), ``DeviceDescription``, ``Cap
 state          ``Datasheet``, ``ModelOrders``
 answer         ``Device`` (base class), ``Samples``, ``Answers``, ``RaisedAlarm``, ``ReportedDiagnosis``,
                ``ReportedMisfit``
-flags          ``SteppedFlag``, ``LOST``, ``UNREPORTED``, ``UNARMED``
+flags          ``SteppedFlag``, ``LOST``, ``UNREPORTED``, ``UNARMED``; ``Cause``, ``Change`` of our catalogue
+ours           ``Estimator``, the core in this process; ``HostDevice``; ``trusted``, a description by its name
 errors         ``DeviceRefused``, ``LinkClosed``, ``TimeLimitReached``; ``analogrig`` has more
 =============  ==========================================================================================
 
@@ -26,11 +27,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
-    from analogrig.catalogue import SteppedFlag
+    from analogrig.catalogue import Cause, Change, SteppedFlag
     from analogrig.datasheet import Datasheet, ModelOrders
-    from analogrig.devices.adapted import AdaptedDescription
-    from analogrig.devices.description import Capability, DeviceDescription
-    from analogrig.devices.device import Device
+    from analogrig.devices.device import AdaptedDescription, Capability, Device, DeviceDescription
+    from analogrig.devices.estimator import Estimator
+    from analogrig.devices.processes import HostDevice
+    from analogrig.devices.registry import trusted
     from analogrig.errors import DeviceRefused, LinkClosed, TimeLimitReached
     from analogrig.run import LOST, UNARMED, UNREPORTED
     from analogrig.trust import Thing
@@ -41,11 +43,12 @@ else:
         __name__,
         {
             "analogrig.answers": "Answers RaisedAlarm ReportedDiagnosis ReportedMisfit Samples",
-            "analogrig.catalogue": "SteppedFlag",
+            "analogrig.catalogue": "Cause Change SteppedFlag",
             "analogrig.datasheet": "Datasheet ModelOrders",
-            "analogrig.devices.adapted": "AdaptedDescription",
-            "analogrig.devices.description": "Capability DeviceDescription",
-            "analogrig.devices.device": "Device",
+            "analogrig.devices.device": "AdaptedDescription Capability Device DeviceDescription",
+            "analogrig.devices.estimator": "Estimator",
+            "analogrig.devices.processes": "HostDevice",
+            "analogrig.devices.registry": "trusted",
             "analogrig.errors": "DeviceRefused LinkClosed TimeLimitReached",
             "analogrig.run": "LOST UNARMED UNREPORTED",
             "analogrig.trust": "Thing",
@@ -59,10 +62,14 @@ __all__ = [
     "AdaptedDescription",
     "Answers",
     "Capability",
+    "Cause",
+    "Change",
     "Datasheet",
     "Device",
     "DeviceDescription",
     "DeviceRefused",
+    "Estimator",
+    "HostDevice",
     "LinkClosed",
     "ModelOrders",
     "RaisedAlarm",
@@ -72,4 +79,5 @@ __all__ = [
     "SteppedFlag",
     "Thing",
     "TimeLimitReached",
+    "trusted",
 ]

@@ -1,34 +1,104 @@
-"""Devices of the kind ``can``: a node on a CAN bus that python-can can open."""
+"""CAN buses that python-can can open, and devices of the kind ``can``: a node there."""
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from urllib.parse import quote, urlencode
 
-from analogrig.devices.can_description import CanBusDescription
-from analogrig.devices.catalogue_description import FrameDevice
+from analogrig.devices.catalogue_device import CatalogueDescription
 from analogrig.devices.child import Child
-from analogrig.devices.host import host_child, host_program_for
 from analogrig.devices.library import library_for
+from analogrig.devices.processes import host_child, host_program_for
 from analogrig.errors import ConfigurationError
+from analogrig.links.line import CanLine
+from analogrig.trust import Thing
 
 if TYPE_CHECKING:
-    from analogrig.links.can_bus import CanBus, PythonCanBus
+    from analogrig.links.can_bus import CanBus
+
+MOST_BITRATE = 20_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class CanRates:
+    """Bit rates of a CAN bus."""
+
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = dict.fromkeys(("bitrate", "data_bitrate"), (1, MOST_BITRATE))
+    bitrate: int | None = None
+    """Bit rate of the bus [bit/s]. If there is no real bus, the run reports the time that this one would take."""
+    data_bitrate: int | None = None
+    """Bit rate of the data phase of CAN FD [bit/s]; None if it is ``bitrate``."""
+    fd: bool = False
+    """True if bus and device support CAN FD, whose frames carry up to 64 bytes."""
+
+    def check_rates(self) -> None:
+        """:raises ValueError: the rates do not go together."""
+        if self.data_bitrate is not None and not (self.fd and self.bitrate is not None):
+            raise ValueError("data_bitrate is for CAN FD: set fd = true and bitrate as well")
+
+    def can_line(self) -> CanLine | None:
+        """Bit rates, if they are stated."""
+        return None if self.bitrate is None else CanLine(self.bitrate, self.data_bitrate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CanPort(CanRates):
+    """CAN bus that python-can can open."""
+
+    interface: str = ""
+    """Interface in python-can's terms. Empty interface and channel come from python-can's own configuration."""
+    channel: str = ""
+    options: Mapping[str, bool | int | float | str] = field(default_factory=dict)
+    """Further arguments of the interface in python-can."""
+
+    def bus_config(self) -> dict[str, Any]:
+        """Arguments for ``can.Bus``, completed from python-can's own configuration.
+
+        :raises ConfigurationError: there is no such interface, or it has no such option.
+        """
+        from analogrig.links.can_bus import complete_config
+
+        given = {**self.options, "fd": self.fd or None, "bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
+        given |= {"interface": self.interface or None, "channel": self.channel or None}
+        config = complete_config({key: value for key, value in given.items() if value is not None})
+        if config["interface"] == "virtual" and config["channel"] is None:
+            # Shared with nobody else in this process. Writers of logs take digits at the end as a number of a channel.
+            config["channel"] = f"analogrig-{secrets.token_hex(4)}-bus"
+        return config
+
+    def hint(self, link_name: str) -> str:
+        """Advice for a device that does not answer on the bus of that name."""
+        return f"the bus was opened as can:{link_name}: is the device on it, at the same bit rate?"
+
+    @property
+    def bus_name(self) -> str:
+        """Name of the bus: ``can:INTERFACE/CHANNEL``."""
+        return f"can:{self.interface}{'/' if self.channel else ''}{self.channel}"
+
+    @property
+    def only_one(self) -> str:
+        return "" if self.interface == "virtual" else self.bus_name
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """The bus. Options are part of its name: python-can takes hosts, ports and driver libraries as such."""
+        if self.interface == "virtual":
+            return ()
+        texts = {key: str(value).lower() if isinstance(value, bool) else value for key, value in self.options.items()}
+        options = urlencode(sorted(texts.items()), quote_via=quote)
+        return (Thing("CAN bus", f"{self.bus_name}{'?' if options else ''}{options}", "the device opens the CAN bus"),)
+
 
 _ONE_CONNECTION = frozenset({"slcan", "serial", "robotell", "seeedstudio"})
 """Interfaces of python-can behind a serial port, which only one process can open."""
 
 
-def _start_host(program: Path, bus: PythonCanBus) -> Child:
-    """Start the device's process on the bus."""
-    child = host_child(["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])], program)
-    return child.connect(lambda _: child)
-
-
 @dataclass(frozen=True, kw_only=True)
-class CanDevice(CanBusDescription, FrameDevice):
+class CanDevice(CanPort, CatalogueDescription):
     """A node on a CAN bus that python-can can open."""
 
     kind: ClassVar[str] = "can"
@@ -41,6 +111,7 @@ class CanDevice(CanBusDescription, FrameDevice):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.check_rates()
         if self.interface:
             self._check_device_on(self.interface)
 
@@ -54,8 +125,13 @@ class CanDevice(CanBusDescription, FrameDevice):
             )
 
     @classmethod
-    def check_place(cls, name: str, place: str) -> None:
-        """Accept any place: ``can:`` is the bus of python-can's own configuration."""
+    def from_name(cls, name: str, rest: str) -> Self:
+        """Device with this name; ``can:`` alone is the bus of python-can's own configuration."""
+        return super().from_name(name, rest.removeprefix(":"))
+
+    @property
+    def is_on_can(self) -> bool:
+        return True
 
     @classmethod
     def _place(cls, name: str, place: str) -> dict[str, Any]:  # noqa: ARG003
@@ -75,8 +151,15 @@ class CanDevice(CanBusDescription, FrameDevice):
         started = self._started_device(interface)
         if started == "inproc":
             return InhabitedBus(config, library_for(self.estimator))
-        start = functools.partial(_start_host, host_program_for(self.estimator))
-        return ChildBus(config, start) if started == "host" else PythonCanBus(config)
+        if started == "none":
+            return PythonCanBus(config)
+
+        def start(bus: PythonCanBus) -> Child:
+            arguments = ["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])]
+            child = host_child(arguments, host_program_for(self.estimator))
+            return child.connect(lambda _: child)
+
+        return ChildBus(config, start)
 
     @property
     def program(self) -> Path | None:

@@ -10,12 +10,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import can
+
 from analogrig.devices.child import Child
 from analogrig.devices.library import ALWAYS_ROOM, LIBRARY, LibraryDevice
 from analogrig.errors import LinkClosed
 from analogrig.links.can_bus import PythonCanBus
 from analogrig.links.line import CanLine
-from analogrig.links.python_can import can
 from analogrig.links.wire import VirtualClock
 
 MOST_BYTES = 64
@@ -164,11 +165,9 @@ class InhabitedBus(PythonCanBus):
 class ChildBus(PythonCanBus):
     """A bus to a child process, which ends when the bus is closed."""
 
-    def __init__(
-        self, config: Mapping[str, Any], start: Callable[[PythonCanBus], Child], *, name: str | None = None
-    ) -> None:
+    def __init__(self, config: Mapping[str, Any], start: Callable[[PythonCanBus], Child]) -> None:
         """Open the bus, and take over the process that ``start`` returns for it; errors as of both."""
-        super().__init__(config, name=name)
+        super().__init__(config)
         try:
             self.child = start(self)
         except BaseException:

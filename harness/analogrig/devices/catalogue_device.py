@@ -1,4 +1,4 @@
-"""Device behind a link that carries our catalogue: handshake, configuration, samples in and answers out.
+"""Devices that exchange our catalogue's messages: descriptions, the device behind a link, and its estimator alone.
 
 The device sends nothing without a request. Any other message than the expected answer is an error.
 """
@@ -8,13 +8,14 @@ from __future__ import annotations
 import dataclasses
 import enum
 import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeGuard
 
 import numpy as np
 
-from analogrig.answers import Answers, Samples
+from analogrig.answers import Answers, Samples, raised_alarms
 from analogrig.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
@@ -31,9 +32,14 @@ from analogrig.catalogue import (
     Identify,
     Result,
     Status,
+    Trigger,
 )
-from analogrig.devices.catalogue_description import CatalogueDescription, suited
-from analogrig.devices.device import Device
+from analogrig.datasheet import Datasheet
+from analogrig.devices.device import Capability, Device, DeviceDescription
+from analogrig.devices.estimator import Estimator, EstimatorOutput
+from analogrig.devices.exchange import Conversation, Exchange, Packing
+from analogrig.devices.library import estimator_library_for
+from analogrig.devices.pace import Pace, check_line
 from analogrig.errors import (
     CatalogueMismatch,
     ConfigurationError,
@@ -44,12 +50,139 @@ from analogrig.errors import (
     LinkTimeout,
 )
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links.link import CanListener, Link
-from analogrig.links.wire_faults import FaultyLine
-from analogrig.protocol.conversation import Conversation
-from analogrig.protocol.exchange import Exchange, Packing, most_answers
-from analogrig.protocol.pace import Pace, check_line
+from analogrig.links.line import SerialLine
+from analogrig.links.link import CanListener, FramedLink, Link
+from analogrig.links.wire import Wire
+from analogrig.links.wire_faults import FaultyLine, FaultyWire, WireFaults
 from analogrig.run import Channel
+
+if TYPE_CHECKING:
+    from analogrig.links.can_bus import CanBus
+
+EXCHANGES = Literal["sample", "block", "stream"]
+"""Ways in which samples go to a device."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CatalogueDescription(DeviceDescription):
+    """Description of a device with our estimator's settings, behind a link that carries our catalogue's messages."""
+
+    starting_s: ClassVar[float] = 0.0
+    """Longest start-up time, added to the time-out of the handshake."""
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"window": (1, 255), "report_interval_n": (1, 65535)}
+    is_in_process: ClassVar[bool] = False
+    """True if the device runs in this process, on a virtual clock: time-outs cost nothing, a crash ends the process."""
+    exchange: EXCHANGES = "sample"
+    """Samples go one at a time, in blocks, or in blocks without waiting for the answers to earlier ones. The answers
+    are the same. A line of 8-byte messages carries single samples even for ``stream``."""
+    window: int = 255
+    """For ``stream``: the largest number of unanswered sample messages, if the device can buffer them."""
+    report_interval_n: int = 1
+    """Samples between two reports of the estimate. Alarms are always reported."""
+    wire_faults: str = ""
+    """Faults of the line, in the notation of ``WireFaults.parse``."""
+    computes: Literal["est", "own"] = "est"
+    """The estimator that the device computes: that of estimator_c/core, which the shipped properties compare with the
+    bundled library, or one of your own."""
+    estimator: EstimatorConfig = field(default_factory=lambda: EstimatorConfig(orders="program"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        try:
+            self.faults()
+        except ConfigurationError as error:
+            raise ValueError(str(error)) from error
+
+    @property
+    def capabilities(self) -> frozenset[Capability]:
+        found: set[Capability] = {"configure", "faults", "identify", "pace"}
+        if self.is_in_process:
+            found.add("in-process")
+        if self.can_run_in_blocks:
+            found.add("blocks")
+        return frozenset(found)
+
+    def known_datasheet(self) -> Datasheet:
+        return Datasheet.of_estimator(self.estimator.as_table())
+
+    def open(self) -> Device:
+        return CatalogueDevice(self.open_link(), self)
+
+    def direct(self, *, alarms_only: bool = False) -> Device:
+        return DirectDevice(self, alarms_only=alarms_only)
+
+    @property
+    def is_on_can(self) -> bool:
+        """True if its line is a CAN bus, False if it carries bytes."""
+        return False
+
+    def open_link(self) -> Link:
+        """Start the device, or connect to it.
+
+        :raises LinkError: it cannot be reached.
+        """
+        faults = self.faults()
+        if self.is_on_can:
+            from analogrig.links.can_link import CanLink
+            from analogrig.links.faulty_bus import FaultyBus
+
+            return CanLink(self.bus() if faults is None else FaultyBus(self.bus, faults))
+        return FramedLink(self.wire() if faults is None else FaultyWire(self.wire, faults), self.serial_line())
+
+    def wire(self) -> Wire:
+        """Wire to the started device; errors as ``open_link``."""
+        raise NotImplementedError
+
+    def bus(self) -> CanBus:
+        """Bus with the started device; errors as ``open_link``."""
+        raise NotImplementedError
+
+    def serial_line(self) -> SerialLine | None:
+        """Speed of a line of bytes, if it is stated."""
+        return None
+
+    def fault_kinds(self) -> Collection[str]:
+        if self.is_on_can:
+            from analogrig.links.faulty_bus import FaultyBus
+
+            return FaultyBus.KINDS
+        return FaultyWire.KINDS
+
+    def faults(self) -> WireFaults | None:
+        """Faults of its line; None if there are none.
+
+        :raises ConfigurationError: the line has no such faults.
+        """
+        return WireFaults.parse(self.wire_faults, self.fault_kinds()) if self.wire_faults else None
+
+    @property
+    def estimator_library(self) -> Path:
+        """Shared library with the device's estimator, to be run in this process."""
+        return estimator_library_for(self.estimator)
+
+    @property
+    def can_run_in_blocks(self) -> bool:
+        """True if ``estimator_library``, given whole blocks, yields what the device answers sample by sample."""
+        return False
+
+
+def suited(description: CatalogueDescription, poles: Sequence[complex]) -> EstimatorConfig:
+    """Settings of the device for a plant with these poles: chosen by them, or those given.
+
+    :raises ConfigurationError: the estimator has no such order.
+    """
+    try:
+        return description.estimator.suited(poles)
+    except ValueError as error:
+        cure = "give the device settings of its own: [estimator]"
+        where = f"device {description.name}: a program of order {len(poles)}"
+        raise ConfigurationError(f"{where}: {error}; {cure}") from error
+
+
+def has_our_estimator(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:
+    """True if the device has the settings of ``EstimatorConfig``."""
+    return isinstance(description, CatalogueDescription)
+
 
 _HELLO_AGAIN_S = 0.25
 """Time after which the handshake is repeated: a board that resets when its port is opened misses the first request."""
@@ -262,11 +395,9 @@ class CatalogueDevice(Device):
         self._check_device()  # keeps the expected number, so a message lost or forged at the end is noticed
         self._control(Command.STOP)
         self._exchange = None
-        return {name: value - self._before_run(name) for name, value in self.status().items()}
-
-    def _before_run(self, counter: str) -> int:
-        """Count before the run; 0 for the estimator's own counters, which begin with the run."""
-        return 0 if Counter[counter.upper()] < Counter.FRAMES_DROPPED else self._counted[counter]
+        before = self._counted  # the estimator's own counters begin with the run
+        own = {counter.name.lower() for counter in Counter if counter < Counter.FRAMES_DROPPED}
+        return {name: value if name in own else value - before[name] for name, value in self.status().items()}
 
     def _packing(self) -> Packing:
         """Packing whose samples fit in the device's input buffer, and whose answers fit in that of the line."""
@@ -276,7 +407,9 @@ class CatalogueDevice(Device):
         if self._identity is not None:
             window = min(window, self._identity.input_blocks)
         if link.unread_n is not None:
-            window = min(window, link.unread_n // most_answers(BLOCK_SAMPLES if in_blocks else 1, self.parameters))
+            # Estimates and Stepped for each sample of a message, and one Alarm, Diagnosis and Misfit.
+            answers_n = (BLOCK_SAMPLES if in_blocks else 1) * (self.parameters + 2) + 3
+            window = min(window, link.unread_n // answers_n)
         return Packing(in_blocks=in_blocks, window=max(1, window))
 
     def status(self) -> dict[str, int]:
@@ -369,3 +502,96 @@ class CatalogueDevice(Device):
 def _word(kind: type[enum.IntEnum], value: int) -> str:
     """Name of a value, or its number if it has no name."""
     return kind(value).name if value in kind.__members__.values() else f"number {value}"
+
+
+class DirectDevice(Device):
+    """Estimator of a device of our catalogue that has the capability ``blocks``, without its line.
+
+    Its answers are those of ``CatalogueDevice`` to the bit. It lacks what other messages carry: the diagnoses,
+    the misfits, the flags RESTARTED and IDLE, and the counters of messages.
+    """
+
+    def __init__(self, description: CatalogueDescription, *, alarms_only: bool = False) -> None:
+        """Load and configure the estimator.
+
+        :param alarms_only: omit the estimates, which take a twentieth of the time: theta has no columns.
+        :raises ConfigurationError: the estimator refuses its configuration.
+        :raises LinkError: the library was not built.
+        """
+        super().__init__(description)
+        self._description: CatalogueDescription = description
+        self._as_opened = description.estimator
+        self._alarms_only = alarms_only
+        self._next_index = 0
+        self._poles: Sequence[complex] | None = None
+        """Order for which the settings were chosen last: to choose them takes as long as to play a thousand samples."""
+        self.configure()
+
+    @property
+    def datasheet(self) -> Datasheet:
+        return self._datasheet
+
+    def description(self) -> Mapping[str, Any]:
+        return self._table
+
+    def recover(self) -> None:
+        self._estimator.restart()
+
+    def configure(self, **settings: Any) -> None:
+        self._poles = None
+        self._apply(self._as_opened.changed(f"device {self.name}", settings))
+
+    def suit(self, poles: Sequence[complex]) -> None:
+        if poles == self._poles:
+            return
+        estimator = suited(self._description, poles)
+        if estimator != self._description.estimator:
+            self._apply(estimator)
+        self._poles = poles
+
+    def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
+        zero = channels["u"].zero
+        if zero != self._description.estimator.force_zero:
+            self._apply(dataclasses.replace(self._description.estimator, force_zero=zero))
+
+    def _apply(self, estimator: EstimatorConfig) -> None:
+        self._description = dataclasses.replace(self._description, estimator=estimator)
+        self._estimator = Estimator(estimator, library=self._description.estimator_library)
+        self._trigger = Trigger[estimator.trigger.replace("-", "_").upper()]
+        # Runs share the table: to write it anew for each takes as long as to play a thousand samples.
+        self._table = self._description.as_table()
+        self._datasheet = dataclasses.replace(Datasheet.recorded(self._table), misfits=False)
+        if self._alarms_only:
+            self._datasheet = dataclasses.replace(self._datasheet, theta_n=0, model=None)
+        self._table["datasheet"] = self._datasheet.as_table()
+
+    def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
+        self._estimator.restart()
+        self._next_index = 0
+
+    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
+        for block in blocks:
+            if skipped_n := block.skipped_after(self._next_index):
+                nothing = np.zeros(skipped_n, np.uint16)
+                self._estimator.run(nothing, nothing, np.zeros(skipped_n, np.bool_), with_theta=False)
+            self._next_index = block.first + len(block)
+            steps = self._estimator.run(block.u, block.y, block.valid, with_theta=not self._alarms_only)
+            yield self._answers(steps, block.first)
+
+    def play_records(self, records: Sequence[Samples]) -> Iterator[tuple[Answers, Mapping[str, int]]]:
+        u, y, valid = (np.stack([getattr(each, name) for each in records]) for name in ("u", "y", "valid"))
+        for steps, counters in self._estimator.run_records(u, y, valid, with_theta=not self._alarms_only):
+            yield self._answers(steps), counters
+
+    def _answers(self, steps: EstimatorOutput, first: int = 0) -> Answers:
+        """Answers to a block from sample ``first`` on."""
+        return Answers(
+            flags=steps.flags,
+            alarms=raised_alarms(first + steps.alarms, steps.statistic[steps.alarms], self._trigger),
+            theta=steps.theta,
+            innovation=steps.innovation,
+            statistic=steps.statistic,
+        )
+
+    def stop(self) -> Mapping[str, int]:
+        return self._estimator.counters

@@ -14,10 +14,12 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from analogrig.errors import LinkClosed, LinkError
-from analogrig.links.wire import Wire
+
+if TYPE_CHECKING:  # importing pyserial takes longer than all other imports together
+    from analogrig.links.wire import Wire
 
 PROGRAMS = Path(__file__).parents[1] / "bin"
 """Folder of the programs that the package brings."""
@@ -121,7 +123,9 @@ class Child:
             self._stderr += self._process.stderr.read().decode(errors="replace")
         lines = self._stderr.strip().splitlines()
         messages = [line for line in lines if _COMPLAINT.match(line)] or lines
-        status = _status(self._process.wait())
+        status = str(self._process.wait())
+        with contextlib.suppress(ValueError):
+            status = f"{status} ({signal.Signals(-int(status)).name})"
         return f"{self._what} ended with status {status}{f': {messages[-1]}' if messages else ''}"
 
     @contextlib.contextmanager
@@ -152,13 +156,6 @@ class Child:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(time_s)
         return self.has_ended
-
-
-def _status(status: int) -> str:
-    """Exit status, with the name of the signal that it stands for."""
-    with contextlib.suppress(ValueError):
-        return f"{status} ({signal.Signals(-status).name})"
-    return str(status)
 
 
 class ChildWire:

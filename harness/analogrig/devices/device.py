@@ -1,22 +1,253 @@
-"""Interface of a device under test: blocks of samples go in, answers come out."""
+"""Interface of every kind of device: its description, which a device file states, and the device that it opens."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from urllib.parse import unquote
 
-from analogrig.answers import Answers, Samples
+from analogrig import config
+from analogrig.answers import AlarmIs, Answers, Samples
 from analogrig.datasheet import Datasheet
-from analogrig.devices.description import DeviceDescription
-from analogrig.errors import ConfigurationError, DeviceRefused
+from analogrig.devices.pace import Pace
+from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.identity import DeviceFile
-from analogrig.protocol.pace import Pace
+from analogrig.links.causes import Causes
 from analogrig.run import Channel
+from analogrig.trust import Thing
 
 if TYPE_CHECKING:
     from analogrig.links.link import CanListener
     from analogrig.links.wire_faults import FaultyLine
+
+KEEPS_MEMORY = "a state left from before the record"
+"""Entry of ``Datasheet.cannot_tell`` of a device whose memory outlives a record."""
+
+LONGEST_TIMEOUT_S = 3600.0
+
+MOST_LOST = 2**31
+
+Capability = Literal["blocks", "configure", "faults", "identify", "in-process", "pace"]
+"""Capability of a device beyond taking samples and raising alarms:
+
+``blocks``      ``direct`` opens it without messages, with the same answers
+``configure``   settings can be changed by name
+``faults``      faults can be injected into its line
+``identify``    it can tell whether it was reset
+``in-process``  it runs in this process: a time-out costs no time, a crash ends the process
+``pace``        samples can be sent in real time
+``snapshot``    the state of its estimator can be saved and restored
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceDescription:
+    """Description of a device: a table of a device file. Each kind is a subclass that ``registry.KINDS`` names."""
+
+    kind: ClassVar[str]
+    usage: ClassVar[str]
+    """Name on the command line, with its parameters."""
+    summary: ClassVar[str]
+    """One line for `analogrig list`."""
+    collects: ClassVar[str] = ""
+    """Field that collects the keys of a name that are no fields; empty: they are refused."""
+    place_key: ClassVar[str] = ""
+    """Field that the part of a name after the colon sets; empty: there is no such part."""
+    no_place: ClassVar[str] = ""
+    """Error for a name without that part, with {name} and {kind}; empty: the field has a default."""
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"most_lost_n": (0, MOST_LOST)}
+    """Least and largest value of numbers, by their fields. Those of base classes hold as well."""
+    state_types: ClassVar[tuple[type[int | str], ...]] = ()
+    """Types of the states that ``alarm_is`` may name; none if the alarm is true or false."""
+    name: str
+    description: str = ""
+    """One line for people."""
+    most_lost_n: int = 0
+    """Largest number of samples lost on the way to the device. Beyond it the run is INCONCLUSIVE."""
+    timeout_s: float = 10.0
+    """Time-out of all answers to one message."""
+    alarm_is: AlarmIs = "event"
+    """``event``: every answer with an alarm is one. ``level``: the device holds its alarm, and only the first of a row
+    is one. An array of states, such as ["FAULT", 3]: those that stand for an alarm, of which the first of a row is
+    one."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
+            raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
+        if self.alarm_is == ():
+            raise ValueError('alarm_is must be "event", "level", or an array of the states that stand for an alarm')
+        if unknown := [state for state in self.states if type(state) not in self.state_types]:
+            known = " or ".join({int: "numbers", str: "words"}[each] for each in self.state_types)
+            cure = f"its states are {known}" if known else 'its alarm is true or false: use "level"'
+            raise ValueError(f"alarm_is: a device of the kind {self.kind} has no state {unknown[0]!r}: {cure}")
+        if getattr(self, "settings", None) and "configure" not in self.capabilities:
+            raise ValueError(f"settings: a device of the kind {self.kind} has none")
+        for kind in type(self).__mro__:
+            for name, (low, high) in vars(kind).get("ranges", {}).items():
+                if (value := getattr(self, name)) is not None and not low <= value <= high:
+                    raise ValueError(f"{name} must be {low:.10g} to {high:.10g}, not {value:.10g}")
+
+    @classmethod
+    def from_name(cls, name: str, rest: str) -> Self:
+        """Device with the command-line name ``name``; ``rest`` is its part after the kind.
+
+        :raises ConfigurationError: ``rest`` is not a colon, a place and KEY=VALUE pairs of this kind.
+        """
+        place, _, query = rest.partition("?")
+        if place == ":" and not cls.no_place:
+            raise ConfigurationError(
+                f"device {name!r}: nothing follows the colon: pass {cls.kind} for the default, or {cls.kind}:WHICH"
+            )
+        place, query = cls._split_query(name, place.removeprefix(":"), query)
+        table = {"name": name, **cls._place(name, place)}
+        for key, text in _pairs(name, query):
+            if key in table:
+                raise ConfigurationError(f"{name}: {key} is given twice")
+            table[key] = _value(cls, key, text)
+        if cls.collects:
+            names = {field.name for field in dataclasses.fields(cls)}
+            others = {key: table.pop(key) for key in list(table) if key not in names}
+            table[cls.collects] = others
+        return config.build(cls, table, name)
+
+    @classmethod
+    def _split_query(cls, name: str, place: str, query: str) -> tuple[str, str]:  # noqa: ARG003
+        """Place with those KEY=VALUE pairs that belong to it, and the others."""
+        return place, query
+
+    @classmethod
+    def _place(cls, name: str, place: str) -> dict[str, Any]:
+        """Fields given by the part of a name between the colon and the question mark."""
+        if place and not cls.place_key:
+            raise ConfigurationError(f"{name}: a device of the kind {cls.kind} has no {place!r}")
+        if not place and cls.no_place:
+            raise ConfigurationError(cls.no_place.format(name=name, kind=cls.kind))
+        return {cls.place_key: place} if place else {}
+
+    @property
+    def states(self) -> tuple[int | str, ...]:
+        """States that stand for an alarm; empty if the alarm is a number, which is an alarm unless it is 0."""
+        return self.alarm_is if isinstance(self.alarm_is, tuple) else ()
+
+    @property
+    def capabilities(self) -> frozenset[Capability]:
+        """Capabilities of the device."""
+        return frozenset()
+
+    def known_datasheet(self) -> Datasheet:
+        """Data sheet, as far as it is known before the device is opened."""
+        return Datasheet()
+
+    def open(self) -> Device:
+        """Start the device, or connect to it. Nothing is sent yet.
+
+        :raises LinkError: it cannot be reached.
+        """
+        raise NotImplementedError
+
+    def connect(self, listener: CanListener | None = None) -> Device:
+        """Open the device, bring it to a defined state and configure it; ready for ``Bench.play``.
+
+        :param listener: receives every frame of a CAN bus from its opening on.
+        :raises LinkError: it cannot be reached.
+        :raises DeviceError: it refuses its configuration, or is not the device described.
+        """
+        files = self.files()
+        device = self.open()
+        try:
+            if listener is not None:
+                device.listen(listener)
+            self._check_files(device, files)
+            device.recover()
+            device.configure()
+        except BaseException:
+            device.close()
+            raise
+        return device
+
+    def _check_files(self, device: Device, before: tuple[DeviceFile, ...]) -> None:
+        """:raises DeviceError: a file of the device is not the one before it was opened."""
+        if device.files() != before:
+            raise DeviceError(f"device {self.name}: its file was replaced while it was loaded: start again")
+
+    def direct(self, *, alarms_only: bool = False) -> Device:  # noqa: ARG002
+        """Device of the capability ``blocks`` without messages: its answers are those of ``connect`` to the bit.
+
+        :param alarms_only: omit the estimates if that is faster.
+        :raises ConfigurationError: the estimator refuses its configuration.
+        :raises LinkError, DeviceError: as ``connect``.
+        """
+        return self.connect()
+
+    def hint(self, link_name: str) -> str:  # noqa: ARG002
+        """Advice for a device that has never answered on the link of that name; may be empty."""
+        return ""
+
+    def fault_kinds(self) -> Collection[str]:
+        """Kinds of faults that its line can have; none without the capability ``faults``."""
+        return ()
+
+    @property
+    def program(self) -> Path | None:
+        """File with the device's code on this machine; None for a device elsewhere."""
+        return None
+
+    def files(self) -> tuple[DeviceFile, ...]:
+        """Library, program or firmware that the device runs on this machine, if any."""
+        return () if self.program is None else (DeviceFile.of(self.name, self.program),)
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """Things outside analogrig that opening the device would load, run or connect to."""
+        return ()
+
+    def placed(self, folder: Path) -> Self:  # noqa: ARG002
+        """The same device with its paths, relative to ``folder``, made absolute."""
+        return self
+
+    @property
+    def only_one(self) -> str:
+        """Name of the port or bus that two processes cannot share; empty if each can start a device of its own."""
+        return ""
+
+    @property
+    def is_private(self) -> bool:
+        """True if only this process reaches the device: it is an object at the other end of a virtual bus."""
+        return False
+
+    def as_table(self) -> dict[str, Any]:
+        """Plain values; ``registry.from_table`` is the inverse."""
+        table = {"kind": self.kind, **dataclasses.asdict(self)}
+        tables = {key: value.as_table() for key in table if hasattr(value := getattr(self, key), "as_table")}
+        return {key: value for key, value in (table | tables).items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stated:
+    """Figures of a device that its owner states."""
+
+    datasheet: Datasheet = field(default_factory=Datasheet)
+    """Figures that the owner states. What the device itself reports replaces them when it is opened."""
+    settings: Mapping[str, bool | int | float | str] = field(default_factory=dict)
+    """Settings of its estimator by name, if the kind has the capability ``configure``."""
+    estimator: EstimatorConfig | None = None
+    """Configuration of est.c that the device runs, by its owner's claim. ``analogrig replay --compare`` and a shipped
+    property check the claim against the bundled library."""
+
+    def known_datasheet(self) -> Datasheet:
+        """Data sheet, as far as it is known before the device is opened."""
+        return self.datasheet
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptedDescription(Stated, DeviceDescription):
+    """Description of a device with a protocol of its own."""
 
 
 class Device(ABC):
@@ -31,6 +262,8 @@ class Device(ABC):
     def __init__(self, description: DeviceDescription) -> None:
         self._description = description
         self._files = description.files()
+        self.causes = Causes()
+        """Causes of lost samples and of unused frames since it was opened."""
 
     @property
     def name(self) -> str:
@@ -45,6 +278,11 @@ class Device(ABC):
     def description(self) -> Mapping[str, Any]:
         """Description in plain values, for the record; the device can be opened from it again (``recorded``)."""
         return {**self._description.as_table(), "datasheet": self.datasheet.as_table()}
+
+    @property
+    def holds_alarms(self) -> bool:
+        """True if its alarm is a level or a state: only the first alarm of a row is one."""
+        return self._description.alarm_is != "event"
 
     def files(self) -> tuple[DeviceFile, ...]:
         """Library, program or firmware that the device runs on this machine, if any, as it was when it was loaded."""
@@ -149,6 +387,16 @@ class Device(ABC):
         return {}
 
     @property
+    def losses(self) -> tuple[str, ...]:
+        """Causes that lost samples or frames, as ``Conditions.losses``."""
+        return self.causes.losses
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The other causes, as ``Conditions.remarks``."""
+        return self.causes.remarks
+
+    @property
     def line_s(self) -> float:
         """Time that the samples and answers of this record take at the line's speed [s]; 0.0 if it is unknown."""
         return 0.0
@@ -165,3 +413,28 @@ class Device(ABC):
 
     def listen(self, listener: CanListener) -> None:  # noqa: B027 - few lines carry CAN frames
         """Report all CAN frames to the listener from now on; a line without any ignores it."""
+
+
+def _pairs(name: str, query: str) -> list[tuple[str, str]]:
+    """KEY=VALUE pairs separated by ampersands, with percent escapes decoded.
+
+    :raises ConfigurationError: a word is not KEY=VALUE.
+    """
+    words = [word.partition("=") for word in query.split("&") if word]
+    for key, equals, value in words:
+        if not (key and equals):
+            raise ConfigurationError(f"{name}: {key + equals + value!r} is not KEY=VALUE")
+    return [(unquote(key), unquote(value)) for key, _, value in words]
+
+
+def _value(cls: type[DeviceDescription], key: str, text: str) -> Any:
+    """Text as a number or truth value where possible, as python-can reads it. Text fields of ``cls`` stay text."""
+    if isinstance(getattr(cls, key, None), str):
+        return text
+    is_flag = isinstance(getattr(cls, key, None), bool)
+    if text.lower() in {"true", "false"} or (is_flag and text in {"1", "0"}):
+        return text.lower() in {"true", "1"}
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return text

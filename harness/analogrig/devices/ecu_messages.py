@@ -6,17 +6,22 @@ cantools encodes and decodes. Every name and every range is checked once, when t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import can
+
 from analogrig.answers import LARGEST_FLOAT32
 from analogrig.config import suggest
-from analogrig.devices.can_dbc import CanDbcDevice, Request, Units, scale
+from analogrig.devices.dbc_description import DbcDescription, Request, scale
+from analogrig.devices.ecu_checksum import COUNTED_TO_14, ChecksumSpec, FrameChecksum
+from analogrig.devices.ecu_traffic import EcuTraffic
+from analogrig.devices.message_reader import MessageReader, frame_bytes
 from analogrig.errors import ConfigurationError
-from analogrig.links.can_station import Identifier
+from analogrig.links.causes import Causes
 from analogrig.links.dbc import check_layout, load_dbc
-from analogrig.links.python_can import can
+from analogrig.links.link import Identifier
 from analogrig.run import Channel
 
 CLASSIC_BYTES = 8
@@ -27,6 +32,9 @@ _LARGEST_FLOAT = {16: 65504.0, 32: LARGEST_FLOAT32, 64: math.inf}
 
 _INPUTS = ("u", "y")
 
+_LEAST_FLAGS, _RESTLESS = 16, 0.8
+"""Frames from which on a flag is judged, and the share of them in which none that is right is away from rest."""
+
 
 class Answer(NamedTuple):
     """Part of the device's answer to a sample: one frame."""
@@ -36,6 +44,8 @@ class Answer(NamedTuple):
     """Values of the signals that [receive] names, as ``Message.Signal``."""
     counter: int | None
     """Value of its counter; None if [receive] names none in this message."""
+    absent: frozenset[str] = frozenset()
+    """Signals among ``values`` whose value stands for none."""
 
 
 class SamplePart(NamedTuple):
@@ -43,7 +53,9 @@ class SamplePart(NamedTuple):
 
     message: str
     values: Mapping[str, float]
-    """Physical values by key of [send]: u, y, valid."""
+    """Physical values by key of [send]: u, y."""
+    is_missing: bool
+    """True if the frame carries a missing sample, or no number."""
     counter: int | None
     """Value of its counter, if it has one."""
 
@@ -60,7 +72,7 @@ class _Found(NamedTuple):
 class EcuMessages:
     """Messages that a device file names, as the DBC defines them."""
 
-    def __init__(self, description: CanDbcDevice) -> None:
+    def __init__(self, description: DbcDescription) -> None:
         """Find and check all messages.
 
         :raises ConfigurationError: names file, table and key.
@@ -68,13 +80,26 @@ class EcuMessages:
         self._description = description
         self._path = Path(description.dbc)
         self._database = load_dbc(self._path)
-        self._frames: dict[str, Any] = {}
-        """Messages in use by name."""
+        self.causes = Causes()
+        """Causes of frames that are not used."""
+        self._flags: dict[str, str] = {}
+        """Key of each flag: alarm, armed, valid."""
+        self._readers: dict[str, MessageReader] = {}
+        """Readers of the messages in use by name."""
+        self.events = frozenset(description.receive.events)
+        """Messages that come only with something to report."""
         self._find_sent()
         self._find_received()
+        self._count_moduli()
         self.start = self._request("start", description.start)
         self.reset = self._request("reset", description.reset)
-        self._check_identifiers()
+        names: dict[Identifier, str] = {}
+        for name, reader in self._readers.items():
+            if (other := names.setdefault(reader.identifier, name)) != name:
+                raise self._error("dbc", f"messages {other} and {name} have the same identifier")
+        if both := self.own & self.of_device:
+            raise self._error("receive", f"message {names[min(both)]} is sent to the device as well")
+        self.traffic = EcuTraffic(self._readers, self.causes)
 
     # ------------------------------------------------------------------------------------------------------ identifiers
 
@@ -82,22 +107,13 @@ class EcuMessages:
     def own(self) -> frozenset[Identifier]:
         """Identifiers of the harness's frames."""
         requests = [request.message for request in (self.start, self.reset) if request]
-        return frozenset(_identifier(self._frames[name]) for name in (*self.order, *requests))
+        return frozenset(self._readers[name].identifier for name in (*self.order, *requests))
 
     @property
     def of_device(self) -> frozenset[Identifier]:
         """Identifiers of the device's frames."""
         answers = [request.answer for request in (self.start, self.reset) if request and request.answer]
-        return frozenset(_identifier(self._frames[name]) for name in (*self._answers, *answers))
-
-    def _check_identifiers(self) -> None:
-        names: dict[Identifier, str] = {}
-        for name, message in self._frames.items():
-            other = names.setdefault(_identifier(message), name)
-            if other != name:
-                raise self._error("dbc", f"messages {other} and {name} have the same identifier")
-        if both := self.own & self.of_device:
-            raise self._error("receive", f"message {names[min(both)]} is sent to the device as well")
+        return frozenset(self._readers[name].identifier for name in (*self._answers, *answers))
 
     # ------------------------------------------------------------------------------------------------------- to the bus
 
@@ -109,9 +125,15 @@ class EcuMessages:
         :param channels: channels of the rig; None: units that depend on them are not checked.
         :raises ConfigurationError: a code does not fit its signal.
         """
-        tables = {key: self._raw_values(key, None if channels is None else channels[key]) for key in _INPUTS}
+        tables: dict[str, Sequence[float]] = {}
+        for key in _INPUTS:
+            channel = None if channels is None else channels[key]
+            codes = range(self._description.send.codes if channel is None else channel.codes)
+            factor, offset = self._check_range(key, channel) or (0.0, 0.0)
+            signal = self._carriers[key].signal
+            tables[key] = [_to_raw(signal, code * factor + offset) for code in codes] if factor else ()
         u_of, y_of = tables["u"], tables["y"]
-        parts = [self._encode_part(self._frames[name]) for name in self.order]
+        parts = [self._encode_part(self._readers[name].message) for name in self.order]
 
         def encode(index: int, u: int, y: int, valid: bool) -> list[can.Message]:  # noqa: FBT001
             given = {"u": u_of[u], "y": y_of[y], "valid": int(valid)}
@@ -124,8 +146,9 @@ class EcuMessages:
         fixed = self._fixed[message.name]
         keys = [(found.signal.name, key) for key, found in self._carriers.items() if found.message is message]
         counter = self._send_counters.get(message.name)
-        modulus = 1 if counter is None else _modulus(counter)
+        modulus = 1 if counter is None else self._modulus(counter)
         name = "" if counter is None else counter.signal.name
+        checksum = self._readers[message.name].checksum
 
         def encode(index: int, given: Mapping[str, float]) -> can.Message:
             values = fixed.copy()
@@ -133,6 +156,10 @@ class EcuMessages:
                 values[signal] = given[key]
             if name:
                 values[name] = index % modulus
+            if checksum is not None:
+                values[checksum.name] = 0
+                data = message.encode(values, scaling=False, strict=False)
+                values[checksum.name] = checksum.value(data, values)
             return self._frame(message, values)
 
         return encode
@@ -143,7 +170,7 @@ class EcuMessages:
         return can.Message(
             arbitration_id=message.frame_id,
             is_extended_id=message.is_extended_frame,
-            data=data if len(data) <= CLASSIC_BYTES else data.ljust(_frame_bytes(len(data)), b"\0"),
+            data=data if len(data) <= CLASSIC_BYTES else data.ljust(frame_bytes(len(data)), b"\0"),
             is_fd=is_fd,
             bitrate_switch=is_fd and self._description.data_bitrate is not None,
             is_rx=False,
@@ -151,81 +178,105 @@ class EcuMessages:
 
     def request(self, request: Request) -> can.Message:
         """Frame of [start] or [reset]."""
-        return self._frame(self._frames[request.message], self._fixed[request.message])
+        return self._frame(self._readers[request.message].message, self._fixed[request.message])
 
     def is_answer(self, request: Request, frame: can.Message) -> bool:
         """True if the frame is the answer to [start] or [reset]."""
-        message = self._frames[request.answer]
-        if _identifier(message) != (frame.arbitration_id, frame.is_extended_id):
+        reader = self._readers[request.answer]
+        return reader.is_of(frame) and self._has(reader, request.answered, frame)
+
+    def is_start(self, frame: can.Message) -> bool:
+        """True if the frame is that of [start], whatever its length and its other signals."""
+        if self.start is None or not (reader := self._readers[self.start.message]).is_of(frame):
             return False
-        values = _decode(message, frame)
-        return values is not None and all(values.get(name) == value for name, value in request.answered.items())
+        is_start = self._has(reader, self.start.signals, frame)
+        if not is_start:
+            self.causes.add(f"{reader.title} has other values than [start]")
+        return is_start
+
+    @staticmethod
+    def _has(reader: MessageReader, wanted: Mapping[str, float], frame: can.Message) -> bool:
+        """True if a frame has these values."""
+        found = reader.read(frame)
+        return found is not None and all(found.values.get(signal) == value for signal, value in wanted.items())
 
     # ----------------------------------------------------------------------------------------------------- from the bus
 
     def answer(self, frame: can.Message) -> Answer | None:
-        """Answer in a frame of the device; None if it is damaged, or none of [receive]."""
-        message = self._by_identifier.get((frame.arbitration_id, frame.is_extended_id))
-        values = None if message is None else _decode(message, frame)
-        if message is None or values is None:
+        """Answer in a frame of the device; None if it cannot be used, or is none of [receive]."""
+        reader = self._by_identifier.get((frame.arbitration_id, frame.is_extended_id))
+        found = None if reader is None else reader.read(frame)
+        if reader is None or found is None:
             return None
-        wanted = {}
-        for name, full in self._answers[message.name].items():
-            if name in values:
-                wanted[full] = values[name]
-        counter = self._receive_counters.get(message.name)
-        return Answer(message.name, wanted, None if counter is None else int(values.get(counter.signal.name, -1)))
+        name = reader.message.name
+        full = self._answers[name]
+        values = {full[signal]: value for signal, value in found.values.items() if signal in full}
+        counter = self._receive_counters.get(name)
+        count = None if counter is None else found.values.get(counter.signal.name)
+        if (full and not values) or (counter is not None and count is None):
+            return None
+        if counter is not None and count is not None:
+            self.traffic.count(counter.name, int(count), self.count_moduli[name])
+        absent = frozenset(full[signal] for signal in found.absent if signal in full)
+        return Answer(name, values, None if count is None else int(count), absent)
 
     def is_of_answer(self, frame: can.Message) -> bool:
         """True if the frame has the identifier of a message of [receive]."""
         return (frame.arbitration_id, frame.is_extended_id) in self._by_identifier
 
-    def is_start(self, frame: can.Message) -> bool:
-        """True if the frame is that of [start]."""
-        return self.start is not None and self._equals(self.request(self.start), frame)
-
-    @staticmethod
-    def _equals(one: can.Message, other: can.Message) -> bool:
-        return (one.arbitration_id, one.is_extended_id, bytes(one.data)) == (
-            other.arbitration_id,
-            other.is_extended_id,
-            bytes(other.data),
-        )
-
     def is_of_sample(self, frame: can.Message) -> bool:
         """True if the frame has the identifier of a message of [send]."""
-        return any((frame.arbitration_id, frame.is_extended_id) == _identifier(self._frames[n]) for n in self.order)
+        return any(self._readers[name].is_of(frame) for name in self.order)
 
     def sample_part(self, frame: can.Message) -> SamplePart | None:
-        """Part of a sample in a captured frame of the harness; None if it is damaged, or none of [send]."""
-        identifier = frame.arbitration_id, frame.is_extended_id
-        message = next(
-            (self._frames[name] for name in self.order if _identifier(self._frames[name]) == identifier), None
-        )
-        values = None if message is None else _decode(message, frame)
-        if message is None or values is None:
+        """Part of a sample in a captured frame of the harness; None if it cannot be used, or is none of [send]."""
+        reader = next((self._readers[name] for name in self.order if self._readers[name].is_of(frame)), None)
+        found = None if reader is None else reader.read(frame)
+        if reader is None or found is None:
             return None
-        carried = {key: found.signal.name for key, found in self._carriers.items() if found.message is message}
-        if not all(name in values and math.isfinite(values[name]) for name in carried.values()):
+        name = reader.message.name
+        carried = {key: each for key, each in self._carriers.items() if each.message.name == name}
+        counter = self._send_counters.get(name)
+        if gone := [each.name for each in carried.values() if each.signal.name not in found.values]:
+            self.causes.add(f"a frame {name} has no {', '.join(gone)}", detail=bytes(frame.data).hex())
             return None
-        counter = self._send_counters.get(message.name)
-        count = None if counter is None else int(values.get(counter.signal.name, -1))
-        return SamplePart(message.name, {key: values[name] for key, name in carried.items()}, count)
+        count = None if counter is None else found.values.get(counter.signal.name)
+        if counter is not None and count is None:
+            return None
+        values = {key: found.values[each.signal.name] for key, each in carried.items()}
+        is_missing = values.pop("valid", 1.0) == 0.0
+        for key, each in carried.items():
+            if each.signal.name in found.absent or not math.isfinite(found.values[each.signal.name]):
+                if not is_missing and key != "valid":
+                    self.causes.add(f"{each.name} is no number: a missing sample")
+                is_missing = True
+                values[key] = 0.0
+        if counter is not None and count is not None:
+            self.traffic.count(counter.name, int(count), self._modulus(counter))
+        return SamplePart(name, values, is_missing, None if count is None else int(count))
 
-    def decoder(self, channels: Mapping[str, Channel]) -> Callable[[Mapping[str, float]], tuple[int, int, bool] | None]:
-        """Function that returns the codes of u and y, and valid, from the values of all parts; None outside the range.
+    def decoder(self, channels: Mapping[str, Channel]) -> Callable[[Mapping[str, float], str], tuple[int, int] | None]:
+        """Function that returns the codes of u and y from the values of all parts; None outside the range.
+
+        A value outside the range is counted as a cause, unless its place is empty.
 
         It is the inverse of ``encoder``, as far as the signals have a step for each code.
         """
-        known = {key: scale(self._units(key), channels[key]) for key in _INPUTS}
+        known = {key: scale(getattr(self._description.send.units, key), channels[key]) for key in _INPUTS}
         scales = {key: factors for key, factors in known.items() if factors is not None}
         most = {key: channels[key].codes for key in _INPUTS}
 
-        def decode(values: Mapping[str, float]) -> tuple[int, int, bool] | None:
+        def decode(values: Mapping[str, float], place: str) -> tuple[int, int] | None:
             codes = {key: round((values[key] - offset) / factor) for key, (factor, offset) in scales.items()}
-            if not all(0 <= code < most[key] for key, code in codes.items()):
-                return None
-            return codes["u"], codes["y"], bool(values.get("valid", 1))
+            for key, code in codes.items():
+                if not 0 <= code < most[key] and not place:
+                    return None
+                if not 0 <= code < most[key]:
+                    text = f"{self._carriers[key].name} is beyond the range of the rig, codes 0 to {most[key] - 1}"
+                    detail = f"{values[key]:g} is code {code}"
+                    self.causes.add(text, noun="sample", place=place, detail=detail, loses=True)
+                    return None
+            return codes["u"], codes["y"]
 
         return decode
 
@@ -236,11 +287,15 @@ class EcuMessages:
         self._carriers = {key: self._signal(f"send.{key}", getattr(sent, key)) for key in _INPUTS}
         if sent.valid:
             self._carriers["valid"] = self._signal("send.valid", sent.valid)
+            self._watch_flag("valid", sent.valid)
         self._send_counters = self._counters("send.counter", sent.counter)
         constants = [self._signal(f"send.constant.{name}", name) for name in sent.constant]
         carriers = (*self._carriers.values(), *self._send_counters.values())
-        used = {found.name for found in carriers}
-        if len(used) < len(carriers):
+        self._set_checksums(
+            "send.checksum", sent.checksum, self._send_counters, {found.message.name for found in carriers}
+        )
+        used = {found.name for found in carriers} | set(sent.checksum)
+        if len(used) < len(carriers) + len(sent.checksum):
             raise self._error("send", "one signal carries two quantities")
         if twice := used & set(sent.constant):
             raise self._error("send.constant", f"{min(twice)} carries a quantity of the sample")
@@ -248,17 +303,27 @@ class EcuMessages:
         self.order = sent.order or tuple(dict.fromkeys(named))
         if sorted(self.order) != sorted(set(named)):
             raise self._error("send.order", f"must name each of {', '.join(dict.fromkeys(named))} once")
-        if len({_modulus(found) for found in self._send_counters.values()}) > 1:
-            raise self._error("send.counter", "the counters have different ranges")
         self._fixed: dict[str, dict[str, float]] = {}
         for name in self.order:
             self._fixed[name] = self._start_values(
                 f"send.{'constant' if constants else 'order'}",
-                self._frames[name],
+                self._readers[name].message,
                 {found.signal.name: sent.constant[found.name] for found in constants if found.message.name == name},
                 [found.signal for found in carriers if found.message.name == name],
             )
-        self.encoder()
+        self.carriers = {key: self._carriers[key].name for key in _INPUTS}
+        """Signals that carry u and y, as ``Message.Signal``."""
+        for key in _INPUTS:
+            self._check_range(key, None)
+            self._readers[self._carriers[key].message.name].watch(self._carriers[key].signal.name)
+        for found in carriers:
+            self._readers[found.message.name].use([found.signal.name])
+
+    def _watch_flag(self, key: str, name: str) -> None:
+        """Count the frames in which a flag is set."""
+        self._flags[name] = key
+        message, _, signal = name.rpartition(".")
+        self._readers[message].watch_flag(signal)
 
     def _start_values(
         self, where: str, message: Any, constant: Mapping[str, float], carriers: Sequence[Any]
@@ -290,16 +355,16 @@ class EcuMessages:
             raise self._error(where, f"message {message.name} cannot be encoded: {error}") from error
         return values
 
-    def _raw_values(self, key: str, channel: Channel | None) -> Sequence[float]:
-        """Raw value of the signal for each code.
+    def _check_range(self, key: str, channel: Channel | None) -> tuple[float, float] | None:
+        """Scale and offset of the value of a code; None if they depend on a channel that is not known.
 
         :raises ConfigurationError: a value does not fit.
         """
         found = self._carriers[key]
         codes = self._description.send.codes if channel is None else channel.codes
-        factors = scale(self._units(key), channel)
+        factors = scale(getattr(self._description.send.units, key), channel)
         if factors is None:
-            return ()
+            return None
         factor, offset = factors
         if factor == 0.0:
             raise self._error(f"send.units.{key}", "the scale is 0")
@@ -309,11 +374,7 @@ class EcuMessages:
             except ConfigurationError as error:
                 cure = f"set send.units.{key}, or correct scale and range of {found.name} in the DBC"
                 raise ConfigurationError(f"{error}: {cure}") from error
-        return [_to_raw(found.signal, code * factor + offset) for code in range(codes)]
-
-    def _units(self, key: str) -> Units:
-        units: Units = getattr(self._description.send.units, key)
-        return units
+        return factors
 
     # ---------------------------------------------------------------------------------------------------------- receive
 
@@ -331,44 +392,113 @@ class EcuMessages:
             self.quantities.append((key, found.name))
         if not self.quantities:
             raise self._error("receive", "no signal is named: name alarm, theta, or both")
+        self._check_events()
+        self.alarm_states = self._states(received.alarm)
         if received.complete:
             self._answers.setdefault(self._message("receive.complete", received.complete).name, {})
         self._receive_counters = self._counters("receive.counter", received.counter)
+        self._set_checksums("receive.checksum", received.checksum, self._receive_counters, self._answers)
         for name in self._receive_counters:
             if name not in self._answers:
                 raise self._error("receive.counter", f"message {name} carries nothing else of an answer")
-        if received.counter and received.counter_is == "echo":
-            self._check_echo()
-        self._by_identifier = {_identifier(self._frames[name]): self._frames[name] for name in self._answers}
-
-    def _check_echo(self) -> None:
-        """Check that echoed counters fit.
-
-        :raises ConfigurationError: there is no counter to echo, or it has another range.
-        """
-        if not self._send_counters:
+        if received.counter and received.counter_is == "echo" and not self._send_counters:
             raise self._error("receive.counter", "an echo needs send.counter; or set counter_is = 'own'")
-        sent = _modulus(next(iter(self._send_counters.values())))
-        for found in self._receive_counters.values():
-            if _modulus(found) > sent:
-                raise self._error(
-                    "receive.counter", f"{found.name} counts to {_modulus(found) - 1}, send.counter to {sent - 1}"
-                )
+        self._read_answers()
 
-    @property
-    def count_moduli(self) -> Mapping[str, int]:
-        """Modulus of the counter of each message of an answer that has one."""
-        return {name: _modulus(found) for name, found in self._receive_counters.items()}
+    def _read_answers(self) -> None:
+        """Read the signals of the answers in their frames."""
+        self._by_identifier = {self._readers[name].identifier: self._readers[name] for name in self._answers}
+        for name, signals in self._answers.items():
+            self._readers[name].use(signals)
+        for key, name in self.quantities:
+            message, _, signal = name.rpartition(".")
+            if key in {"alarm", "armed"}:
+                self._watch_flag(key, name)
+            else:
+                self._readers[message].watch(signal)
+        for name, counter in self._receive_counters.items():
+            self._readers[name].use([counter.signal.name])
 
-    @property
-    def sample_modulus(self) -> int | None:
-        """Modulus of the sample's counter; None without one."""
-        return next(map(_modulus, self._send_counters.values()), None)
+    def _check_events(self) -> None:
+        """:raises ConfigurationError: an event carries more than the alarm, or no other message answers a sample."""
+        received = self._description.receive
+        for name in received.events:
+            carried = set(self._answers.get(self._message("receive.events", name).name, {}).values())
+            if carried != {received.alarm}:
+                raise self._error("receive.events", f"message {name} must carry alarm, and no other quantity")
+        if not received.complete and self.events >= set(self._answers):
+            cure = "name a signal of one that comes with each sample, or complete"
+            raise self._error("receive.events", f"no other message shows that a sample was taken: {cure}")
 
-    @property
-    def is_each_answer_counted(self) -> bool:
+    def _states(self, alarm: str) -> frozenset[float] | None:
+        """Values that stand for an alarm; None if every nonzero one does.
+
+        :raises ConfigurationError: the DBC names no such value.
+        """
+        if not alarm or not self._description.states:
+            return None
+        signal = self._signal("receive.alarm", alarm).signal
+        scaled = {
+            str(name): signal.conversion.raw_to_scaled(value, decode_choices=False)
+            for value, name in (signal.choices or {}).items()
+        }
+        names = {name: float(value) for name, value in scaled.items()}
+        for state in self._description.states:
+            if isinstance(state, str) and state not in names:
+                raise self._error("receive.alarm_is", f"{alarm} has no value {state!r}{suggest(state, names)}")
+        return frozenset(names[state] if isinstance(state, str) else float(state) for state in self._description.states)
+
+    def _count_moduli(self) -> None:
+        """Find out how far each counter counts."""
+        received = self._description.receive
+        self.counter_names = {name: found.name for name, found in self._receive_counters.items()}
+        """Counter of each message of an answer that has one, as ``Message.Signal``."""
+        self.sent_counters = {name: found.name for name, found in self._send_counters.items()}
+        """Counter of each message of a sample that has one, as ``Message.Signal``."""
+        self.sent_moduli = {name: self._modulus(found) for name, found in self._send_counters.items()}
+        """Modulus of the counter of each message of a sample that has one."""
+        sent = set(self.sent_moduli.values())
+        self.sample_modulus = max(sent, default=None)
+        """Largest modulus of a counter of the sample; None without one."""
+        moduli = {name: self._modulus(found) for name, found in self._receive_counters.items()}
+        is_bounded = received.counter_is == "echo" and self.sample_modulus is not None
+        self.count_moduli = {name: min(n, self.sample_modulus or n) if is_bounded else n for name, n in moduli.items()}
+        """Modulus of the counter of each message of an answer that has one; an echo has no more than the sample's."""
+        self.echo_moduli = {name: n if n in sent else max(sent, default=1) for name, n in self.count_moduli.items()}
+        """Modulus of the sample's counter that each counter of an answer echoes: the same, or else the largest."""
+        self.is_each_answer_counted = set(self._receive_counters) >= set(self._answers) - self.events
         """True if each message of an answer has a counter."""
-        return set(self._receive_counters) == set(self._answers)
+
+    def conclude(self, *, in_log: bool) -> None:
+        """State the findings on the frames so far; ``in_log`` if they include those of the harness."""
+        needed = (*self.order, *self._answers) if in_log else tuple(self._answers)
+        self.traffic.conclude(needed, self.events, self._description.receive.alarm.rpartition(".")[0])
+        if in_log and self.start is not None and (texts := self.traffic.never_came([self.start.message])):
+            self.causes.state("start", f"{texts[0]}, with which [start] begins a run", loses=False)
+        for reader in self._readers.values():
+            for name, text in reader.misreadings():
+                self.causes.state(f"{name} reading", text, loses=False)
+            for name, text in reader.pages_that_never_came():
+                self.causes.state(f"{name} page", text, loses=True)
+            for name, n, total in reader.flags():
+                self._conclude_flag(name, n, total)
+
+    def _conclude_flag(self, name: str, n: int, total: int) -> None:
+        """Name a flag that is hardly ever at rest."""
+        key = self._flags[name]
+        if total < _LEAST_FLAGS or (n if key == "alarm" else total - n) <= _RESTLESS * total:
+            return
+        texts = {
+            "alarm": f"{name} is not 0 in {n} of {total} frames: is it inverted, or a state (receive.alarm_is)?",
+            "armed": f"{name} is 0 in {total - n} of {total} frames: is it inverted?",
+            "valid": f"{name} is 0 in {total - n} of {total} frames, which are missing samples: is it inverted?",
+        }
+        self.causes.state(f"{name} flag", texts[key], loses=key == "valid")
+
+    @property
+    def never_came(self) -> tuple[str, ...]:
+        """Messages of [receive] that never came, each in a sentence; events need not come."""
+        return self.traffic.never_came(name for name in self._answers if name not in self.events)
 
     # --------------------------------------------------------------------------------------------------------- requests
 
@@ -381,12 +511,14 @@ class EcuMessages:
         if message.name in self._fixed:
             raise self._error(f"{table}.message", f"message {message.name} is used twice")
         self._fixed[message.name] = self._start_values(f"{table}.signals", message, request.signals, ())
+        self._readers[message.name].use(request.signals)
         if request.answered and not request.answer:
             raise self._error(f"{table}.answered", "no answer is named")
         if request.answer:
             answer = self._message(f"{table}.answer", request.answer)
             for name in request.answered:
                 self._signal_of(f"{table}.answered", answer, name)
+            self._readers[answer.name].use(request.answered)
         return request
 
     # ------------------------------------------------------------------------------------------------------------ names
@@ -400,8 +532,8 @@ class EcuMessages:
 
         :raises ConfigurationError: there is none, or it cannot be used.
         """
-        if name in self._frames:
-            return self._frames[name]
+        if name in self._readers:
+            return self._readers[name].message
         message = next((each for each in self._database.messages if each.name == name), None)
         if message is None:
             known = [each.name for each in self._database.messages]
@@ -416,7 +548,7 @@ class EcuMessages:
             check_layout(message)
         except ValueError as error:
             raise self._error(where, f"{self._path}: {error}") from error
-        self._frames[name] = message
+        self._readers[name] = MessageReader(message, self.causes)
         return message
 
     def _signal(self, where: str, name: str) -> _Found:
@@ -427,6 +559,14 @@ class EcuMessages:
         message = self._message(where, message_name)
         return _Found(message, self._signal_of(where, message, signal_name), name)
 
+    def _whole(self, where: str, name: str) -> _Found:
+        """Signal that is an unsigned number, unscaled; errors as ``_message``."""
+        found = self._signal(where, name)
+        signal = found.signal
+        if signal.is_float or signal.is_signed or (signal.scale, signal.offset) != (1, 0):
+            raise self._error(where, f"{name} is not an unsigned number with the scale 1 and the offset 0")
+        return found
+
     def _signal_of(self, where: str, message: Any, name: str) -> Any:
         signal = next((each for each in message.signals if each.name == name), None)
         if signal is None:
@@ -436,15 +576,39 @@ class EcuMessages:
             raise self._error(where, f"{message.name}.{name} has the scale 0 in the DBC")
         return signal
 
+    def _set_checksums(
+        self, where: str, specs: Mapping[str, ChecksumSpec], counters: Mapping[str, _Found], used: Collection[str]
+    ) -> None:
+        """Give the messages their checksums.
+
+        :raises ConfigurationError: a signal cannot hold its checksum, or its message is not among ``used``.
+        """
+        for name, spec in specs.items():
+            found = self._whole(where, name)
+            signal, message = found.signal, found.message.name
+            if message not in used:
+                raise self._error(where, f"message {message} carries nothing else of [{where.partition('.')[0]}]")
+            if signal.multiplexer_ids is not None or self._readers[message].checksum is not None:
+                raise self._error(where, f"{name} is multiplexed, or the second checksum of its message")
+            counter = counters.get(message)
+            try:
+                checksum = FrameChecksum(spec, signal, None if counter is None else counter.signal.name)
+            except ValueError as error:
+                raise self._error(where, f"{name}: {error}") from error
+            self._readers[message].checksum = checksum
+
+    def _modulus(self, found: _Found) -> int:
+        """Number of values of a counter: those of the DBC, without 15 in a profile that leaves it out."""
+        checksums = {**self._description.send.checksum, **self._description.receive.checksum}
+        methods = {spec.method for name, spec in checksums.items() if name.rpartition(".")[0] == found.message.name}
+        return min(_counted(found), 15) if methods & set(COUNTED_TO_14) else _counted(found)
+
     def _counters(self, where: str, names: Iterable[str]) -> dict[str, _Found]:
         """Counters by message."""
         counters: dict[str, _Found] = {}
         for name in names:
-            found = self._signal(where, name)
-            signal = found.signal
-            if signal.is_float or signal.is_signed or (signal.scale, signal.offset) != (1, 0):
-                raise self._error(where, f"{name} is not an unsigned number with the scale 1 and the offset 0")
-            if signal.multiplexer_ids is not None:
+            found = self._whole(where, name)
+            if found.signal.multiplexer_ids is not None:
                 raise self._error(where, f"{name} is multiplexed: not every frame of its message has it")
             if counters.setdefault(found.message.name, found) is not found:
                 raise self._error(where, f"message {found.message.name} has two counters")
@@ -474,17 +638,13 @@ class EcuMessages:
         return raw
 
 
-def _identifier(message: Any) -> Identifier:
-    return message.frame_id, message.is_extended_frame
-
-
 def _integer_range(signal: Any) -> tuple[int, int]:
     if signal.is_signed:
         return -(1 << signal.length - 1), (1 << signal.length - 1) - 1
     return 0, (1 << signal.length) - 1
 
 
-def _modulus(found: _Found) -> int:
+def _counted(found: _Found) -> int:
     """Number of values of a counter, which runs from 0 to its maximum in the DBC or to that of its bits."""
     signal = found.signal
     maximum = _integer_range(signal)[1]
@@ -495,20 +655,3 @@ def _to_raw(signal: Any, value: float) -> float:
     """Value before the DBC's scaling; a whole number unless the signal is a float."""
     raw = (value - signal.offset) / signal.scale
     return float(raw) if signal.is_float or not math.isfinite(raw) else round(raw)
-
-
-def _frame_bytes(n: int) -> int:
-    """Length of the shortest frame that holds ``n`` bytes."""
-    return int(can.util.dlc2len(can.util.len2dlc(n)))
-
-
-def _decode(message: Any, frame: can.Message) -> dict[str, float] | None:
-    """Physical values of the signals in a frame; None if it is damaged."""
-    length = message.length
-    if len(frame.data) != length and len(frame.data) != _frame_bytes(length):
-        return None
-    try:
-        values: dict[str, float] = message.decode_simple(bytes(frame.data[:length]), decode_choices=False)
-    except Exception:  # noqa: BLE001 - the exceptions of cantools and bitstruct have no common base
-        return None
-    return values

@@ -67,7 +67,7 @@ _COUNTERS = dict.fromkeys(("updated", "missing"), ctypes.c_uint32) | dict.fromke
 )
 """Fields of est_counters_t with their C types."""
 
-_REPORTED = [name for name in _COUNTERS if name != "outliers"]
+REPORTED = [name for name in _COUNTERS if name != "outliers"]
 """Counters that devices report, the first ones: no message has the outliers."""
 
 
@@ -144,7 +144,7 @@ class Estimator:
     def counters(self) -> Mapping[str, int]:
         """Counters since the start, by their names in est_counters_t, as far as devices report them."""
         counters = self._c.library_counters(self._state)
-        return {name: int(getattr(counters, name)) for name in _REPORTED}
+        return {name: int(getattr(counters, name)) for name in REPORTED}
 
     def run(
         self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None, *, with_theta: bool = True
@@ -186,7 +186,7 @@ class Estimator:
             self._refuse()
         for theta, innovation, statistic, status, alarm, counted in zip(*arrays, counters.tolist(), strict=True):
             output = EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm))
-            yield output, dict(zip(_REPORTED, counted, strict=False))
+            yield output, dict(zip(REPORTED, counted, strict=False))
 
     def _room(self, shape: tuple[int, ...], *, with_theta: bool) -> tuple[_Arrays, _Out]:
         """Arrays for theta, innovation, statistic, status and alarm of samples of this shape."""
@@ -198,30 +198,3 @@ class Estimator:
             np.empty(shape, np.bool_),
         )
         return arrays, _Out(*(array.ctypes.data if array.size else None for array in arrays))
-
-    def save(self) -> NDArray[np.uint8]:
-        """State after the last sample, for ``branch`` of the same object; (size,)."""
-        return np.frombuffer(bytes(self._state), np.uint8).copy()
-
-    def branch(
-        self, saved: NDArray[np.uint8], u: ArrayLike, y: ArrayLike, valid: ArrayLike
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.uint8]]:
-        """Continue from several saved states, each with its own samples.
-
-        :param saved: (b, size), rows of ``save``.
-        :param u: (b, n); y and valid likewise, as of ``run``.
-
-        :return: statistic and alarm, (b, n), and the states afterwards, (b, size).
-        """
-        u, y = (np.ascontiguousarray(x, dtype=np.float32) for x in (u, y))
-        mask, after = np.ascontiguousarray(valid, dtype=np.uint8), np.array(saved, order="C")
-        statistic, alarm = np.empty(u.shape, np.float32), np.empty(u.shape, np.bool_)
-        state, size, n = ctypes.addressof(self._state), len(self._state), u.shape[1]
-        rows = [(x.ctypes.data, x.strides[0]) for x in (after, u, y, mask, statistic, alarm)]
-        for i in range(len(after)):
-            kept, u_i, y_i, mask_i, statistic_i, alarm_i = (start + i * stride for start, stride in rows)
-            ctypes.memmove(state, kept, size)
-            out = _Out(statistic=statistic_i, alarm=alarm_i)
-            self._c.library_run(state, n, u_i, y_i, mask_i, ctypes.byref(out))
-            ctypes.memmove(kept, state, size)
-        return statistic, alarm, after

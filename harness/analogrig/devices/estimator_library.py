@@ -3,51 +3,129 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import math
-import time
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analogrig.answers import Answers, RaisedAlarm, Samples
-from analogrig.catalogue import SteppedFlag
-from analogrig.datasheet import Datasheet
-from analogrig.devices.adapted import AdaptedDescription
-from analogrig.devices.description import Capability
+from analogrig.datasheet import MOST_THETA, Datasheet
+from analogrig.devices.child import PROGRAMS
 from analogrig.devices.device import Device
-from analogrig.devices.library_host import (
-    SLOT_SAMPLES,
-    SLOTS,
-    About,
-    ChildHost,
-    InProcessHost,
-    LibraryHost,
-    Reports,
-)
-from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused, TimeLimitReached
-from analogrig.protocol.pace import Pace
-from analogrig.run import UNARMED
+from analogrig.devices.foreign_device import ForeignDescription, ForeignDevice
+from analogrig.devices.foreign_host import ForeignCall, ForeignHost
+from analogrig.devices.foreign_memory import MOST_MESSAGE, SharedLayout
+from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused
 from analogrig.trust import Thing, absolute_path
 from analogrig.wording import one_line
 
+PROGRAM = PROGRAMS / "analogrig-library"
+
+ABI = 1
+"""ANALOGRIG_ABI."""
+
+MOST_STATE_BYTES = 1 << 28
+
+_MOST_SETTINGS = 256
+"""SETTINGS_MAX of library_child.c."""
+
+_LAYOUT = SharedLayout(np.dtype([("u", "<f4"), ("y", "<f4"), ("valid", "<u4")]))
+"""Samples are analogrig_in_t."""
+
+_HELLO = struct.Struct("=IIQI1024sI")
+
+
+class Reports(enum.IntFlag):
+    """Flags of analogrig_about_t.reports."""
+
+    STATISTIC = 1
+    INNOVATION = 2
+    ARMED = 4
+
+
+class About(NamedTuple):
+    """Facts that a library states about itself: analogrig_about_t."""
+
+    abi: int
+    theta_n: int
+    state_bytes: int
+    reports: int
+    name: str
+    """Name and version; any characters."""
+
+
+class LibraryHost(ForeignHost):
+    """A library of analogrig_estimator.h in a child process."""
+
+    layout = _LAYOUT
+    step_name = "analogrig_step"
+    what = "library"
+    start_name = "analogrig_init"
+
+    def __init__(self, device: str, library: Path, timeout_s: float) -> None:
+        """Start the process, which loads the library.
+
+        :raises ConfigurationError: the file is no library of analogrig_estimator.h.
+        :raises DeviceCrashed: the library crashes or hangs while it is loaded.
+        :raises LinkError: analogrig-library was not built.
+        """
+        super().__init__(device, [PROGRAM, library], timeout_s)
+        try:
+            self.about = self.facts = self._read_about(library)
+            self.lay_out(self.about.theta_n)
+        except BaseException:
+            self.close()
+            raise
+
+    def _read_about(self, library: Path) -> About:
+        hello, where = self.hello(), f"device {self._device}: {library}"
+        if len(hello) != _HELLO.size:
+            text = hello.decode(errors="replace").removeprefix(f"{library}: ")
+            raise ConfigurationError(f"{where}: is no library of an estimator: {text}")
+        abi, theta_n, state_bytes, reports, name, is_single = _HELLO.unpack(hello)
+        self._is_single = bool(is_single)
+        about = About(abi, theta_n, state_bytes, reports, name.rstrip(b"\0").decode(errors="replace"))
+        if abi != ABI:
+            built = f"was built for ABI {abi} of analogrig_estimator.h, and this analogrig has {ABI}"
+            raise ConfigurationError(f"{where}: {built}: compile it again")
+        limits = (("theta_n", MOST_THETA), ("state_bytes", MOST_STATE_BYTES), ("reports", sum(Reports)))
+        for key, most in limits:
+            if (value := getattr(about, key)) > most:
+                raise ConfigurationError(f"{where}: analogrig_about gives {key} = {value}, and the largest is {most}")
+        return about
+
+    def overrun(self, call: ForeignCall, what: str) -> DeviceError:
+        size = f", which has state_bytes = {self.about.state_bytes}" if what == "its state" else ""
+        return super().overrun(call, f"{what}{size}")
+
+    def _start(self, settings: Mapping[str, float]) -> None:
+        words = b"".join(f"{name}={float(value).hex()}\0".encode() for name, value in settings.items())
+        if len(settings) > _MOST_SETTINGS or len(words) >= MOST_MESSAGE:
+            raise DeviceRefused(f"device {self._device}: the settings are more than {_MOST_SETTINGS}, or too long")
+        result, _ = self.begin(words, self._timeout_s)
+        if 0 < result <= len(settings):
+            name, value = list(settings.items())[result - 1]
+            raise DeviceRefused(f"device {self._device}: the library refuses the setting {name} = {value:g}")
+        if result:
+            raise DeviceError(f"device {self._device}: cannot start: analogrig_init returned {result}")
+
 
 @dataclass(frozen=True, kw_only=True)
-class EstimatorLibrary(AdaptedDescription):
+class EstimatorLibrary(ForeignDescription):
     """An estimator of your own in a shared library. `analogrig include` prints the folder of its header."""
 
     kind: ClassVar[str] = "library"
-    usage: ClassVar[str] = "library:FILE.so[?in_process=true]"
+    place_key: ClassVar[str] = "library"
+    no_place: ClassVar[str] = "device {name!r}: names no library: use {kind}:./my_estimator.so"
+    usage: ClassVar[str] = "library:FILE.so[?SETTING=VALUE&...]"
     summary: ClassVar[str] = "estimator of your own in a shared library with three functions"
-    collects: ClassVar[str] = "settings"
+    state_types: ClassVar[tuple[type[int | str], ...]] = (int,)
     library: str
     """Shared library."""
-    in_process: bool = False
-    """True: run in this process, which a crash of the library ends; False: in a child process."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -58,21 +136,6 @@ class EstimatorLibrary(AdaptedDescription):
                 raise ValueError(f"settings: {name!r} is no name of a setting: use letters, digits and _")
             if isinstance(value, str) or not math.isfinite(value):
                 raise ValueError(f"settings: {name} must be a finite number, not {value!r}")
-
-    @classmethod
-    def check_place(cls, name: str, place: str) -> None:
-        """:raises ConfigurationError: no library is named."""
-        if place in {"", ":"}:
-            raise ConfigurationError(f"device {name!r}: names no library: use {cls.kind}:./my_estimator.so")
-
-    @classmethod
-    def _place(cls, name: str, place: str) -> dict[str, Any]:  # noqa: ARG003
-        return {"library": place}
-
-    @property
-    def capabilities(self) -> frozenset[Capability]:
-        always: frozenset[Capability] = frozenset({"blocks", "configure"})
-        return always | ({"in-process"} if self.in_process else frozenset())
 
     def open(self) -> Device:
         return EstimatorLibraryDevice(self)
@@ -98,35 +161,11 @@ class EstimatorLibrary(AdaptedDescription):
     def placed(self, folder: Path) -> Self:
         return dataclasses.replace(self, library=absolute_path(self.library, folder))
 
-    def host(self) -> LibraryHost:
-        """The library, loaded anew.
 
-        :raises ConfigurationError: the file is no library of analogrig_estimator.h.
-        :raises DeviceError: the library crashes or hangs.
-        """
-        if not self.program.is_file():
-            raise ConfigurationError(f"device {self.name}: there is no file {self.library}")
-        if self.in_process:
-            return InProcessHost(self.name, self.program)
-        return ChildHost(self.name, self.program, self.numbers, self.timeout_s)
-
-    @property
-    def numbers(self) -> Mapping[str, float]:
-        """Settings as the library takes them."""
-        return {name: float(value) for name, value in self.settings.items()}
-
-
-class _Piece(NamedTuple):
-    """Samples of one call of the library: all of a block, or a piece of a long one."""
-
-    samples: Samples
-    skipped_n: int
-    """Samples before the block, which were skipped and are missing samples to the library."""
-    is_last: bool
-
-
-class EstimatorLibraryDevice(Device):
+class EstimatorLibraryDevice(ForeignDevice[LibraryHost]):
     """Estimator in a shared library."""
+
+    reports_states = True
 
     def __init__(self, description: EstimatorLibrary, *, alarms_only: bool = False) -> None:
         """Nothing is loaded yet: ``recover`` does so.
@@ -135,46 +174,28 @@ class EstimatorLibraryDevice(Device):
         """
         super().__init__(description)
         self._description: EstimatorLibrary = description
-        self._as_opened = description.settings
         self._alarms_only = alarms_only
-        self._opened: LibraryHost | None = None
-        self._until_s = math.inf
-        self._posted: deque[_Piece] = deque()
-        self._answered: list[Answers] = []
-        """Answers to the first pieces of a block."""
-        self._next_index = 0
-        self._held = np.zeros(2, np.uint16)
-        """u and y of the last valid sample."""
 
-    @property
-    def datasheet(self) -> Datasheet:
-        return super().datasheet if self._opened is None else self._sheet
+    def load(self) -> LibraryHost:
+        described = self._description
+        if not described.program.is_file():
+            raise ConfigurationError(f"device {self.name}: there is no file {described.library}")
+        return LibraryHost(self.name, described.program, described.timeout_s)
 
-    def description(self) -> Mapping[str, Any]:
-        return super().description() if self._opened is None else self._table
-
-    @property
-    def _host(self) -> LibraryHost:
-        if self._opened is None:
-            raise DeviceError(f"device {self.name}: is closed")
-        return self._opened
+    def numbers(self) -> Mapping[str, float]:
+        return {name: float(value) for name, value in self._description.settings.items()}
 
     def recover(self) -> None:
-        self.close()
         if self._description.files() != self._files:
+            self.close()
             raise DeviceError(f"device {self.name}: its file was replaced since it was opened: start again")
-        self._opened = self._description.host()
-        self._opened.limit(self._until_s)
-        self._sheet = self._complete(self._opened.about)
-        identity = {"firmware": one_line(self._opened.about.name)}
-        # Runs share the table: to write it anew for each takes as long as to play a thousand samples.
-        self._table = {**super().description(), "identity": identity}
+        super().recover()
 
-    def _complete(self, about: About) -> Datasheet:
-        """Stated data sheet with the quantities that the library reports."""
+    def stated(self) -> tuple[Datasheet, Mapping[str, Any]]:
+        about = self._host.about
         try:
-            return dataclasses.replace(
-                self._description.datasheet,
+            sheet = dataclasses.replace(
+                self._description.known_datasheet(),
                 **({"theta_n": 0, "model": None} if self._alarms_only else {"theta_n": about.theta_n}),
                 statistic=bool(about.reports & Reports.STATISTIC),
                 innovation=bool(about.reports & Reports.INNOVATION),
@@ -182,150 +203,4 @@ class EstimatorLibraryDevice(Device):
             )
         except ValueError as error:
             raise ConfigurationError(f"device {self.name}: datasheet: {error}") from error
-
-    def configure(self, **settings: Any) -> None:
-        try:
-            described = dataclasses.replace(self._description, settings={**self._as_opened, **settings})
-        except ValueError as error:
-            raise DeviceRefused(f"device {self.name}: {error}") from error
-        before = self._description
-        if described != before:
-            self._description = described
-            self.recover()
-        try:
-            self.start()
-        except DeviceRefused:
-            self._description = before
-            self.recover()
-            raise
-
-    def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
-        if not self._host.is_idle:
-            self.recover()
-        self._posted.clear()
-        self._answered.clear()
-        self._next_index = 0
-        self._held[:] = 0
-        self._host.start(self._description.numbers)
-
-    def limit(self, left_s: float) -> None:
-        self._until_s = time.monotonic() + left_s
-        if self._opened is not None:
-            self._opened.limit(self._until_s)
-
-    def close(self) -> None:
-        if self._opened is not None:
-            self._opened.close()
-            self._opened = None
-
-    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
-        try:
-            for block in blocks:
-                while self._posted and not len(block):
-                    yield from self._take()
-                for piece in self._pieces(block):
-                    if len(self._posted) == SLOTS:
-                        yield from self._take()
-                    self._post(piece)
-            while self._posted:
-                yield from self._take()
-        except TimeLimitReached:
-            yield from self._take_in_time()
-            raise
-
-    def _pieces(self, block: Samples) -> Iterator[_Piece]:
-        skipped_n = block.skipped_after(self._next_index)
-        whole = _after_missing(skipped_n, block) if skipped_n else block
-        if 0 < len(whole) <= SLOT_SAMPLES:
-            yield _Piece(whole, skipped_n, is_last=True)
-            self._next_index += len(whole)
-            return
-        for start in range(0, len(whole), SLOT_SAMPLES):
-            piece = slice(start, start + SLOT_SAMPLES)
-            samples = Samples(whole.first + start, whole.u[piece], whole.y[piece], whole.valid[piece])
-            yield _Piece(samples, skipped_n, is_last=piece.stop >= len(whole))
-        self._next_index += len(whole)
-
-    def _post(self, piece: _Piece) -> None:
-        samples = piece.samples
-        u, y = samples.u, samples.y
-        if not samples.valid.all():
-            last = np.maximum.accumulate(np.where(samples.valid, np.arange(1, len(samples) + 1), 0))
-            u, y = (np.concatenate(([held], x))[last] for held, x in zip(self._held, (u, y), strict=True))
-        self._held[:] = u[-1], y[-1]
-        self._host.post(u, y, samples.valid)
-        self._posted.append(piece)
-
-    def _take(self) -> Iterator[Answers]:
-        """Wait for the records of the oldest piece. Yield the answers to its block if it is the last of it."""
-        piece = self._posted[0]
-        records = self._host.take(len(piece.samples), piece.samples.first)
-        self._answered.append(self._answers(piece.samples, records))
-        self._posted.popleft()
-        if piece.is_last:
-            yield self._join(piece.skipped_n)
-
-    def _take_in_time(self) -> Iterator[Answers]:
-        """Answers that have come; those to the last block in part."""
-        try:
-            while self._posted:
-                yield from self._take()
-        except TimeLimitReached:
-            piece = self._posted[0]
-            self._answered.append(self._answers(piece.samples, self._host.answered(len(piece.samples))))
-            yield self._join(piece.skipped_n)
-
-    def _join(self, skipped_n: int) -> Answers:
-        """Answers to a block from those to its pieces."""
-        pieces, self._answered = self._answered, []
-        if len(pieces) == 1 and not skipped_n:
-            return pieces[0]
-
-        def joined(name: str) -> Any:
-            arrays = [getattr(piece, name) for piece in pieces]
-            return None if arrays[0] is None else np.concatenate(arrays)[skipped_n:]
-
-        alarms = tuple(alarm for piece in pieces for alarm in piece.alarms)
-        names = ("flags", "theta", "innovation", "statistic")
-        return Answers(alarms=alarms, **{name: joined(name) for name in names})
-
-    def _answers(self, samples: Samples, records: NDArray[Any]) -> Answers:
-        """Answers from the first records of a piece; copies, since the records will be overwritten."""
-        sheet, valid = self._sheet, samples.valid[: len(records)]
-        flags = np.zeros(len(records), np.uint8)
-        if not valid.all():
-            flags[~valid] = SteppedFlag.MISSING
-        if records["refused"].any():
-            flags[valid & (records["refused"] != 0)] |= np.uint8(SteppedFlag.REFUSED)
-        if sheet.armed:
-            flags[records["armed"] == 0] |= UNARMED
-        alarm = records["alarm"]
-        indices = np.flatnonzero(alarm).tolist() if alarm.any() else []
-        return Answers(
-            flags=flags,
-            alarms=tuple(
-                RaisedAlarm(samples.first + k, statistic=float(records["statistic"][k]) if sheet.statistic else 0.0)
-                for k in indices
-            ),
-            theta=self._numbers("theta", samples.first, records) if sheet.theta_n else None,
-            innovation=self._numbers("innovation", samples.first, records) if sheet.innovation else None,
-            statistic=self._numbers("statistic", samples.first, records) if sheet.statistic else None,
-        )
-
-    def _numbers(self, name: str, first: int, records: NDArray[Any]) -> NDArray[np.float32]:
-        """Copy of a field of the records, the first of which is that of the sample ``first``.
-
-        :raises DeviceError: a number is non-finite.
-        """
-        numbers: NDArray[np.float32] = records[name].copy()
-        if not (are_finite := np.isfinite(numbers)).all():
-            index = int(np.argmin(are_finite.reshape(len(records), -1).all(axis=1)))
-            raise DeviceError(f"device {self.name}: sample {first + index}: {name} is non-finite: {numbers[index]}")
-        return numbers
-
-
-def _after_missing(n: int, block: Samples) -> Samples:
-    """The block after ``n`` missing samples."""
-    codes = np.zeros(n, np.uint16)
-    u, y = np.concatenate((codes, block.u)), np.concatenate((codes, block.y))
-    return Samples(block.first - n, u, y, np.concatenate((np.zeros(n, np.bool_), block.valid)))
+        return sheet, {"identity": {"firmware": one_line(about.name)}}

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import atexit
 import ctypes
-import functools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
@@ -27,9 +25,6 @@ OWN_LIBRARIES = (LIBRARY, WIDE_LIBRARY, FIXED_LIBRARY)
 
 _FIXED_ORDERS = {"na": 2, "nb": 3, "nk": 0, "nc": 0, "offset": True}
 """FIXED_ORDERS of setup.py."""
-
-EXIT_GUARD = LIBRARY.with_name("_exit_guard.so")
-"""exit_guard.c: after exit() in a user's library, the status of this process is no success."""
 
 ALWAYS_ROOM = 255
 """Input blocks of a device that handles every message before the call returns: no message ever waits."""
@@ -54,21 +49,18 @@ class IdentityStruct(ctypes.Structure):
     )
 
 
-_HOW_TO = "sources to compile: harness/docs/howto/replace-the-core.md"
+_HOW_TO = "sources to compile: harness/docs/howto/check-a-port-of-the-estimator.md"
 
 
-def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -> ctypes.CDLL:
+def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
     """The library of the project's device or of a user's own, with all of ``functions``.
 
-    :param cure: advice if a function is lacking.
     :raises LinkError: the project's library was not built.
     :raises ConfigurationError: the user's library cannot be loaded, or lacks a function.
     """
     if library.exists() and not library.is_file():
         raise ConfigurationError(f"{library}: not a file")
     try:
-        if library not in OWN_LIBRARIES:
-            _exit_guard().exit_guard_arm(str(library).encode())
         c = ctypes.CDLL(str(library))
     except OSError as error:
         if library in OWN_LIBRARIES:
@@ -77,7 +69,7 @@ def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -
         raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
     lacking = [function for function in functions if not hasattr(c, function)]
     if lacking:
-        raise ConfigurationError(f"{library}: is no library of a device: it lacks {', '.join(lacking)} ({cure})")
+        raise ConfigurationError(f"{library}: is no library of a device: it lacks {', '.join(lacking)} ({_HOW_TO})")
     return c
 
 
@@ -90,13 +82,6 @@ def estimator_library_for(estimator: EstimatorConfig) -> Path:
     """The fastest build of the estimator alone for these settings, whose orders are final."""
     is_fixed = all(getattr(estimator, name) == order for name, order in _FIXED_ORDERS.items())
     return FIXED_LIBRARY if is_fixed else library_for(estimator)
-
-
-@functools.cache
-def _exit_guard() -> ctypes.CDLL:
-    guard = ctypes.CDLL(str(EXIT_GUARD))
-    atexit.register(guard.exit_guard_disarm)  # Python runs it before it calls exit() itself
-    return guard
 
 
 def unwritten(size: int) -> ctypes.Array[ctypes.c_char]:
@@ -149,13 +134,14 @@ class MemoryWire(LibraryDevice):
         """Boot a device; parameters and errors as ``LibraryDevice``."""
         super().__init__("serial", boot_nonce=boot_nonce, catalogue_hash=catalogue_hash, library=library)
         self._output = unwritten(_OUTPUT_BYTES)
+        self._given = memoryview(self._output)
         self.clock = VirtualClock() if clock is None else clock
         self._answers = b""
 
     def write(self, sent: bytes) -> None:
         while True:
             progress = self.run(self.state, sent, len(sent), self._output, _OUTPUT_BYTES)
-            self._answers += ctypes.string_at(self._output, progress.given)
+            self._answers += self._given[: progress.given]
             sent = sent[progress.taken :]
             if not progress.given and not sent:
                 return

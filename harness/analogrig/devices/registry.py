@@ -1,19 +1,23 @@
-"""Devices by name: kinds, shipped descriptions, files, and tables of plain values."""
+"""Devices by name: kinds, shipped descriptions, files, tables of plain values; and opening them."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from analogrig import config
-from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import Device, DeviceDescription
 from analogrig.errors import ConfigurationError
 from analogrig.kinds import Kinds
 from analogrig.trust import Thing, Trust, file_of, folder_of
+
+if TYPE_CHECKING:
+    from analogrig.links.link import CanListener
 
 _FOUND_OUT = ("identity", "datasheet")
 """Tables of a record that the device, once opened, adds to its description."""
@@ -28,19 +32,20 @@ KINDS = Kinds(
     DeviceDescription,
     "analogrig.devices",
     {
-        "host": "analogrig.devices.host:HostDevice",
+        "host": "analogrig.devices.processes:HostDevice",
         "inproc": "analogrig.devices.inproc:InprocDevice",
         "library": "analogrig.devices.estimator_library:EstimatorLibrary",
-        "qemu-m3": "analogrig.devices.qemu:QemuM3",
-        "qemu-m4": "analogrig.devices.qemu:QemuM4",
-        "qemu-m7": "analogrig.devices.qemu:QemuM7",
-        "qemu-f405": "analogrig.devices.qemu:QemuF405",
-        "serial": "analogrig.devices.serial:SerialDevice",
+        "qemu-m3": "analogrig.devices.processes:QemuM3",
+        "qemu-m4": "analogrig.devices.processes:QemuM4",
+        "qemu-m7": "analogrig.devices.processes:QemuM7",
+        "qemu-f405": "analogrig.devices.processes:QemuF405",
+        "serial": "analogrig.devices.port:SerialDevice",
         "can": "analogrig.devices.can:CanDevice",
         "can-dbc": "analogrig.devices.can_dbc:CanDbcDevice",
         "python": "analogrig.devices.python:PythonDescription",
         "lines": "analogrig.devices.lines:LinesDevice",
-        "exec": "analogrig.devices.program:ProgramDevice",
+        "frames": "analogrig.devices.lines:FramesDevice",
+        "exec": "analogrig.devices.lines:ProgramDevice",
     },
 )
 """Description of each kind of device."""
@@ -78,9 +83,8 @@ def _read(name: str) -> tuple[DeviceDescription, str]:
     """The description, and the file that holds it; no file if the name states everything."""
     kind = re.split("[:?]", name, maxsplit=1)[0]
     if kind in KINDS and name not in config.names("devices"):
-        KINDS[kind].check_place(name, name[len(kind) :].partition("?")[0])
         try:
-            return KINDS[kind].from_name(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
+            return KINDS[kind].from_name(name, name[len(kind) :]).placed(folder_of(name)), ""
         except ValueError as error:  # of the description of another package
             raise ConfigurationError(f"{name}: {error}") from error
     _check_known(name, kind)
@@ -139,3 +143,56 @@ def from_table(table: Mapping[str, Any], where: str) -> DeviceDescription:
         known = ", ".join(map(repr, KINDS))
         raise ConfigurationError(f"{where}: kind: must be one of {known}, not {table.get('kind')!r}")
     return config.build(described, {key: value for key, value in table.items() if key != "kind"}, where)
+
+
+def open_dut(
+    name: str | Path,
+    *,
+    allow: Trust | Iterable[str] = (),
+    listener: CanListener | None = None,
+    in_real_time: bool = False,
+    **changes: Any,
+) -> Device:
+    """Open a device by name: connected, configured and ready to start. Use it in a ``with`` statement.
+
+    :param name: ``host``, ``inproc[:LIBRARY]``, ``qemu-m4[:ELF]``, ``serial:URL``, ``can:INTERFACE/CHANNEL``, a shipped
+        name or a .toml file; ``?key=value`` appended to a name overrides fields of the description.
+    :param allow: libraries, firmware, ports and buses that a file may name (``analogrig.trust``).
+    :param listener: receives every frame of a CAN bus from its opening on.
+    :param in_real_time: exchange = "stream", unless ``changes`` has one or this kind of device has no such field.
+    :param changes: override fields of the description; None leaves a field as described.
+    :raises ConfigurationError: no such device, its description is wrong, or a file names what is not allowed.
+    :raises LinkError: the device cannot be reached.
+    :raises DeviceError: it refuses the configuration, or was built from another catalogue.
+    """
+    named = str(name) if isinstance(name, Path) else name
+    return _override(trusted(named, Trust.of(allow)), changes, in_real_time=in_real_time).connect(listener)
+
+
+def reopen_dut(
+    description: Mapping[str, Any],
+    file: str,
+    *,
+    allow: Trust | Iterable[str] = (),
+    listener: CanListener | None = None,
+    in_real_time: bool = False,
+    **changes: Any,
+) -> Device:
+    """Open the device of a record of ``Device.description()`` in ``file``; parameters and errors as ``open_dut``."""
+    described = recorded(description).placed(Path(file).parent)
+    Trust.of(allow).check(described.things, file)
+    return _override(described, changes, in_real_time=in_real_time).connect(listener)
+
+
+def _override(description: DeviceDescription, changes: Mapping[str, Any], *, in_real_time: bool) -> DeviceDescription:
+    """:raises ConfigurationError: a value is out of range, or this kind of device has no such field."""
+    wanted = {key: value for key, value in changes.items() if value is not None}
+    fields = {each.name for each in dataclasses.fields(description)}
+    if in_real_time and "exchange" in fields:
+        wanted.setdefault("exchange", "stream")
+    for key in wanted.keys() - fields:
+        raise ConfigurationError(f"device {description.name}: a device of the kind {description.kind} has no {key}")
+    try:
+        return dataclasses.replace(description, **wanted)
+    except ValueError as error:
+        raise ConfigurationError(f"device {description.name}: {error}") from error

@@ -1,4 +1,4 @@
-"""Meaning of the named fields of an answer, and the collection of the answers to a block."""
+"""Answers sample by sample, collected into blocks."""
 
 from __future__ import annotations
 
@@ -8,13 +8,72 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import LARGEST_FLOAT32, Answers, RaisedAlarm
+from analogrig.answers import (
+    EVENTS,
+    LARGEST_FLOAT32,
+    Answers,
+    RaisedAlarm,
+    ReportedDiagnosis,
+    ReportedMisfit,
+    not_finite_text,
+    plausible_orders,
+    raised_alarms,
+)
 from analogrig.catalogue import SteppedFlag
 from analogrig.config import suggest
 from analogrig.datasheet import MOST_THETA, Datasheet
-from analogrig.devices.templates import CHECKSUM, TemplateField
+from analogrig.devices.templates import CHECKSUM, PAD, TemplateField
 from analogrig.errors import DeviceError
 from analogrig.run import LOST, UNARMED, Channel
+
+
+class AnswerRows:
+    """Answers not yet taken, in lists: numpy takes as long for one number as for a hundred."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        """Number of elements of theta, plus one for the innovation."""
+        self.values: list[float] = []
+        self.statistics: list[float] = []
+        self.flags: list[int] = []
+        self.alarms: list[RaisedAlarm] = []
+        self.diagnoses: list[ReportedDiagnosis] = []
+        self.misfits: list[ReportedMisfit] = []
+        self._last_taken = (width * [0.0], 0.0)
+
+    def repeat(self, flags: int, statistic: float | None = None) -> None:
+        """Enter a sample without a report: the estimate of the sample before, and no innovation."""
+        row = self.values[-self.width :] or self._last_taken[0]
+        self.values += [*row[:-1], 0.0]
+        self.finish(flags, self.statistic if statistic is None else statistic)
+
+    @property
+    def statistic(self) -> float:
+        """Statistic of the latest sample."""
+        return (self.statistics or self._last_taken[1:])[-1]
+
+    def finish(self, flags: int, statistic: float) -> None:
+        self.flags.append(flags)
+        self.statistics.append(statistic)
+
+    def take(self, n: int, before: int) -> Answers:
+        """Remove and return the first n samples, and all that was reported before the index ``before``."""
+        cut = n * self.width
+        values = np.array(self.values[:cut], dtype=np.float32).reshape(n, self.width)
+        events = {name: [each for each in getattr(self, name) if each.index < before] for name in EVENTS}
+        out = Answers(
+            theta=values[:, :-1],
+            innovation=values[:, -1],
+            statistic=np.array(self.statistics[:n], dtype=np.float32),
+            flags=np.array(self.flags[:n], dtype=np.uint8),
+            **events,
+        )
+        if n:
+            self._last_taken = (self.values[cut - self.width : cut], self.statistics[n - 1])
+        del self.values[:cut], self.statistics[:n], self.flags[:n], self.alarms[: len(out.alarms)]
+        del self.diagnoses[: len(out.diagnoses)], self.misfits[: len(out.misfits)]
+        return out
+
 
 INDEX = "index"
 
@@ -24,9 +83,9 @@ _SWITCHES = ("alarm", "armed", "valid", "refused")
 _VALUES = ("statistic", "innovation")
 
 KNOWN = (INDEX, *_SWITCHES, *_VALUES, CHECKSUM)
-"""Fields that are no element of theta."""
+"""Fields with a meaning of their own."""
 
-_NOT_WHOLE = ("g", "a", "f32", "f64")
+_NOT_WHOLE = ("g", "a", "f32", "f64", "f32be", "f64be")
 """Types that are not whole numbers."""
 
 _FLAGS = (("armed", False, UNARMED), ("valid", False, SteppedFlag.REFUSED), ("refused", True, SteppedFlag.REFUSED))
@@ -46,7 +105,7 @@ class AnswerForm:
 
         :raises ValueError: an element of theta is not there, there are too many, or a name is almost a known one.
         """
-        present = tuple(name for name in names if name not in KNOWN)
+        present = tuple(name for name in names if name not in (*KNOWN, PAD))
         if theta is None:
             for name in present:
                 if suggestion := suggest(name, KNOWN, cutoff=0.8):
@@ -101,6 +160,7 @@ class AnswerAssembler:
         self._name = name
         self._to_codes = to_codes
         self._last = np.zeros((1, len(form.columns)))
+        self._switches_n = sum(name in _SWITCHES for name in form.columns)
 
     def answers(self, values: NDArray[np.float64], flags: NDArray[np.int64], first: int) -> Answers:
         """Answers to the n samples from ``first`` on.
@@ -110,7 +170,7 @@ class AnswerAssembler:
         :raises DeviceError: a value is not finite.
         """
         form, is_answer = self._form, (flags & NO_ANSWER) == 0
-        self._check(values, first + np.flatnonzero(is_answer))
+        self._check(values, first + np.flatnonzero(is_answer), flags[is_answer])
         values = np.concatenate([self._last, values])[np.cumsum(is_answer)]
         if len(values):
             self._last = values[-1:]
@@ -122,26 +182,28 @@ class AnswerAssembler:
         if self._to_codes is not None:
             theta = self._to_codes.theta(theta)
             innovation = None if innovation is None else innovation / self._to_codes.y.lsb_v
-        raised = np.flatnonzero(is_answer & (column["alarm"] != 0.0)).tolist() if "alarm" in column else ()
+        raised = np.flatnonzero(is_answer & (column["alarm"] != 0.0)) if "alarm" in column else np.empty(0, np.int64)
         return Answers(
             flags=(flags & 0xFF).astype(np.uint8),
-            alarms=tuple(
-                RaisedAlarm(first + row, statistic=0.0 if statistic is None else float(statistic[row]))
-                for row in raised
-            ),
+            alarms=raised_alarms(first + raised, 0.0 if statistic is None else statistic[raised]),
             theta=theta.astype(np.float32) if form.theta else None,
             innovation=None if innovation is None else innovation.astype(np.float32),
             statistic=None if statistic is None else statistic.astype(np.float32),
         )
 
-    def _check(self, values: NDArray[np.float64], samples: NDArray[np.int64]) -> None:
+    def _check(self, values: NDArray[np.float64], samples: NDArray[np.int64], flags: NDArray[np.int64]) -> None:
         """:raises DeviceError: a value is not finite."""
         bad = ~(np.abs(values) <= LARGEST_FLOAT32)
         if bad.any():
             row, at = (int(each[0]) for each in np.nonzero(bad))
+            with np.errstate(over="ignore", invalid="ignore"):
+                numbers = values[:, : len(self._form.columns) - self._switches_n].astype(np.float32)
+            found = [order for order, *_ in plausible_orders(numbers.ravel())]
+            cure = f"; {' or '.join(found)}, such values are plausible: correct the byte order" if found else ""
+            why = not_finite_text(is_missing=bool(flags[row] & SteppedFlag.MISSING))
             raise DeviceError(
                 f"device {self._name}: {self._form.columns[at]} = {values[row, at]:g} for sample {samples[row]},"
-                " which is not finite or too large for a float"
+                f" which is {why}{cure}"
             )
 
 

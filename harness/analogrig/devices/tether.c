@@ -3,7 +3,7 @@
 /// With --stdio, the inherited descriptors IN and OUT are the command's standard input and output.
 /// The end of standard input ends the command, by SIGTERM and a second later by SIGKILL. If this program is killed, the
 /// kernel kills the command. If the command ends by itself, this program writes the last part of the command's standard
-/// error, and exits with the same status or signal. Processes that the command left in its process group are killed.
+/// error, and exits with the same status or signal. Processes that the command left behind are killed.
 
 #include <errno.h>
 #include <signal.h>
@@ -21,6 +21,7 @@
 #define EXIT_USAGE 2
 #define EXIT_CANNOT_START 127
 #define GRACE_S 1U
+#define DESCENDANTS_MAX 10000U
 #define NO_STDIO (-1)
 
 /// Bytes of the command's standard error that are kept. The command may write any amount.
@@ -157,6 +158,27 @@ static void drain(const int errors, tail_t* const tail) {
     }
 }
 
+/// Kill what the command left behind: its process group, and the processes that have left the group. The kernel gives
+/// those to this process as soon as their parents end.
+static void end_descendants(const pid_t pid) {
+    char path[64];
+    long child = 0;
+    (void)kill(-pid, SIGKILL);  // ESRCH if there are none
+    (void)snprintf(path, sizeof(path), "/proc/self/task/%ld/children", (long)getpid());
+    for (unsigned i = 0U; i < DESCENDANTS_MAX; i++) {
+        FILE* const children = fopen(path, "re");
+        const bool  is_found = (children != NULL) && (fscanf(children, "%ld", &child) == 1);
+        if (children != NULL) {
+            (void)fclose(children);
+        }
+        if (!is_found) {
+            return;
+        }
+        (void)kill((pid_t)child, SIGKILL);
+        (void)waitpid((pid_t)child, NULL, 0);
+    }
+}
+
 static int exit_like(const int status, const sigset_t* const mask) {
     if (!WIFSIGNALED(status)) {
         return WEXITSTATUS(status);
@@ -188,6 +210,7 @@ int main(const int argc, char* argv[]) {
         !handle(SIGALRM, on_alarm) || !handle(SIGPIPE, SIG_IGN)) {
         return fail("cannot prepare");
     }
+    (void)prctl(PR_SET_CHILD_SUBREAPER, 1);
     const pid_t pid = fork();
     if (pid < 0) {
         return fail("cannot fork");
@@ -200,7 +223,7 @@ int main(const int argc, char* argv[]) {
     (void)close(errors[1]);
     close_stdio(stdio);
     const int status = watch(errors[0], &tail, &mask);
-    (void)kill(-pid, SIGKILL);  // its children, which hold its descriptors; ESRCH if there are none
+    end_descendants(pid);  // which hold its descriptors
     drain(errors[0], &tail);
     (void)!write(STDERR_FILENO, tail.bytes, tail.n);
     return exit_like(status, &mask);

@@ -8,6 +8,18 @@
 ///     ANALOGRIG_ESTIMATOR(mine_t, mine_init, mine_step, "mine 1.0", 0, 0);
 ///
 ///     cc -shared -fPIC -O2 -I"$(analogrig include)" -o mine.so mine.c && analogrig run --dut library:./mine.so
+///
+/// Samples come at the rate of the rig's card: 20,000/s on the shipped rigs, so T = 50 us of the machine. A program runs
+/// `speed` times faster than its plant (front, shock: 200), so T is speed * 50 us of the plant: 10 ms for front.
+/// Codes are volts at the card: volts = low + code * (high - low) / 2^bits. On the rig `emulator`, with 12 bits, u of
+/// front is -1 to 11 V, y is -1 to 9 V, and channels of other programs are -12.5 to 12.5 V. Volts times the unit per
+/// volt of the channel are the plant's units. `analogrig patch PROGRAM` prints T and all of these figures, the equations
+/// with their parameters and, of a linear program, A, B, C and the sampled F, G.
+///
+/// u is held between samples: that of sample k moves y from sample k + 1 on. Both have noise of 1 LSB rms and are
+/// rounded. Amplifiers' offsets move y off its model by some codes: estimate an offset, or a fixed model alarms at once.
+/// An estimator with a fixed model states latches = true in the [datasheet] of its device file, which judges a record
+/// up to its first alarm.
 #ifndef ANALOGRIG_ESTIMATOR_H
 #define ANALOGRIG_ESTIMATOR_H
 
@@ -30,7 +42,7 @@ typedef struct {
 } analogrig_about_t;
 
 typedef struct {
-    float    u, y;   ///< input and output of the plant in codes of the converter, 0 to 4095 at 12 bit
+    float    u, y;   ///< input and output of the plant in codes of the converter, 0 to 4095 at 12 bits
     uint32_t valid;  ///< 0: the sample is missing; u and y repeat the last valid sample
 } analogrig_in_t;
 

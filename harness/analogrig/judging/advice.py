@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
+from analogrig.judging.misread import misreadings
 from analogrig.judging.verdict import (
     DIAGNOSES,
     ESTIMATES,
@@ -20,7 +21,7 @@ from analogrig.judging.verdict import (
     is_beyond_model,
     unreported,
 )
-from analogrig.run import Run
+from analogrig.run import LOST, UNREPORTED, Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
 
@@ -45,6 +46,9 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         return ()
     return (
         *_statement(run),
+        *run.conditions.losses,
+        *run.conditions.remarks,
+        *misreadings(run, verdict),
         *misfits(verdict),
         *_orders(run, verdict),
         *_unjudged_quantities(run, verdict),
@@ -54,13 +58,14 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_excitation_beyond_the_scales(run, verdict),
         *_inputs_at_rest(run),
         *_channel_faults(verdict),
+        *_wrong_diagnoses(verdict),
         *_noise_setting(run),
         *_edge_spacing(run),
         *_warm_up(run),
         *_changes_in_warm_up(run, verdict),
         *_false_alarm_rate(verdict),
         *_undetectable_changes(verdict),
-        *_implausible_estimates(verdict),
+        *_implausible_estimates(run, verdict),
     )
 
 
@@ -187,6 +192,15 @@ def _channel_faults(verdict: Verdict) -> Iterator[str]:
         )
 
 
+def _wrong_diagnoses(verdict: Verdict) -> Iterator[str]:
+    for tweak in verdict.tweaks:
+        if tweak.diagnosis is not None and not tweak.diagnosis.right:
+            yield (
+                f"the device named {tweak.diagnosis.named} where {tweak.what} changed at {tweak.sample}: this does not"
+                " fail the run, since one diagnosis in twenty may be wrong; isolates() of a test judges diagnoses"
+            )
+
+
 def _name(fault: ChannelFault) -> str:
     return fault.name
 
@@ -266,10 +280,13 @@ def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
             yield f"{tweak.what} at {tweak.sample} is not judged: the run ends before an alarm would be late"
 
 
-def _implausible_estimates(verdict: Verdict) -> Iterator[str]:
+def _implausible_estimates(run: Run, verdict: Verdict) -> Iterator[str]:
     if ESTIMATES in verdict.not_judged:
         return
     for segment in verdict.estimates:
         if segment.estimate is None:
             samples = f"{segment.start}-{segment.end - 1}"
-            yield f"the last estimate of samples {samples} describes no plant of the program"
+            if (run.flags[: segment.end] & np.uint8(UNREPORTED | LOST)).all():
+                yield f"the device has reported no estimate until the end of samples {samples}"
+            else:
+                yield f"the last estimate of samples {samples} describes no plant of the program"

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.judging.statistics import Decision, check_counts, check_trials
+from analogrig.judging.statistics import check_trials, rising_root
 from analogrig.wording import number_of
 
 BURST = 5.0
@@ -38,19 +38,6 @@ _MOST_BLOCKS = 1000
 _SIGMAS, _LEAST_WIDTH = 12.0, 60
 """Half width of a sum over counts: in standard deviations, and in counts. The rest is below 1e-30."""
 
-_ROOT_PRECISION = 1e-12
-"""Relative precision of a root."""
-
-_TERMS = np.arange(16.0)
-_WEIGHTS: NDArray[np.float64] = 1.0 / ((_TERMS + 1.0) * (_TERMS + 2.0))
-"""(16,) weights of a mixture; their sum is below 1. The first terms suit few events, the last ones 1e8 of them."""
-
-_TILTS: NDArray[np.float64] = 4.0 * np.exp2(-_TERMS)
-"""(16,) exponents of the martingales that bound a rate from above."""
-
-_SHARES: NDArray[np.float64] = 0.9 * np.exp2(-_TERMS)
-"""(16,) tilts of the martingales that bound a rate from below, relative to the largest with a finite mean."""
-
 
 # ---------------------------------------------------------------------------------------------------- fixed sample size
 
@@ -61,7 +48,7 @@ def upper_count(events: int, confidence: float, burst: float = 1.0) -> float:
     :raises ValueError: a negative number of events, ``confidence`` not between 0 and 1, or ``burst`` below 1.
     """
     _check(events, confidence, burst)
-    return _rising_root(lambda mean: 1.0 - confidence - _probabilities(events, mean, burst)[0])
+    return rising_root(lambda mean: 1.0 - confidence - _probabilities(events, mean, burst)[0])
 
 
 def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
@@ -75,7 +62,7 @@ def lower_count(events: int, confidence: float, burst: float = 1.0) -> float:
         return 0.0
 
     def bound(burst: float) -> float:
-        return _rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
+        return rising_root(lambda mean: _probabilities(events - 1, mean, burst)[1] - (1.0 - confidence))
 
     at_most = bound(burst)
     if at_most <= bound(1.0 + 0.95 * (burst - 1.0)):  # it falls with the bursts before it rises
@@ -133,17 +120,6 @@ def _normalise(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Probabilities in proportion to exp(log_weights)."""
     weights = np.exp(log_weights - log_weights.max())
     return np.asarray(weights / weights.sum())
-
-
-def _rising_root(function: Callable[[float], float]) -> float:
-    """Root above 0 of a rising function that is negative at 0."""
-    low, high = 0.0, 1.0
-    while function(high) < 0.0:
-        low, high = high, 2.0 * high
-    while high - low > _ROOT_PRECISION * high:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if function(middle) < 0.0 else (low, middle)
-    return high
 
 
 @dataclass(frozen=True)
@@ -246,68 +222,6 @@ def _basis(burst: float, found: Dispersion) -> str:
         return f"bursts of {found.burst:.3g} alarms on average, observed ({found})"
     assumed = f"bursts of {burst:g} alarms on average" if burst > 1.0 else "independent alarms"
     return f"{assumed}, assumed ({found})"
-
-
-# ------------------------------------------------------------------------------------------------------------- anytime
-
-
-@dataclass
-class ConfidenceSequence:
-    """Confidence sequence of a rate: bounds valid after every trial at once. ValueError: a value is out of range.
-
-    With u > 0 and 1/k = burst + 1/(exp(u) - 1), exp(rate k trials - u events) is a supermartingale for every rate that
-    is not below ``rate``; u < 0 serves the other side. A mixture over u bounds the rate by Ville's inequality (Howard,
-    Ramdas, McAuliffe and Sekhon, Annals of Statistics 49, 2021). Each side has half of the error probability.
-    """
-
-    confidence: float
-    burst: float = BURST
-    """Mean number of events of a burst; also valid for any bursts of at most so many."""
-    trials: int = 0
-    events: int = 0
-
-    def __post_init__(self) -> None:
-        _check(self.events, self.confidence, self.burst)
-
-    def add(self, trials: int, events: int) -> tuple[float, float]:
-        """Add the counts of more trials; return the bounds."""
-        check_counts(events, trials)
-        self.trials += trials
-        self.events += events
-        return self.bounds
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """Interval of the rates at which neither martingale has reached 2 / (1 - confidence)."""
-        if self.trials == 0:
-            return 0.0, 1.0
-        low = 0.0
-        if self._log_excess(0.0) > self._limit:
-            low = _rising_root(lambda count: self._limit - self._log_excess(count))
-        high = _rising_root(lambda count: self._log_shortfall(count) - self._limit)
-        return min(low / self.trials, 1.0), min(high / self.trials, 1.0)
-
-    def decision(self, rate: float) -> Decision:
-        """Decision whether the true rate is below or above ``rate``: on which side of it the bounds lie."""
-        count = rate * self.trials
-        if self._log_shortfall(count) >= self._limit:
-            return Decision.BELOW
-        return Decision.ABOVE if self._log_excess(count) > self._limit else Decision.OPEN
-
-    @property
-    def _limit(self) -> float:
-        """Logarithm of the value that each martingale reaches with at most half of the error probability."""
-        return math.log(2.0 / (1.0 - self.confidence))
-
-    def _log_shortfall(self, count: float) -> float:
-        """Logarithm of the martingale that grows if fewer than the expected ``count`` events occur."""
-        gains = count / (self.burst + 1.0 / np.expm1(_TILTS))
-        return float(np.logaddexp.reduce(np.log(_WEIGHTS) + gains - _TILTS * self.events))
-
-    def _log_excess(self, count: float) -> float:
-        """Logarithm of the martingale that grows if more than the expected ``count`` events occur."""
-        losses = count * _SHARES / (self.burst * (1.0 - _SHARES))
-        return float(np.logaddexp.reduce(np.log(_WEIGHTS) - np.log1p(-_SHARES / self.burst) * self.events - losses))
 
 
 def _check(events: int, confidence: float, burst: float) -> None:

@@ -6,6 +6,7 @@ equation, or without excitation. Zero alarms in such samples prove nothing.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -22,6 +23,10 @@ from analogrig.wording import number_of
 EDGE_NOISES = 9.0
 """Smallest edge, in rms values of the noise of the input. Noise alone makes two samples differ as much once in 5e9
 pairs."""
+
+_LEAST_SHARE = 0.1
+"""Share of the samples that a warm-up must leave, times ``least_exposure``: else any silent device could state one that
+ends with the record."""
 
 _QUANTISATION_LSB = 12.0**-0.5
 
@@ -41,23 +46,58 @@ class Exposure:
     """Samples without an alarm whose estimate, innovation or statistic was non-finite."""
     datasheet: Datasheet
     """Data sheet of the device."""
+    after_warm_up: int = 0
+    """Samples after the warm-up of the data sheet."""
+    unarmed_alarms: tuple[int, ...] = ()
+    """Sample indices of the alarms that came while the trigger cannot have been armed."""
 
     @property
     def lack_of_evidence(self) -> str:
-        """Reason that zero alarms prove nothing, in one line; empty if they are evidence."""
+        """Reason that the run proves nothing, in one line; empty if it is evidence."""
         of = number_of(self.samples, "sample")
         if self.non_finite:
             return f"the device reported non-finite estimates in {self.non_finite} of {of}"
-        return "" if self.armed else f"the trigger was armed in none of {of}: {self._unarmed_reason()}"
+        if self.armed or self.unarmed_alarms:
+            return ""
+        return f"the trigger was armed in none of {of}: {self._unarmed_reason('none')}"
 
-    def _unarmed_reason(self) -> str:
-        """Main reason that the trigger was never armed."""
+    def shortfall(self, least: float) -> str:
+        """Reason that zero alarms prove nothing with this ``least`` share of armed samples, in one line; or empty."""
+        if self.armed >= least * self.after_warm_up:
+            if self.datasheet.latches or self.armed >= least * _LEAST_SHARE * self.samples:
+                return ""
+            armed = f"the trigger was armed in {self.armed} of {number_of(self.samples, 'sample')}"
+            return f"{armed}, too few to judge it by: {self._unarmed_reason('no more')}"
+        return (
+            f"the trigger was armed in {self.armed} of {number_of(self.after_warm_up, 'sample')} after warm-up, fewer"
+            f" than [expect] least_exposure = {least:g} asks for: {self._unarmed_reason('no more')}"
+        )
+
+    @property
+    def contradiction(self) -> str:
+        """Finding that alarms came while the trigger was not armed, in one line; empty without one."""
+        if not self.unarmed_alarms:
+            return ""
+        sheet, alarms = self.datasheet, number_of(len(self.unarmed_alarms), "alarm")
+        says = "the device reported its trigger"
+        if not sheet.alarms:
+            says = "the data sheet ([datasheet] alarms = false) has the trigger"
+        elif not sheet.armed:
+            says = f"the data sheet (warm_up_n = {sheet.warm_up_n}, hold_off_n = {sheet.hold_off_n}) has the trigger"
+        return f"{alarms} while unarmed, the first at {self.unarmed_alarms[0]}: there {says} not armed"
+
+    def _unarmed_reason(self, quantity: str) -> str:
+        """Main reason that the trigger was armed in ``quantity``: ``none``, ``no more``."""
         sheet = self.datasheet
         if not sheet.alarms:
             return "the device has no trigger"
         if sheet.armed:
-            return "the device reported it armed in none"
+            return f"the device reported it armed in {quantity}"
         if 2 * self.unexcited <= self.samples:
+            if self.armed and sheet.hold_off_n:
+                return f"its hold-off after each alarm takes {sheet.hold_off_n}"
+            if not sheet.warm_up_n:
+                return "the others were missing, refused or lost" if self.armed else "each was missing, refused or lost"
             return f"its warm-up takes {sheet.warm_up_n}"
         return (
             f"in {self.unexcited} it was not excited (no edge of the input of {sheet.edge_codes:g} codes, or none for"
@@ -94,21 +134,60 @@ def exposures(runs: Sequence[Run]) -> list[Exposure]:
     for i in range(run.theta.shape[1]):
         are_finite &= np.isfinite(stack([each.theta[:, i] for each in runs]))
     counts = np.zeros((3, len(runs)), np.int64)
+    unarmed: list[list[int]] = [[] for _ in runs]
     for start, end in run.records:
         alarms = [each.alarm_index[(each.alarm_index >= start) & (each.alarm_index < end)] - start for each in runs]
         part = slice(start, end)
-        counts += _count(driven[:, part], flags[:, part], are_finite[:, part], alarms, sheet, noise_lsb)
+        count, found = _count(driven[:, part], flags[:, part], are_finite[:, part], alarms, sheet, noise_lsb)
+        counts += count
+        for i, in_record in enumerate(found):
+            unarmed[i] += (in_record + start).tolist()
     return [
-        Exposure(run.samples, armed, unexcited, non_finite, sheet) for armed, unexcited, non_finite in counts.T.tolist()
+        Exposure(run.samples, armed, unexcited, non_finite, sheet, _after_warm_up(each), tuple(indices))
+        for each, (armed, unexcited, non_finite), indices in zip(runs, counts.T.tolist(), unarmed, strict=True)
     ]
+
+
+def _after_warm_up(run: Run) -> int:
+    """Samples after the warm-up, in each record until a device that latches has raised its alarm."""
+    latched = latched_from(run)
+    ends = {(start, end): latched.get((start, end), end - 1) + 1 for start, end in run.records}
+    return sum(max(0, end - start - run.datasheet.warm_up_n) for (start, _), end in ends.items())
+
+
+def latched_from(run: Run) -> dict[tuple[int, int], int]:
+    """First alarm of each record (start, end) from which on a device that latches is not judged; empty for others."""
+    alarms = run.alarm_index.tolist() if run.datasheet.latches else []
+    found = {}
+    for start, end in run.records:
+        first = next((alarm for alarm in alarms if start <= alarm < end), None)
+        if first is not None:
+            found[start, end] = first
+    return found
+
+
+def until_latched(run: Run) -> Run:
+    """The run without the alarms that a latched trigger held; the run itself for other devices."""
+    if not run.datasheet.latches:
+        return run
+    firsts = latched_from(run)
+    kept = [i for i, alarm in enumerate(run.alarm_index.tolist()) if alarm in firsts.values()]
+    kept = [i for i in kept if i == 0 or run.alarm_index[i - 1] != run.alarm_index[i]]
+    return dataclasses.replace(
+        run,
+        alarm_index=run.alarm_index[kept],
+        alarm_kind=run.alarm_kind[kept],
+        alarm_statistic=run.alarm_statistic[kept],
+    )
 
 
 def record_exposure(record: ObservedRecord, sheet: Datasheet, noise_lsb: float) -> Exposure:
     """Exposure of one record; ``noise_lsb`` is the noise of the input's channel, rms in LSB."""
     driven, flags, are_finite = record.input[None], record.flags[None], record.are_finite[None]
-    counts = _count(driven, flags, are_finite, [record.alarms], sheet, noise_lsb)
+    counts, (unarmed,) = _count(driven, flags, are_finite, [record.alarms], sheet, noise_lsb)
     armed, unexcited, non_finite = counts[:, 0].tolist()
-    return Exposure(len(record.input), armed, unexcited, non_finite, sheet)
+    n = len(record.input)
+    return Exposure(n, armed, unexcited, non_finite, sheet, max(0, n - sheet.warm_up_n), tuple(unarmed.tolist()))
 
 
 def _count(
@@ -118,8 +197,11 @@ def _count(
     alarms: Sequence[NDArray[np.int64]],
     sheet: Datasheet,
     noise_lsb: float,
-) -> NDArray[np.int64]:
-    """Armed, unexcited and non-finite samples of each of r records, (3, r); driven, flags and are_finite are (r, n)."""
+) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+    """Armed, unexcited and non-finite samples of each of r records, (3, r), and their alarms while unarmed.
+
+    driven, flags and are_finite are (r, n).
+    """
     known = (flags & _NOT_PROCESSED) == 0
     excited = _excitation_mask(driven, known, _least_edge(sheet, noise_lsb), sheet.idle_n)
     excited &= (flags & SteppedFlag.IDLE) == 0
@@ -131,11 +213,31 @@ def _count(
         watched = _beyond_hold_off(equations, alarms, sheet)
     armed = watched & excited & are_finite & sheet.alarms
     non_finite = ~are_finite
+    unarmed = []
     for i, raised in enumerate(alarms):
-        armed[i, raised] = True
-        non_finite[i, raised] = False  # an alarm is the required response to a non-finite estimate
+        # An alarm is the required response to a non-finite estimate, armed or not.
+        unarmed.append(raised[_are_unarmed(raised, flags[i], sheet) & are_finite[i, raised]])
+        armed[i, raised], armed[i, unarmed[i]] = True, False
+        if sheet.latches and len(raised):
+            armed[i, raised[0] + 1 :] = False
+        non_finite[i, raised] = False
     # Row by row: along an axis it takes ten times as long.
-    return np.array([[np.count_nonzero(row) for row in each] for each in (armed, ~excited, non_finite)])
+    counts = np.array([[np.count_nonzero(row) for row in each] for each in (armed, ~excited, non_finite)])
+    return counts, unarmed
+
+
+def _are_unarmed(alarms: NDArray[np.int64], flags: NDArray[np.uint8], sheet: Datasheet) -> NDArray[np.bool_]:
+    """(a,): the trigger cannot have been armed when the alarm at this sample of a record came.
+
+    A device may report its state before or after the alarm, so it must be unarmed in the sample before as well.
+    Warm-up and hold-off are counted in equations, of which there are at most as many as samples.
+    """
+    if not sheet.alarms or sheet.latches:
+        return np.full(len(alarms), not sheet.alarms)
+    if sheet.armed:
+        return np.asarray((flags[alarms] & flags[np.maximum(alarms - 1, 0)] & UNARMED) != 0)
+    since = np.diff(alarms, prepend=-1 - sheet.hold_off_n)
+    return np.asarray((alarms < sheet.warm_up_n) | ((since > 0) & (since <= sheet.hold_off_n)))
 
 
 def _least_edge(sheet: Datasheet, noise_lsb: float) -> float:

@@ -19,19 +19,22 @@ real rig or a CAN log, use the program under the measured input if it is linear 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.errors import ConfigurationError
 from analogrig.judging import isolation, played
 from analogrig.judging.courses import Model, PlantChange, changes_between, first_at_level
 from analogrig.judging.linear import LinearPlant
 from analogrig.run import CHUNK_SAMPLES, Run
+from analogrig.scenario import Scenario
 
 if TYPE_CHECKING:
-    from analogrig.scenario import Scenario
+    from analogrig.program import Program
+    from analogrig.rigs.rig import Rig
 
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
 
@@ -73,41 +76,48 @@ def isolation_bounds(run: Run, model: Model | None = None) -> list[int | None]:
     ]
 
 
-def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096) -> bool:
+def detectable(scenario: Scenario | str, arl0: float, *, rig: str | Rig, program: Program | str | None = None) -> bool:
     """True if every change of a scenario is detectable before the next one: its information I(n) reaches ln ARL0.
 
-    A prediction from a play of the nominal machine, with the scenario's own phase even if the seed draws one.
+    A prediction from a noise-free play of the scenario's program on an emulated rig, with the resolution, the range and
+    the noise of its card. The phase is the scenario's own even if the seed draws one.
 
+    :param scenario: a scenario, its shipped name or its .toml file.
     :param arl0: average run length between false alarms, in samples.
-    :param noise_lsb: noise of the output's channel, rms in LSB.
-    :param lsb_v: resolution of the output's channel, in volts.
-    :raises ConfigurationError: the machine cannot play the scenario.
+    :param rig: an emulated rig, or its name.
+    :param program: program of the computer instead of the scenario's: the program, its shipped name or .toml file.
+    :raises ConfigurationError: the rig is not emulated, or cannot play the scenario; ``arl0`` is not above 1.
     """
-    return all(bound is not None for bound in predicted_bounds(scenario, arl0, noise_lsb=noise_lsb, lsb_v=lsb_v))
+    return all(bound is not None for bound in predicted_bounds(scenario, arl0, rig=rig, program=program))
 
 
 def predicted_bounds(
-    scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096
+    scenario: Scenario | str, arl0: float, *, rig: str | Rig, program: Program | str | None = None
 ) -> list[int | None]:
     """Predicted information bound of each change of a scenario; None: not detectable before the next one or the end.
 
-    Parameters as ``detectable``.
+    Parameters and errors as ``detectable``.
     """
-    model = played.nominal(scenario, lsb_v)
-    weight = np.full(scenario.samples, _per_lsb2(noise_lsb))
+    level = _level(arl0)
+    scenario = Scenario.load(scenario) if isinstance(scenario, str) else scenario
+    scenario = scenario if program is None else scenario.on_program(program)
+    model, output = played.predicted(scenario, rig)
+    weight = np.full(scenario.samples, _per_lsb2(output.noise_lsb))
     segments = scenario.segments()
     ends = [*(segment.start for segment in segments[1:]), scenario.samples]
     stretches = [(each.start, end, each.plant.parameters()) for each, end in zip(segments, ends, strict=True)]
     ramps_n = {segment.start: segment.ramp_n for segment in segments}
     return [
-        first_at_level(information_of(model, change, weight), math.log(arl0))
+        first_at_level(information_of(model, change, weight), level)
         for change in changes_between(model, stretches, ramps_n)
     ]
 
 
-def models_of(runs: Sequence[Run]) -> Sequence[Model | None]:
-    """Model of each run, as of ``model_of``; machines of runs that differ in the seed alone are played together."""
-    return played.machines_of(runs) or [model_of(run) for run in runs]
+def _level(arl0: Any) -> float:
+    """Ln ARL0."""
+    if isinstance(arl0, int | float | np.number) and not isinstance(arl0, bool) and 1.0 < arl0 < math.inf:
+        return math.log(arl0)
+    raise ConfigurationError(f"arl0 must be a finite number of samples above 1, not {str(arl0)[:40]!r}")
 
 
 def model_of(run: Run) -> Model | None:

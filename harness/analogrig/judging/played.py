@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.judging.courses import Values
-from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors, nominal_courses
-from analogrig.run import Run
-from analogrig.scenario import Scenario
-from analogrig_emulator import Course, Courses, LinearMode, Moment, RepeatedCourses
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors, is_emulated
+from analogrig.rigs.rig import Rig
+from analogrig.run import OUTPUT, Channel, Run
+from analogrig.scenario import DEFAULT_SEED, Scenario
+from analogrig_emulator import Course, Courses, LinearMode, Moment
 
-_PREFIX = "no bound from a play of the machine: "
+PREFIX = "no bound from a play of the machine: "
 
 
 class _Played:
@@ -27,11 +29,11 @@ class _Played:
         self._played, self._lsb_v = played, lsb_v
 
     def advance(self, samples: int) -> NDArray[np.float64]:
-        with emulator_errors(_PREFIX):
+        with emulator_errors(PREFIX):
             return self._played.advance(samples) / self._lsb_v
 
     def moment(self) -> Moment:
-        with emulator_errors(_PREFIX):
+        with emulator_errors(PREFIX):
             return self._played.moment()
 
 
@@ -42,11 +44,11 @@ class Machine:
         self._courses, self._lsb_v = courses, lsb_v
 
     def at_rest(self, start: int, values: Values) -> Moment:  # noqa: ARG002 - a machine plays one record
-        with emulator_errors(_PREFIX):
+        with emulator_errors(PREFIX):
             return self._courses.at_rest(values)
 
     def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _Played:
-        with emulator_errors(_PREFIX):
+        with emulator_errors(PREFIX):
             return _Played(self._courses.course(moment, before, after, ramp_n), self._lsb_v)
 
     def linear_mode(self, values: Values) -> LinearMode:
@@ -64,65 +66,7 @@ class Machine:
             return None
 
 
-class _Together:
-    """Courses of the machines of several runs with the same changes, played for all of them when the first one asks."""
-
-    def __init__(self, courses: RepeatedCourses, run: Run) -> None:
-        """``run``: one of them."""
-        self._courses, self._lsb_v = courses, run.conditions.output.lsb_v
-        self._ends = {start: min(end, run.samples - 1) for start, end, _ in run.segments}
-        self._values = {start: plant.parameters() for start, _, plant in run.segments}
-        self.at_rest = courses.at_rest
-        self.play = functools.cache(self._play)
-
-    def _play(
-        self, start: int, values: tuple[tuple[str, float], ...]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Courses in LSB, (runs, n), from a change to the next one, and states (runs, s) there."""
-        before = max((other for other in self._ends if other < start), default=None)
-        states_v = None if before is None else self.play(before, tuple(self._values[before].items()))[1]
-        with emulator_errors(_PREFIX):
-            volts, ends_v = self._courses.play(dict(values), start, self._ends[start] - start, states_v)
-        return volts / self._lsb_v, ends_v
-
-
-class _PartOfMany:
-    """Course in LSB that was played together with others, up to the next change."""
-
-    def __init__(self, course_lsb: NDArray[np.float64], end: Moment) -> None:
-        self._coming_lsb, self._end = course_lsb, end
-
-    def advance(self, samples: int) -> NDArray[np.float64]:
-        now, self._coming_lsb = self._coming_lsb[:samples], self._coming_lsb[samples:]
-        return now.copy()  # a judge overwrites it
-
-    def moment(self) -> Moment:
-        return self._end
-
-
-class _OneOfMany:
-    """Machine of a run, as a model of its plant: courses up to the next change are played for all runs together."""
-
-    def __init__(self, run: Run, together: _Together, place: int) -> None:
-        self._run, self._together, self._place = run, together, place
-
-    @functools.cached_property
-    def _alone(self) -> Machine:
-        return _machine(self._run)
-
-    def at_rest(self, start: int, values: Values) -> Moment:  # noqa: ARG002 - as of a machine
-        return self._together.at_rest
-
-    def course(self, moment: Moment, before: Values, after: Values, ramp_n: int) -> _PartOfMany:  # noqa: ARG002
-        courses_lsb, ends_v = self._together.play(moment.sample, tuple(after.items()))
-        end = Moment(moment.sample + courses_lsb.shape[1], ends_v[self._place])
-        return _PartOfMany(courses_lsb[self._place], end)
-
-    def rival(self, moment: Moment, values: Values) -> _Played | None:
-        return self._alone.rival(moment, values)
-
-
-class _Recorded(NamedTuple):
+class RecordedRig(NamedTuple):
     """Rig and scenario of a run, with the tables that describe them."""
 
     tables: tuple[Mapping[str, Any], Mapping[str, Any]]
@@ -130,7 +74,7 @@ class _Recorded(NamedTuple):
     scenario: Scenario
 
 
-_last: _Recorded | None = None
+_last: RecordedRig | None = None
 """Those of the last run: consecutive runs of a bench share their tables."""
 
 
@@ -139,34 +83,13 @@ def machine_of(run: Run) -> Machine | None:
 
     :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
     """
-    return _machine(run) if is_played(run) else None
-
-
-def _machine(run: Run) -> Machine:
+    if not is_played(run):
+        return None
     conditions = run.conditions
-    recorded = _recorded(conditions.rig, conditions.scenario)
-    with emulator_errors(_PREFIX):
+    recorded = recorded_rig(conditions.rig, conditions.scenario)
+    with emulator_errors(PREFIX):
         courses = recorded.rig.courses(recorded.scenario, conditions.seed, run.samples)
     return Machine(courses, conditions.output.lsb_v)
-
-
-def machines_of(runs: Sequence[Run]) -> Sequence[_OneOfMany]:
-    """Machine of each run, for runs that differ in the seed alone; none if they have little to share.
-
-    :raises ConfigurationError: as ``machine_of``.
-    """
-    first = runs[0]
-    has_ramps = any(segment.ramp_n for segment in first.conditions.segments)
-    if len(runs) == 1 or not is_played(first) or len(first.segments) < 2 or has_ramps:
-        return ()
-    recorded = _recorded(first.conditions.rig, first.conditions.scenario)
-    with emulator_errors(_PREFIX):
-        seeds = [run.conditions.seed for run in runs]
-        courses = recorded.rig.courses_together(recorded.scenario, seeds, first.samples)
-    if courses is None:
-        return ()
-    together = _Together(courses, first)
-    return [_OneOfMany(run, together, place) for place, run in enumerate(runs)]
 
 
 def is_played(run: Run) -> bool:
@@ -174,20 +97,29 @@ def is_played(run: Run) -> bool:
     return run.conditions.rig.get("kind") == "emulator" and len(run.conditions.records) <= 1
 
 
-def nominal(scenario: Scenario, lsb_v: float) -> Machine:
-    """Machine with nominal components, sampled at the rate of the emulated card.
+def predicted(scenario: Scenario, rig: str | Rig) -> tuple[Machine, Channel]:
+    """Machine of a scenario on an emulated rig before it is played, and the channel of its output.
 
-    :raises ConfigurationError: it cannot play the excitation of the scenario.
+    :raises ConfigurationError: the rig is not emulated, or cannot play the scenario.
     """
+    opened = open_rig(rig) if isinstance(rig, str) else rig
+    if not is_emulated(opened):
+        raise ConfigurationError(f"{opened.description()['name']}: only an emulated rig predicts bounds; name one")
+    in_phase = dataclasses.replace(scenario, random_phase=False)
+    seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
+    output = opened.perform(in_phase, seed).channels[scenario.program.channels[OUTPUT]]
     with emulator_errors(f"scenario {scenario.name}: "):
-        return Machine(nominal_courses(scenario), lsb_v)
+        return Machine(opened.courses(in_phase, seed, scenario.samples), output.lsb_v), output
 
 
-def _recorded(rig: Mapping[str, Any], scenario: Mapping[str, Any]) -> _Recorded:
+def recorded_rig(rig: Mapping[str, Any], scenario: Mapping[str, Any]) -> RecordedRig:
+    """Rig and scenario of these tables of a run; those of the last call if the tables are the same objects."""
     global _last  # noqa: PLW0603 - a cache of one entry
     if _last is None or _last.tables[0] is not rig or _last.tables[1] is not scenario:
         description = config.build(EmulatorDescription, config.plain(rig), "the recorded rig")
         with emulator_errors("the recorded rig: "):
             opened = EmulatorRig(description)
-        _last = _Recorded((rig, scenario), opened, Scenario.from_table(config.plain(scenario), "the recorded scenario"))
+        _last = RecordedRig(
+            (rig, scenario), opened, Scenario.from_table(config.plain(scenario), "the recorded scenario")
+        )
     return _last

@@ -1,27 +1,23 @@
 """Confidence bounds and tests for rates of independent events and for means.
 
 Clopper-Pearson bounds require a sample size fixed in advance. A ``SequentialTest`` (two rates, fixed error
-probabilities) may stop early. ``mean_bounds`` bounds a rate that is estimated, not counted (analogrig.campaigns.rare).
-Sources: Clopper and Pearson, Biometrika 26 (1934); Wald, Sequential Analysis (1947).
+probabilities) may stop early. Sources: Clopper and Pearson, Biometrika 26 (1934); Wald, Sequential Analysis (1947).
 
-Trials are independent plays, diagnoses or machines. False alarms among samples are not: analogrig.judging.bursts.
+Trials are independent plays, diagnoses or machines. False alarms among samples are not: analogrig.judging.betting.
 """
 
 from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-LEAST_FOR_MEAN = 8
-"""Fewest estimates that ``mean_bounds`` accepts."""
-
-LEAST_SKEWNESS = 1e-6
-"""Smaller skewness is not corrected."""
+_PRECISION = 1e-12
+"""Relative precision of a root."""
 
 
 class Decision(enum.Enum):
@@ -58,41 +54,9 @@ def lower_rate(events: int, trials: int, confidence: float) -> float:
     return float(betaincinv(events, trials - events + 1, 1.0 - confidence))
 
 
-def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, float]:
-    """Lower and upper one-sided confidence bound of the mean of independent, unbiased, non-negative estimates.
-
-    Student's t after Hall's transformation, which corrects the skewness (Journal of the Royal Statistical Society B
-    54, 1992; after Johnson, JASA 73, 1978). These bounds are approximate; their error falls with the number of
-    estimates.
-
-    :raises ValueError: fewer than LEAST_FOR_MEAN estimates, or ``confidence`` not between 0 and 1.
-    """
-    count = len(estimates)
-    if count < LEAST_FOR_MEAN:
-        raise ValueError(f"there must be at least {LEAST_FOR_MEAN} estimates, not {count}")
-    check_trials(0, count, confidence)
-    from scipy.special import stdtrit
-
-    mean = math.fsum(estimates) / count
-    off = [each - mean for each in estimates]
-    deviation = math.sqrt(math.fsum(each**2 for each in off) / (count - 1))
-    third = math.fsum(each**3 for each in off) * count / ((count - 1) * (count - 2))
-    skewness = third / deviation**3 / math.sqrt(count) if deviation > 0.0 else 0.0
-    quantile, error = float(stdtrit(count - 1, confidence)), deviation / math.sqrt(count)
-    low, high = (mean - _invert_hall(at, skewness) * error for at in (quantile, -quantile))
-    return max(low, 0.0), high
-
-
 def one_sided(low: float, high: float, confidence: float) -> str:
     """Two one-sided bounds in words that do not pass for one interval, which would be wrong twice as often."""
     return f"at least {low:.3g} and at most {high:.3g}, each one-sided with error {1.0 - confidence:.2g}"
-
-
-def _invert_hall(quantile: float, skewness: float) -> float:
-    """Inverse of Hall's transformation: Student's quantile, corrected for the skewness of the mean."""
-    if abs(skewness) < LEAST_SKEWNESS:
-        return quantile
-    return 3.0 / skewness * (math.cbrt(1.0 + skewness * (quantile - skewness / 6.0)) - 1.0)
 
 
 def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, float]:
@@ -173,3 +137,14 @@ def check_counts(events: int, trials: int) -> None:
     """:raises ValueError: more events than trials, or fewer than none."""
     if not 0 <= events <= trials:
         raise ValueError(f"there cannot be {events} events in {trials} trials")
+
+
+def rising_root(function: Callable[[float], float]) -> float:
+    """Root above 0 of a rising function that is negative at 0."""
+    low, high = 0.0, 1.0
+    while function(high) < 0.0:
+        low, high = high, 2.0 * high
+    while high - low > _PRECISION * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if function(middle) < 0.0 else (low, middle)
+    return high

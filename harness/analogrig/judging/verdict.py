@@ -13,9 +13,8 @@ if the hypotheses disagree, or if a change cannot be found in the samples.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -27,8 +26,9 @@ from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
 from analogrig.judging.courses import Model, first_at_level
-from analogrig.judging.exposure import Exposure, exposures
-from analogrig.plant import Segment, estimated_parameters
+from analogrig.judging.estimates import estimate_findings, parameters_of
+from analogrig.judging.exposure import Exposure, exposure, latched_from, until_latched
+from analogrig.plant import Segment
 from analogrig.run import IMPORTED, LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
@@ -41,6 +41,9 @@ _LEAST_INFORMATION = 0.5
 
 _NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
 
+_MOST_CAUSES = 3
+"""Causes of lost samples that a reason names; all are notes."""
+
 Outcome = Literal["passed", "failed", "inconclusive", "unjudged"]
 """``unjudged``: nothing is known of the plant, so that no alarm can be true or false."""
 
@@ -52,6 +55,12 @@ UNDETECTABLE = (
     " scenario"
 )
 """Reason that imported data permit no verdict."""
+
+NOTHING_TO_DETECT = (
+    "no change of the scenario is detectable before the next one or the end, so a device that never alarms would pass"
+    " too: make a change larger or earlier, or raise the excitation"
+)
+"""Reason that a run without a finding permits no verdict."""
 
 Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not judged"]
 """Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
@@ -290,6 +299,8 @@ class Verdict:
     missing_n: int
     armed_n: int
     """Samples in which the trigger was armed."""
+    after_warm_up_n: int
+    """Samples after the warm-up; the trigger should have been armed in most of them."""
     theta_hash: str
     """``Run.theta_hash``; empty if the device reports no estimate."""
     alarm_hash: str = ""
@@ -300,6 +311,8 @@ class Verdict:
     """Faults that the device's protocol leaves unnoticed, as noun phrases."""
     overloads: Mapping[str, int] = field(default_factory=dict)
     """First sample with a lit overload lamp, by amplifier."""
+    unarmed_alarms: tuple[int, ...] = ()
+    """Sample indices of the alarms that came while the trigger was not armed, whatever they are attributed to."""
     doubtful_alarms: tuple[int, ...] = ()
     """Sample indices of the alarms that are false under some hypotheses only."""
     fit: tuple[MisfitPeriod, ...] | None = None
@@ -333,41 +346,40 @@ def judge(run: Run) -> Verdict:
 
     :raises ConfigurationError: the recorded scenario has an invalid expectation.
     """
-    return judge_all([run])[0]
+    model = information.model_of(run) if is_exact(run) else None
+    return judge_with(run, expectations_of(run), model, exposure(run), segment_estimates([run])[0])
 
 
-def judge_all(runs: Iterable[Run]) -> list[Verdict]:
-    """Verdict on each run, as of ``judge``.
+def expectations_of(run: Run) -> Expectations:
+    """Expectations of the recorded scenario.
 
-    Consecutive runs that differ in seed and samples alone are judged together, in a part of the time.
+    :raises ConfigurationError: one is invalid.
     """
-    return [verdict for _, alike in itertools.groupby(runs, _common) for verdict in _judge_alike(list(alike))]
+    return config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
 
 
-def _common(run: Run) -> tuple[object, ...]:
-    """Values that runs have in common which are judged together."""
-    known = run.conditions
-    return run.samples, known.segments, known.records, known.channels, known.scenario, known.dut, known.rig
-
-
-def _judge_alike(runs: Sequence[Run]) -> Iterator[Verdict]:
-    expect = config.build(Expectations, runs[0].conditions.scenario.get("expect", {}), "the recorded scenario: expect")
-    models = information.models_of(runs) if _is_exact(runs[0]) else [None] * len(runs)
-    for run, model, shown, estimates in zip(runs, models, exposures(runs), _segment_estimates(runs), strict=True):
-        yield _judge(run, model, expect, shown, estimates)
-
-
-def _judge(
-    run: Run, model: Model | None, expect: Expectations, shown: Exposure, estimates: tuple[SegmentEstimate, ...]
+def judge_with(
+    run: Run, expect: Expectations, model: Model | None, shown: Exposure, estimates: tuple[SegmentEstimate, ...]
 ) -> Verdict:
-    """Verdict on a run with this model of its plant, exposure and estimates."""
-    sheet = run.datasheet
+    """Verdict on a run with this model of its plant, exposure and estimates.
+
+    :param model: None if the instants of the changes are not exact, or if there is none.
+    """
+    run, sheet = until_latched(run), run.datasheet
     level = sheet.log_arl0(expect.arl0)
     results = _evaluate_hypotheses(run, model, expect, level)
     invalid = invalid_reasons(run, shown, expect)
     if run.conditions.rig.get("kind") == IMPORTED and _shows_no_change(results):
         invalid.append(UNDETECTABLE)
     outcome, reasons = _decide_outcome(results, expect)
+    findings = [shown.contradiction] if shown.contradiction else []
+    findings += estimate_findings(run, expect.estimate_error)
+    if findings:
+        outcome, reasons = "failed", [*findings, *reasons]
+    if outcome == "passed" and not invalid:  # a device that never alarms must not pass as well
+        reasons = [shown.shortfall(expect.least_exposure), NOTHING_TO_DETECT if _permits_silence(results) else ""]
+        reasons = [reason for reason in reasons if reason]
+        outcome = "inconclusive" if reasons else "passed"
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
     possible = {index for each in results for index in each.false_alarms}
     knows_truth = bool(run.conditions.segments) or not run.samples
@@ -384,6 +396,8 @@ def _judge(
         ceiling=sheet.ceiling,
         missing_n=int(np.count_nonzero(run.missing)),
         armed_n=shown.armed,
+        after_warm_up_n=shown.after_warm_up,
+        unarmed_alarms=shown.unarmed_alarms,
         theta_hash=run.theta_hash(),
         alarm_hash=run.alarm_hash(),
         not_judged=not_judged(run),
@@ -460,29 +474,6 @@ def unreported(sheet: Datasheet) -> tuple[str, ...]:
     return tuple(name for name, is_reported in reported.items() if not is_reported)
 
 
-def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
-    """Estimated parameters after each of ``samples``, (n, m) float64; NaN if theta does not describe them.
-
-    The columns are those of ``Program.estimates``.
-    """
-    return _parameters_of(run, run.theta[samples])
-
-
-def _parameters_of(run: Run, theta: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Parameters, as of ``trajectory``, of estimates (n, p) of a device as in ``run``."""
-    conditions, model = run.conditions, run.datasheet.model
-    if model is None or not theta.shape[1]:
-        return np.full((len(theta), len(conditions.program.estimates)), np.nan)
-    return estimated_parameters(
-        conditions.program,
-        theta,
-        model,
-        input_per_code=conditions.input.lsb,
-        output_per_code=conditions.output.lsb,
-        period_s=conditions.sample_period_problem_s,
-    )
-
-
 def as_json(verdict: Verdict) -> dict[str, Any]:
     """Verdict in plain JSON types; latencies and bounds in samples."""
     return {
@@ -509,6 +500,8 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         ],
         "false_alarms": list(verdict.false_alarms),
         "doubtful_alarms": list(verdict.doubtful_alarms),
+        "unarmed_alarms": list(verdict.unarmed_alarms),
+        "exposure": {"armed": verdict.armed_n, "after_warm_up": verdict.after_warm_up_n},
         "estimates": [
             {
                 "start": segment.start,
@@ -546,7 +539,7 @@ class _HypothesisResult:
 def _evaluate_hypotheses(run: Run, model: Model | None, expect: Expectations, level: float) -> list[_HypothesisResult]:
     """Results at the likeliest instants and, unless these are exact, at the earliest and the latest."""
     runs = [run]
-    if not _is_exact(run):
+    if not is_exact(run):
         runs += [run.with_change_instants(Segment.earliest), run.with_change_instants(Segment.latest)]
     out = []
     for supposed in runs:
@@ -576,6 +569,15 @@ def _shows_no_change(results: Sequence[_HypothesisResult]) -> bool:
     """True if there are changes, and the bounds are known and permit the detection of none."""
     tweaks = [tweak for each in results for tweak in each.tweaks]
     return bool(tweaks) and all(tweak.is_bounded and tweak.bound_n is None for tweak in tweaks)
+
+
+def _permits_silence(results: Sequence[_HypothesisResult]) -> bool:
+    """True if there are changes, none was detected, and no silence of the device would count as a miss."""
+    tweaks = [tweak for each in results for tweak in each.tweaks]
+    return bool(tweaks) and not any(
+        tweak.missed or (tweak.bound_n is not None and tweak.latency_n is not None) or not tweak.is_bounded
+        for tweak in tweaks
+    )
 
 
 def _fails_under_all_hypotheses(results: Sequence[_HypothesisResult], expect: Expectations) -> bool:
@@ -625,6 +627,8 @@ def _attribute_alarms(
     ):
         if start in run.conditions.records:
             continue  # a device that restarts has no earlier plant to compare with
+        if any(record <= latched <= start < stop for (record, stop), latched in latched_from(run).items()):
+            continue
         detection = in_segment[0] if in_segment else None
         changed = before.changes_to(after)
         late = first_at_level(gathered, expect.late_information_ratio * level)
@@ -658,28 +662,29 @@ def unexplained_alarms(run: Run) -> tuple[int, ...]:
 
 
 def _alarms_by_change(run: Run, informations: Iterable[NDArray[np.float64]]) -> list[list[int]]:
-    """Alarms in the segment of each change; none where it gives too little information."""
-    # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
-    return [
-        [index for index in run.alarm_index.tolist() if start < index <= end] if _may_alarm(gathered) else []
-        for (start, end, _), gathered in zip(run.segments[1:], informations, strict=True)
-    ]
+    """Alarms in the segment of each change; none where it gives too little information. No information is unknown."""
+    alarms = []
+    for (start, end, _), gathered in zip(run.segments[1:], informations, strict=True):
+        may_alarm = not len(gathered) or gathered[-1] >= _LEAST_INFORMATION
+        # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
+        alarms.append([index for index in run.alarm_index.tolist() if may_alarm and start < index <= end])
+    return alarms
 
 
 def _unexplained(run: Run, alarms: Iterable[list[int]]) -> tuple[int, ...]:
-    """Alarms other than those of the changes, to which ``alarms`` attributes them; a record begins without a change."""
+    """Alarms that no change explains, in order. ``alarms`` are those in the segment of each change.
+
+    A change explains all alarms until the end of its ramp, and the first one after it. An alarm on a ramp restarts the
+    device on a plant that keeps changing. It must detect that change again. A record begins without a change.
+    """
     ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
-    explained = [
-        _alarms_of_change(in_segment, start + ramps_n[start])
-        for (start, _, _), in_segment in zip(run.segments[1:], alarms, strict=True)
-        if start not in run.conditions.records
-    ]
-    return tuple(sorted(set(run.alarm_index.tolist()).difference(*explained)))
-
-
-def _may_alarm(gathered: NDArray[np.float64]) -> bool:
-    """True if a change with the information I(1), I(2), ... may raise an alarm; empty: unknown."""
-    return not len(gathered) or bool(gathered[-1] >= _LEAST_INFORMATION)
+    unexplained = set(run.alarm_index.tolist())
+    for (start, _, _), in_segment in zip(run.segments[1:], alarms, strict=True):
+        if start not in run.conditions.records:
+            ramp_end = start + ramps_n[start]
+            unexplained.difference_update(index for index in in_segment if index <= ramp_end)
+            unexplained.difference_update([index for index in in_segment if index > ramp_end][:1])
+    return tuple(sorted(unexplained))
 
 
 def _judge_diagnosis(
@@ -710,15 +715,6 @@ def _judge_diagnosis(
     )
 
 
-def _alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
-    """Alarms attributed to a change: all until the end of its ramp, and the first one after it.
-
-    An alarm on a ramp restarts the device on a plant that keeps changing. It must detect that change again.
-    """
-    after_ramp = [index for index in alarms if index > ramp_end]
-    return {index for index in alarms if index <= ramp_end} | set(after_ramp[:1])
-
-
 def invalid_reasons(run: Run, shown: Exposure, expect: Expectations) -> list[str]:
     """Reasons that a run with the exposure ``shown`` permits no verdict; empty if it is valid."""
     reasons = list(run.conditions.faults)
@@ -728,18 +724,38 @@ def invalid_reasons(run: Run, shown: Exposure, expect: Expectations) -> list[str
         reasons.append(f"the run ended after {run.samples} of {asked}{cause}")
     reasons += _loss_reasons(run)
     refused = run.conditions.counters.get("refused", 0)
-    reasons += [f"the device refused {number_of(refused, 'sample')}"] if refused else []
+    reasons += [f"the device refused {number_of(refused, 'sample')}{refusal_cause(run)}"] if refused else []
     reasons += expect.excess_missing(run.samples, int(np.count_nonzero(run.missing)), missing_text(run))
     is_evidence = bool(run.conditions.segments) or shown.non_finite > 0  # alarms of an unknown plant prove nothing
     return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence and run.samples and is_evidence else [])
+
+
+def refusal_cause(run: Run) -> str:
+    """End of a sentence on samples that the device refused: the causes it counted, and the first of them."""
+    counters, settings = run.conditions.counters, run.conditions.dut.get("estimator", {})
+    limits = " to ".join(f"{settings[key]:g}" for key in ("code_low", "code_high") if key in settings)
+    known = {
+        f"with u or y saturated, at or beyond codes {limits}": counters.get("saturated", 0),
+        f"with a stuck y (stuck_n = {settings.get('stuck_n', 'unknown')})": counters.get("stuck", 0),
+    }
+    causes = [f"{n} {text}" for text, n in known.items() if n]
+    at = np.flatnonzero((run.flags & (SteppedFlag.REFUSED | LOST)) == SteppedFlag.REFUSED)
+    if len(at):
+        u, y = run.codes[at[0], :2]
+        causes.append(f"the first is sample {at[0]}, with the codes u = {u} and y = {y}")
+    return f": {', '.join(causes)}" if causes else ""
 
 
 def _loss_reasons(run: Run) -> list[str]:
     """Reasons for invalidity from lost samples: too many, or counts of device and harness that disagree."""
     is_lost, most = run.lost, int(run.conditions.dut.get("most_lost_n", 0))
     lost = int(np.count_nonzero(is_lost))
-    where = "not or only in part in the log" if is_captured(run) else "lost on the way to the device"
-    reasons = [f"{number_of(lost, 'sample was', 'samples were')} {where}, more than {most}"] if lost > most else []
+    causes = run.conditions.losses[:_MOST_CAUSES]
+    where = "lost" if causes else "lost on the way to the device"
+    where = "not or only in part in the log" if is_captured(run) else where
+    cause = f": {'; '.join(causes)}" if causes else ""
+    text = f"{number_of(lost, 'sample was', 'samples were')} {where}, more than {most}{cause}"
+    reasons = [text] if lost > most else []
     after_n = int(np.argmin(is_lost[::-1])) if lost < run.samples else run.samples
     known = lost - after_n  # the device cannot count samples lost after the last one it received
     missed = run.conditions.counters.get("samples_lost", known)
@@ -775,9 +791,9 @@ def _failure_reasons(
     return reasons
 
 
-def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]:
+def segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]:
     """Last estimate of each segment whose plant is known, for each run."""
-    run = runs[0] if _is_exact(runs[0]) else runs[0].with_change_instants(Segment.earliest)
+    run = runs[0] if is_exact(runs[0]) else runs[0].with_change_instants(Segment.earliest)
     unseen = {segment.start for segment in run.conditions.segments if segment.unseen}
     names = run.conditions.program.estimates
     segments = [
@@ -786,7 +802,7 @@ def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]
         if start not in unseen
     ]
     ends = [end - 1 for _, end, _ in segments]
-    lasts = _parameters_of(run, np.concatenate([each.theta[ends] for each in runs]))
+    lasts = parameters_of(run, np.concatenate([each.theta[ends] for each in runs]))
     is_known = np.asarray(~np.isnan(lasts).any(axis=1))
     estimates = (
         dict(zip(names, last, strict=True)) if known and names else None
@@ -795,6 +811,6 @@ def _segment_estimates(runs: Sequence[Run]) -> list[tuple[SegmentEstimate, ...]]
     return [tuple(SegmentEstimate(*each, next(estimates)) for each in segments) for _ in runs]
 
 
-def _is_exact(run: Run) -> bool:
+def is_exact(run: Run) -> bool:
     """True if the instants of all changes are known."""
     return all(segment.is_exact for segment in run.conditions.segments)

@@ -12,15 +12,20 @@ import inspect
 import logging
 import operator
 import os
+import re
 import termios
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
+import can
+from can.interfaces import BACKENDS
+from can.interfaces.slcan import slcanBus
+from can.typechecking import BitTimingDict, BitTimingFdDict
+
 from analogrig.config import suggest
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.links.line import CanLine
-from analogrig.links.python_can import BACKENDS, BitTimingDict, BitTimingFdDict, can, slcanBus
 from analogrig.links.wire import WRITE_TIMEOUT_S, Clock, Connection
 
 RECEIVED_AHEAD_N = 200
@@ -78,15 +83,14 @@ class PythonCanBus:
 
     unread_n = RECEIVED_AHEAD_N
 
-    def __init__(self, config: Mapping[str, Any], *, name: str | None = None) -> None:
+    def __init__(self, config: Mapping[str, Any]) -> None:
         """Open ``can.Bus(**config)``, with interface and channel. python-can's own configuration is not read.
 
         :raises ConfigurationError: there is no such interface, or it rejects a setting.
         :raises LinkError: it cannot be opened.
         """
         interface, self.channel = str(config["interface"]), config["channel"]
-        where = interface if self.channel is None else f"{interface}/{self.channel}"
-        self.name = where if name is None else name
+        self.name = interface if self.channel is None else f"{interface}/{self.channel}"
         self._is_socket = interface == "socketcan"
         self._never_echoes = self._is_socket and not config.get("receive_own_messages")
         self.clock: Clock = time.monotonic
@@ -201,6 +205,13 @@ _COMMON_KEYS = frozenset({"interface", "channel", "fd", "bitrate", "data_bitrate
 """Keys that any description may have, even if its interface does not use them."""
 _TIMING = frozenset(BitTimingDict.__annotations__) | frozenset(BitTimingFdDict.__annotations__)
 """Keys of ``timing``."""
+_UNDOCUMENTED = {
+    "kvaser": ("device_name", "dongle_channel", "serial"),
+    "neovi": ("type_filter",),
+    "nixnet": ("listen_only",),
+    "slcan": ("btr",),
+}
+"""Keyword arguments that constructors of python-can use and do not document."""
 
 
 def complete_config(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -246,21 +257,17 @@ def _load_config(given: dict[str, Any], context: str | None) -> dict[str, Any]:
 
 
 def _keys(interface: str) -> set[str] | None:
-    """Keys that the constructor of an interface knows; None if its driver is absent.
-
-    They are its parameters, and the names that it looks up in its keyword arguments.
-    """
+    """Parameters of an interface's constructors, and those that their docstrings add; None if its driver is absent."""
     module, name = BACKENDS[interface]
     try:
         kind = getattr(importlib.import_module(module), name)
     except Exception:  # noqa: BLE001 - opening the bus reports the driver's error
         return None
-    keys = set(_COMMON_KEYS | _TIMING)
-    for each in set(kind.__mro__) - {can.BusABC}:
-        code = getattr(inspect.unwrap(vars(each).get("__init__", each)), "__code__", None)
-        if code is not None:
-            keys.update(code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount])
-            keys.update(value for value in code.co_consts if isinstance(value, str) and value.isidentifier())
+    keys = {*_COMMON_KEYS, *_TIMING, *_UNDOCUMENTED.get(interface, ())}
+    for init in [vars(each)["__init__"] for each in kind.__mro__ if "__init__" in vars(each)]:
+        if init not in (object.__init__, can.BusABC.__init__):
+            keys |= inspect.signature(init).parameters.keys()
+            keys.update(re.findall(r":param (?:[^:]+ )?(\w+):", init.__doc__ or ""))
     return keys
 
 

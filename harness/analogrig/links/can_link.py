@@ -5,15 +5,17 @@ A frame has the identifier of its message in estimator_c/catalogue/analogrig.dbc
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Any
+
+import can
 
 from analogrig.catalogue import LAYOUTS, Message, pack, unpack_any
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_station import CanStation
 from analogrig.links.frame_bits import CLASSIC_BYTES
 from analogrig.links.link import CanListener
-from analogrig.links.python_can import can
 from analogrig.links.wire_faults import FaultyLine
 
 _HARNESS_IDS = {(layout.id, False) for layout in LAYOUTS.values() if layout.from_harness}
@@ -31,6 +33,7 @@ class CanLink:
         self.line = bus.line
         self.carries_blocks = bus.is_fd
         self.unread_n = bus.unread_n
+        self.unread: deque[Message] = deque()
         self._station = CanStation(bus, _HARNESS_IDS, _DEVICE_IDS)
 
     @property

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+
+import can
 
 from analogrig.errors import LinkError
 from analogrig.links.can_bus import CanBus
-from analogrig.links.link import CanListener
-from analogrig.links.python_can import can
+from analogrig.links.link import CanListener, Identifier
 from analogrig.wording import number_of
-
-Identifier = tuple[int, bool]
-"""Arbitration identifier, and True if it is one of 29 bits."""
 
 _REMEMBERED_N = 256
 """Sent frames that are recognised when the interface returns them."""
@@ -58,6 +56,8 @@ class CanStation:
         self._sent: dict[tuple[int, bytes], None] = {}
         """Identifiers and data of the latest frames sent, in order."""
         self._listeners: list[CanListener] = []
+        self.on_other: Callable[[can.Message], object] = lambda _: None
+        """Function that is called with each frame that is neither of the harness nor of the device."""
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -120,6 +120,7 @@ class CanStation:
             self._note_error(frame)
         elif frame.is_remote_frame or identifier not in self._known:
             self.counted["frames_foreign"] += 1
+            self.on_other(frame)
         elif identifier in self._device:
             return True
         elif not is_echo:

@@ -6,11 +6,12 @@ import copy
 from collections import deque
 from collections.abc import Callable, Sequence
 
+import can
+
 from analogrig.catalogue import LAYOUTS, Hello, pack, unpack
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_station import BUS_OFF, CONTROLLER, NOT_ACKNOWLEDGED, PASSIVE, RESTARTED, VIOLATION
 from analogrig.links.line import CanLine
-from analogrig.links.python_can import can
 from analogrig.links.wire_faults import LONGEST_DELAY_S, STRANGERS_HASH, Direction, FaultyLine, Lane, WireFaults
 
 _IDENTIFIERS = {

@@ -6,11 +6,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
-from analogrig.catalogue import Message, pack, unpack_any
+from analogrig.catalogue import Message, pack, unpack_all
 from analogrig.links import frame
 from analogrig.links.line import Line, SerialLine
 from analogrig.links.wire import Connection, Wire
 from analogrig.links.wire_faults import FaultyLine
+from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     import can
@@ -18,6 +19,15 @@ if TYPE_CHECKING:
 CanListener = Callable[["can.Message"], object]
 """Callback for every frame on a CAN bus, such as a log writer of python-can. ``is_rx`` is False for frames of the
 harness; ``timestamp`` is the link's clock."""
+
+Identifier = tuple[int, bool]
+"""Arbitration identifier, and True if it is one of 29 bits."""
+
+
+def identifier_text(identifier: Identifier) -> str:
+    """Identifier as candump writes it: three digits for one of 11 bits, eight for one of 29."""
+    number, is_extended = identifier
+    return f"{number:0{8 if is_extended else 3}X}"
 
 
 class Link(Connection, Protocol):
@@ -51,6 +61,10 @@ class Link(Connection, Protocol):
     def faulty(self) -> FaultyLine[Any, Any] | None:
         """Line that applies faults to its frames; None if it was opened without faults."""
 
+    @property
+    def unread(self) -> deque[Message]:
+        """Messages that have come and are not yet received."""
+
     def listen(self, listener: CanListener) -> None:
         """Report all CAN frames to the listener from now on; a link without any ignores it."""
 
@@ -70,7 +84,6 @@ class Link(Connection, Protocol):
 class FramedLink:
     """Link that carries messages in frames over a wire, in order."""
 
-    trouble = ""
     carries_blocks = True
     unread_n = None
 
@@ -82,8 +95,16 @@ class FramedLink:
         self.line_s = 0.0
         self.line = line
         self._decoder = frame.FrameDecoder()
-        self._messages: deque[Message] = deque()
-        self._unknown_n = 0
+        self.unread: deque[Message] = deque()
+        self._unknown_n = self._received_n = self._valid_n = 0
+
+    @property
+    def trouble(self) -> str:
+        if self._valid_n:
+            return ""
+        if not self._received_n:
+            return "no byte came"
+        return f"{number_of(self._received_n, 'byte')} came without a valid frame: another speed, or another protocol"
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -98,32 +119,31 @@ class FramedLink:
 
     def send(self, messages: Iterable[Message]) -> None:
         sent = b"".join([frame.encode(pack(message)) for message in messages])
-        self._add_time(sent)
+        if self.line is not None:  # both directions add up, since lock-step uses one at a time
+            self.line_s += self.line.bytes_s(len(sent))
         self.wire.write(sent)
 
     def receive(self, timeout_s: float) -> Message | None:
-        if self._messages:
-            return self._messages.popleft()
-        deadline_s = self.clock() + timeout_s
+        if self.unread:
+            return self.unread.popleft()
+        deadline_s, left_s = self.clock() + timeout_s, timeout_s
         while True:
-            self._enter(self.wire.read(max(0.0, deadline_s - self.clock())))
-            if self._messages:
-                return self._messages.popleft()
-            if self.clock() >= deadline_s:
+            self._enter(self.wire.read(left_s))
+            if self.unread:
+                return self.unread.popleft()
+            left_s = deadline_s - self.clock()
+            if left_s <= 0.0:
                 return None
 
     def close(self) -> None:
         self.wire.close()
 
     def _enter(self, received: bytes) -> None:
-        self._add_time(received)
-        for packet in self._decoder.feed(received):
-            message = unpack_any(packet)
-            if message is not None:
-                self._messages.append(message)
-            self._unknown_n += message is None
-
-    def _add_time(self, transferred: bytes) -> None:
-        """Add the bytes' time. Both directions add up, since lock-step uses one at a time."""
         if self.line is not None:
-            self.line_s += self.line.bytes_s(len(transferred))
+            self.line_s += self.line.bytes_s(len(received))
+        self._received_n += len(received)
+        packets = self._decoder.feed(received)
+        messages = unpack_all(packets)
+        self.unread += messages
+        self._valid_n += len(messages)
+        self._unknown_n += len(packets) - len(messages)

@@ -5,7 +5,34 @@ File formats are those of python-can: candump's .log, Vector's .asc and .blf, .m
 Messages missing from the capture count as lost. Their sequence numbers reveal them.
 """
 
-from analogrig.recordings.capture import import_run, replace_scenario
-from analogrig.recordings.files import READ, WRITTEN, CanLog, CapturedFrames
+from __future__ import annotations
 
-__all__ = ["READ", "WRITTEN", "CanLog", "CapturedFrames", "import_run", "replace_scenario"]
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analogrig.recordings.capture import import_run, replace_scenario
+    from analogrig.recordings.files import READ, WRITTEN, CanLog, CapturedFrames
+    from analogrig.recordings.measured_runs import in_units, scaled_to_program, unanswered
+else:
+    from analogrig.lazy import loader
+
+    __getattr__ = loader(
+        __name__,
+        {
+            "analogrig.recordings.capture": "import_run replace_scenario",
+            "analogrig.recordings.files": "READ WRITTEN CanLog CapturedFrames",
+            "analogrig.recordings.measured_runs": "in_units scaled_to_program unanswered",
+        },
+    )
+
+__all__ = [
+    "READ",
+    "WRITTEN",
+    "CanLog",
+    "CapturedFrames",
+    "import_run",
+    "in_units",
+    "replace_scenario",
+    "scaled_to_program",
+    "unanswered",
+]

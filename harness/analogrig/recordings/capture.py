@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,9 @@ from analogrig.recordings.captured import CaptureDecoding, CapturedRun
 from analogrig.recordings.decoder import CaptureDecoder, FrameDictionary
 from analogrig.recordings.ecu_decoder import EcuDecoder
 from analogrig.recordings.files import CapturedFrames
-from analogrig.recordings.program_units import scaled_to_program
+from analogrig.recordings.measured_runs import scaled_to_program
+from analogrig.recordings.scales import scale_findings
+from analogrig.rigs.emulator import is_emulated
 from analogrig.rigs.rig import Block
 from analogrig.run import IMPORTED, INPUT, LOST, OUTPUT, Conditions, Run
 from analogrig.scenario import Scenario
@@ -39,6 +41,7 @@ def import_run(
     device: CanDbcDevice | None = None,
     number: int | None = None,
     most_lost_n: int = 0,
+    channels: Collection[str] = (),
 ) -> Run:
     """Run of a CAN log, with the truth of ``scenario`` and the units of ``rig``.
 
@@ -49,17 +52,21 @@ def import_run(
     :param device: device with messages of its own, to which the log belongs.
     :param number: number of the run in the log, from 1; None: the log holds exactly one.
     :param most_lost_n: largest number of lost samples in a valid run.
+    :param channels: channels of the log to read; empty: all.
     :raises RecordingError: the file cannot be read, or holds no such run.
-    :raises ConfigurationError: ``dbc`` is invalid, or the log is longer than the scenario.
+    :raises ConfigurationError: ``dbc`` is invalid, several buses carry the messages, or the log is longer than the
+        scenario.
     """
-    frames = CapturedFrames(path)
+    frames = CapturedFrames(path, channels=channels)
     performance = rig.perform(scenario, 0)
     decoder = _decoder(frames, dbc, device, performance, scenario.samples)
+    frames.check_channels(decoder.known)
     captured = _select_run(decoder, frames, number)
     if captured.extent > scenario.samples:
+        cause = f": {decoder.causes.losses[0]}" if decoder.causes.losses else ""
         raise ConfigurationError(
             f"{path}: has {number_of(captured.extent, 'sample')}, scenario {scenario.name} {scenario.samples}:"
-            " pass the scenario that was played"
+            f" pass the scenario that was played{cause}"
         )
     answers = captured.answers(path)
     dut = {**captured.device(path), "most_lost_n": most_lost_n}
@@ -82,6 +89,8 @@ def import_run(
             counters=_plausible_counters(captured, answers),
             link_counters=_line_counts(decoder, frames),
             faults=faults,
+            losses=decoder.causes.losses,
+            remarks=(*decoder.causes.remarks, *_scale_remarks(decoder, captured, rig, performance)),
             program=scenario.program,
         )
     )
@@ -106,6 +115,20 @@ def _plausible_counters(captured: CapturedRun, answers: Answers) -> Mapping[str,
     if lost <= counters.get("samples_lost", lost):
         return counters
     return {name: value for name, value in counters.items() if name not in {"samples_lost", "updated"}}
+
+
+def _scale_remarks(
+    decoder: CaptureDecoding, captured: CapturedRun, rig: Rig, performance: Performance
+) -> Iterator[str]:
+    """Sentences on samples that are scaled otherwise than those of the scenario, if an emulated rig can tell."""
+    known = sorted(k for k, sample in captured.samples.items() if not sample[2])
+    if not (decoder.carriers and known and is_emulated(rig)):
+        return
+    blocks = [block.codes[:, [INPUT, OUTPUT]] for block in performance.blocks]
+    played = np.concatenate(blocks).astype(np.float64)
+    known = [k for k in known if k < len(played)]
+    logged = np.array([captured.samples[k][:2] for k in known], np.float64)
+    yield from scale_findings((decoder.carriers["u"], decoder.carriers["y"]), logged, played[known])
 
 
 def _block(captured: CapturedRun, channels: int) -> Block:
@@ -171,6 +194,8 @@ def _empty_reason(decoder: CaptureDecoding, frames: CapturedFrames) -> str:
         first = ", ".join(map(str, frames.damaged[:_MOST_NAMED]))
         lines = number_of(len(frames.damaged), "line is no frame", "lines are no frames")
         return f": {lines} (at {first}); candump -L writes the expected format"
+    if decoder.causes.losses:
+        return f": {'; '.join((*decoder.causes.losses, *decoder.causes.remarks)[:_MOST_NAMED])}"
     foreign = decoder.line["frames_foreign"]
     others = number_of(foreign, "frame has another identifier", "frames have other identifiers")
     return f": {others}; pass the DBC of the log with --dbc" if foreign else ""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from analogrig.answers import Answers
+from analogrig.links.causes import Causes
+from analogrig.links.link import Identifier
 
 
 @dataclass
@@ -49,6 +51,18 @@ class CaptureDecoding(Protocol):
     @property
     def runs(self) -> Sequence[CapturedRun]:
         """Runs in the log, some perhaps without samples."""
+
+    @property
+    def known(self) -> Collection[Identifier]:
+        """Identifiers of the messages of harness and device."""
+
+    @property
+    def carriers(self) -> Mapping[str, str]:
+        """Signals whose scales a DBC of the user states, by u and y; empty for our own catalogue."""
+
+    @property
+    def causes(self) -> Causes:
+        """Causes of lost samples and unused frames."""
 
     @property
     def line(self) -> Mapping[str, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter as Tally
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any
 from analogrig import catalogue
 from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit
 from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
+from analogrig.devices.exchange import misfit_of
+from analogrig.devices.rows import AnswerRows
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
+from analogrig.links.causes import Causes
 from analogrig.links.dbc import check_layout, load_dbc
-from analogrig.protocol.answer_rows import AnswerRows
-from analogrig.protocol.exchange import misfit_of
+from analogrig.links.link import Identifier
 from analogrig.recordings.captured import CapturedRun
 from analogrig.run import LOST, UNREPORTED
 from analogrig.wording import number_of
@@ -50,6 +52,11 @@ class FrameDictionary:
         if frame.is_remote_frame or not self.is_known(frame):
             return None
         return self._decoders[frame.arbitration_id, frame.is_extended_id](bytes(frame.data))
+
+    @property
+    def known(self) -> Collection[Identifier]:
+        """Identifiers of the catalogue."""
+        return self._decoders.keys()
 
     def is_known(self, frame: can.Message) -> bool:
         """True if the identifier of the frame belongs to the catalogue."""
@@ -197,6 +204,7 @@ class CaptureDecoder:
         """Runs with samples, and possibly a last one without."""
         self.line: Tally[str] = Tally()
         """Counts of foreign frames and of damaged, repeated or missing messages, by name."""
+        self.causes = Causes()
         self._settings: Mapping[int, float] = {}
         """Current settings. Replaced, never modified: runs share them."""
         self._identity: Mapping[str, int] = {}
@@ -212,6 +220,14 @@ class CaptureDecoder:
         """Last index of the samples (True) and of the answers (False), which resolves the overflow of 16 bits."""
         for frame in frames:
             self._decode(frame)
+
+    @property
+    def known(self) -> Collection[Identifier]:
+        return self._dictionary.known
+
+    @property
+    def carriers(self) -> Mapping[str, str]:
+        return {}
 
     def _decode(self, frame: can.Message) -> None:
         message = self._dictionary.message(frame)

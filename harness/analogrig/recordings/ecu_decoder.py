@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.answers import Answers
+from analogrig.answers import AlarmLevel, Answers
 from analogrig.devices.can_dbc import CanDbcDevice
-from analogrig.devices.ecu_answers import MISSING, EcuAnswers
+from analogrig.devices.ecu import MISSING, EcuAnswers
 from analogrig.devices.ecu_messages import EcuMessages, SamplePart
 from analogrig.errors import DeviceError
+from analogrig.links.link import Identifier
 from analogrig.recordings.captured import CapturedRun
 from analogrig.run import LOST, Channel
 
@@ -24,7 +25,7 @@ class EcuRun(CapturedRun):
 
     def __init__(self, description: CanDbcDevice, messages: EcuMessages) -> None:
         super().__init__()
-        self._description = description
+        self._description, self._messages = description, messages
         self.collected = EcuAnswers(description.name, description.receive, messages)
         self.next_index = 0
         """Index of the next sample if none is missing from the log."""
@@ -38,11 +39,12 @@ class EcuRun(CapturedRun):
 
     def answers(self, path: Path) -> Answers:  # noqa: ARG002
         self.collected.end()
-        return self.collected.rows.take(self.extent, self.extent)
+        answers = self.collected.rows.take(self.extent, self.extent)
+        return answers if self._description.alarm_is == "event" else AlarmLevel().rises(answers, 0)
 
     def capture_faults(self, path: Path) -> Iterator[str]:  # noqa: ARG002
-        """No reasons: such a device has no counters of its own, and its data sheet lists what cannot be noticed."""
-        return iter(())
+        """Messages that never came. Such a device has no counters; its data sheet lists what cannot be noticed."""
+        return iter(self._messages.never_came)
 
 
 class EcuDecoder:
@@ -55,26 +57,39 @@ class EcuDecoder:
         self._description = description
         self._messages = description.messages()
         self._decode = self._messages.decoder(channels)
+        self._missing = (channels["u"].codes // 2, channels["y"].codes // 2)
+        """Codes of a missing sample, which stand for nothing."""
         self._most_n = most_n
         self.runs: list[EcuRun] = []
         self._traffic: Counter[str] = Counter()
         self._parts: dict[str, SamplePart] = {}
         """Parts of the sample that is being sent, by message."""
-        self._last_counter: int | None = None
-        for frame in frames:
+        self._place = ""
+        self.causes = self._messages.causes
+        self.causes.place = lambda: self._place
+        for number, frame in enumerate(frames, 1):
+            self._place = f"frame {number} at {frame.timestamp:.6f} s"
             self._take(frame)
         self._end_sample()
+        for run in self.runs:
+            run.collected.end()
+        self._messages.conclude(in_log=True)
+
+    @property
+    def known(self) -> Collection[Identifier]:
+        return self._messages.own | self._messages.of_device
+
+    @property
+    def carriers(self) -> Mapping[str, str]:
+        return self._messages.carriers
 
     @property
     def line(self) -> Counter[str]:
         return sum((run.collected.counted for run in self.runs), self._traffic.copy())
 
     def _take(self, frame: can.Message) -> None:
-        identifier = frame.arbitration_id, frame.is_extended_id
-        if frame.is_error_frame:
-            self._traffic["error_frames"] += 1
-        elif frame.is_remote_frame or identifier not in self._messages.own | self._messages.of_device:
-            self._traffic["frames_foreign"] += 1
+        if self._messages.traffic.take(frame) is None:
+            self._traffic["error_frames" if frame.is_error_frame else "frames_foreign"] += 1
         elif self._messages.is_start(frame):
             self._end_sample()
             self._begin_run()
@@ -98,7 +113,6 @@ class EcuDecoder:
         if self.runs and not self.runs[-1].samples:
             self.runs.pop()
         self.runs.append(EcuRun(self._description, self._messages))
-        self._last_counter = None
         return self.runs[-1]
 
     # ---- samples
@@ -117,35 +131,67 @@ class EcuDecoder:
         if not parts:
             return
         run = self.runs[-1] if self.runs else self._begin_run()
-        counters = {part.counter for part in parts.values() if part.counter is not None}
-        index = self._index(run, min(counters)) if counters else run.next_index
+        index, is_agreed = self._index(run, parts)
         if index < run.next_index:
             self._traffic["samples_repeated"] += 1
+            self.causes.add(
+                "the same sample came again, with the same counters", noun="sample", place=f"sample {index}"
+            )
             return
         run.collected.end()
-        values: dict[str, float] = {}
-        for part in parts.values():
-            values |= part.values
-        is_whole = len(parts) == len(self._messages.order) and len(counters) < 2
-        sample = self._decode(values) if is_whole else None
-        for lacking in range(run.next_index, min(index, self._most_n)):
-            run.collected.skip(lacking, LOST | MISSING)
+        place = f"sample {index}"
+        codes = self._codes(parts, place) if is_agreed else None
+        self._skip_lacking(run, index)
         run.next_index = index + 1
         if run.next_index > self._most_n:
             return
-        if sample is None:
+        if codes is None:
             self._traffic["samples_lacking"] += 1
             run.collected.skip(index, LOST | MISSING)
             return
-        u, y, valid = sample
-        run.samples[index] = (u, y, not valid)
-        run.collected.begin(index, missing=not valid)
+        is_missing = any(part.is_missing for part in parts.values())
+        run.samples[index] = (*codes, is_missing)
+        run.collected.begin(index, missing=is_missing)
 
-    def _index(self, run: EcuRun, counter: int) -> int:
-        """Index of the sample with this counter: the next one that has it, or the last if it is repeated."""
-        modulus = self._messages.sample_modulus or 1
-        before, self._last_counter = self._last_counter, counter
-        if before is None:
-            return counter
-        step = (counter - before) % modulus
-        return run.next_index - 1 + step
+    def _codes(self, parts: Mapping[str, SamplePart], place: str) -> tuple[int, int] | None:
+        """Codes of u and y in the parts of a sample; None if one is absent or out of range."""
+        if gone := [name for name in self._messages.order if name not in parts]:
+            self.causes.add(f"a sample without {', '.join(gone)}", noun="sample", place=place, loses=True)
+            return None
+        values: dict[str, float] = {}
+        for part in parts.values():
+            values |= part.values
+        if any(part.is_missing for part in parts.values()):
+            return self._decode(values, "") or self._missing
+        return self._decode(values, place)
+
+    def _skip_lacking(self, run: EcuRun, index: int) -> None:
+        """Enter the samples before ``index`` that the log lacks."""
+        lacking = range(run.next_index, min(index, self._most_n))
+        for k in lacking:
+            run.collected.skip(k, LOST | MISSING)
+        if lacking:
+            text, place = "by the counters, samples are not in the log", f"sample {lacking[0]}"
+            if not run.next_index:
+                detail = f"the log begins with sample {index}"
+            else:
+                detail = f"sample {run.next_index - 1} is followed by {index}; a second run? [start] tells them apart"
+            self.causes.add(text, noun="sample", place=place, detail=detail, loses=True, n=len(lacking))
+
+    def _index(self, run: EcuRun, parts: Mapping[str, SamplePart]) -> tuple[int, bool]:
+        """Index of the sample with the counters of these parts, and True if they agree.
+
+        It is the next one that has them, or the last if they are repeated.
+        """
+        moduli = self._messages.sent_moduli
+        counters = {name: part.counter for name, part in parts.items() if part.counter is not None}
+        if not counters:
+            return run.next_index, True
+        longest = max(counters, key=lambda name: (moduli[name], -counters[name]))
+        last = run.next_index - 1
+        first = counters[longest] if last < 0 else last + (counters[longest] - last) % moduli[longest]
+        is_agreed = all(first % moduli[name] == counter for name, counter in counters.items())
+        if not is_agreed:
+            shown = ", ".join(f"{self._messages.sent_counters[name]} {counter}" for name, counter in counters.items())
+            self.causes.add("the parts of a sample have different counters", noun="sample", detail=shown, loses=True)
+        return first, is_agreed

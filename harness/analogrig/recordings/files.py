@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import gc
 import io
+import re
 import sys
 import zlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from analogrig.errors import RecordingError
+from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.links.link import Identifier, identifier_text
 from analogrig.links.quiet import silence_logger
 from analogrig.wording import number_of
 
@@ -21,6 +25,12 @@ if TYPE_CHECKING:
 
 WRITTEN = ("log", "blf", "asc", "mf4")
 """Formats that can be written, as file suffixes."""
+
+
+_MOST_CHANNEL = 254
+"""Largest channel of a frame: MF4 has a byte for it, and BLF counts from 1."""
+_HELD_NAME = re.compile(r"(?=.)[!-~]*?(?<!\d)(\d{1,2}|1\d\d|)", re.ASCII)
+"""Name that a writer can hold: printable ASCII without a space. python-can takes the digits at its end as a number."""
 
 
 class CanLog:
@@ -36,6 +46,8 @@ class CanLog:
         """Frames before ``begin``; None afterwards."""
         self._writer: can.io.generic.MessageWriter | None = None
         self._failure: Exception | None = None
+        self._channels: dict[Any, Any] = {}
+        """Channels in the file, by those of the frames."""
 
     @property
     def has_frames(self) -> bool:
@@ -56,12 +68,24 @@ class CanLog:
             return
         try:
             if self._writer is None:
-                from analogrig.links.python_can import can
+                import can
 
                 self._writer = can.Logger(self.path)
+            channel = self._channel(frame.channel)
+            if channel != frame.channel:
+                frame = copy.copy(frame)
+                frame.channel = channel
             self._writer(frame)
         except Exception as error:  # noqa: BLE001 - the writers' exceptions are undocumented; the run must continue
             self._failure = error
+
+    def _channel(self, channel: Any) -> Any:
+        """The channel if every writer can hold it, or else its number in the order of appearance."""
+        if channel not in self._channels:
+            is_held = isinstance(channel, str) and _HELD_NAME.fullmatch(channel)
+            is_small = isinstance(channel, int) and 0 <= channel <= _MOST_CHANNEL
+            self._channels[channel] = channel if channel is None or is_held or is_small else len(self._channels)
+        return self._channels[channel]
 
     def close(self) -> None:
         """Finish the file. May be called twice.
@@ -96,10 +120,14 @@ class CapturedFrames:
     """Frames of a file, read by python-can; can be iterated once."""
 
     path: Path
+    channels: Collection[str] = ()
+    """Channels to read, by their names in the file; empty: all."""
     damaged: list[int] = field(default_factory=list)
     """Numbers of the lines that are not frames and were skipped."""
     end: str = ""
     """Reason that reading stopped before the end of the file; empty otherwise."""
+    by_channel: dict[str, Counter[Identifier]] = field(default_factory=dict)
+    """Frames read so far by channel and identifier, also of channels that are not to be read."""
 
     def __post_init__(self) -> None:
         """Check that the file can be opened.
@@ -117,11 +145,46 @@ class CapturedFrames:
             raise RecordingError(f"{self.path}: {error.strerror or error}") from error
 
     def __iter__(self) -> Iterator[can.Message]:
-        return self._read_candump() if self.path.suffix.lower() == ".log" else self._read_binary()
+        frames = self._read_candump() if self.path.suffix.lower() == ".log" else self._read_binary()
+        for frame in frames:
+            channel = self._channel(frame)
+            self.by_channel.setdefault(channel, Counter())[frame.arbitration_id, frame.is_extended_id] += 1
+            if not self.channels or channel in self.channels:
+                yield frame
+
+    def _channel(self, frame: can.Message) -> str:
+        """Channel as the file names it. python-can counts those of Vector's formats from 0."""
+        channel = frame.channel
+        if isinstance(channel, int) and self.path.suffix.lower() in {".asc", ".blf"}:
+            channel += 1
+        return "" if channel is None else str(channel)
+
+    def check_channels(self, known: Collection[Identifier]) -> None:
+        """Check, after reading, that no identifier of ``known`` was read from two channels.
+
+        :raises ConfigurationError: one was, or a channel to read is not in the file; names the channels there are.
+        """
+        counts = {name: sum(n for each, n in found.items() if each in known) for name, found in self.by_channel.items()}
+        texts = [
+            f"{name or 'without a name'} ({number_of(found.total(), 'frame')}, {counts[name]} of the device's messages)"
+            for name, found in sorted(self.by_channel.items())
+        ]
+        there = f"its channels are {', '.join(texts)}"
+        for name in self.channels:
+            if name not in self.by_channel:
+                raise ConfigurationError(f"{self.path}: has no channel {name!r}: {there}")
+        read = [found for name, found in self.by_channel.items() if not self.channels or name in self.channels]
+        both = next((each for each in sorted(known) if sum(each in found for found in read) > 1), None)
+        if both is not None:
+            best = max(counts, key=lambda name: counts[name])
+            raise ConfigurationError(
+                f"{self.path}: more than one bus carries frame {identifier_text(both)}; {there}: select one, such as"
+                f" --channel {best}"
+            )
 
     def _read_candump(self) -> Iterator[can.Message]:
         """Read a candump log, in which reading continues after a damaged line."""
-        from analogrig.links.python_can import can
+        import can
 
         with self.path.open(encoding="ascii", errors="replace") as file:
             lines = iter(lambda: file.readline(LONGEST_LINE), "")
@@ -133,7 +196,7 @@ class CapturedFrames:
 
     def _read_binary(self) -> Iterator[can.Message]:
         """Read any other format, in which reading ends at the first fault."""
-        from analogrig.links.python_can import can
+        import can
 
         suffix = self.path.suffix.lower()
         reader: Any = can.io.player.MESSAGE_READERS[suffix]

@@ -1,17 +1,25 @@
-"""Conversion of imported data to the units and the clock of a program."""
+"""Runs of measured data, which no device has answered, and their conversion to units and clock of a program."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
-from analogrig.run import IMPORTED, Conditions
+from analogrig.plant import Segment
+from analogrig.run import IMPORTED, Channel, Conditions, Run
+from analogrig.scenario import Scenario
 from analogrig_emulator import ProgramError, parse_unit
 
 if TYPE_CHECKING:
     from analogrig_emulator import Equations
+
+UNSEEN = "no device has seen these samples: pass the recording to analogrig replay"
+"""Fault of a recording that was imported and not played."""
 
 _LEAST_PERIOD_S = 1e-9
 
@@ -64,3 +72,46 @@ def in_units(conditions: Conditions, equations: Equations, quantities: Sequence[
             )
         channels[name] = dataclasses.replace(channel, unit=unit.text, unit_per_v=channel.unit_per_v * factor)
     return dataclasses.replace(conditions, channels=channels)
+
+
+def unanswered(
+    codes: NDArray[np.uint16],
+    clipped: NDArray[np.bool_],
+    channels: Mapping[str, Channel],
+    period_s: float,
+    time_scale: float,
+    rig: Mapping[str, Any],
+    scenario: Scenario,
+    segments: tuple[Segment, ...],
+) -> Run:
+    """Recording without answers of a device.
+
+    :param codes: (n, c), with ``clipped`` for the channels of the scenario's program.
+    :param segments: true plant; empty if it is unknown.
+    """
+    samples = len(codes)
+    return Run(
+        conditions=Conditions(
+            seed=0,
+            samples_asked=scenario.samples,
+            sample_period_s=period_s,
+            time_scale=time_scale,
+            channels=dict(channels),
+            segments=segments,
+            scenario=scenario.as_table(),
+            rig=rig,
+            dut={"name": "none", "kind": IMPORTED, "datasheet": {"alarms": False}},
+            link="none",
+            faults=(UNSEEN,),
+            program=scenario.program,
+        ),
+        codes=codes,
+        clipped=clipped,
+        theta=np.zeros((samples, 0), np.float32),
+        innovation=np.zeros(samples, np.float32),
+        statistic=np.zeros(samples, np.float32),
+        flags=np.zeros(samples, np.uint8),
+        alarm_index=np.zeros(0, np.int64),
+        alarm_kind=np.zeros(0, np.uint8),
+        alarm_statistic=np.zeros(0, np.float32),
+    )

@@ -4,6 +4,32 @@ It contains the verdict in words and tables, and the signals of the run in plots
 security policy forbids network access.
 """
 
-from analogrig.reporting.page import render, write_report
+from __future__ import annotations
 
-__all__ = ["render", "write_report"]
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analogrig.pages import PLOTS, assemble_page
+    from analogrig.reporting.page import provenance, render, write_report
+    from analogrig.reporting.payload import as_script, deflate
+else:
+    from analogrig.lazy import loader
+
+    __getattr__ = loader(
+        __name__,
+        {
+            "analogrig.pages": "PLOTS assemble_page",
+            "analogrig.reporting.payload": "as_script deflate",
+            "analogrig.reporting.page": "provenance render write_report",
+        },
+    )
+
+__all__ = [
+    "PLOTS",
+    "as_script",
+    "assemble_page",
+    "deflate",
+    "provenance",
+    "render",
+    "write_report",
+]

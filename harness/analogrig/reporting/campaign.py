@@ -11,14 +11,13 @@ from typing import Any
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.summary import CONFIDENCE, ERROR_STEP, RATES, Summary
 from analogrig.errors import ConfigurationError
-from analogrig.judging.bursts import BURST
 from analogrig.storage import replace_file
 from analogrig.wording import counter_text, number_of
 
 _MARK, _FORMAT = b'data-page="analogrig-campaign"', b'"format": "analogrig-campaign"'
 """Markers that identify the page and the aggregated results of a campaign."""
 
-BOUNDS = f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended, for bursts of {BURST:g} false alarms on average"
+BOUNDS = f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended and whatever the dependence within a trial"
 """Note on the bounds in the tables."""
 
 
@@ -32,14 +31,12 @@ def labelled(results: Results) -> list[tuple[dict[str, str], Summary]]:
     return out
 
 
-def anytime_text(counted: Mapping[str, int]) -> str:
-    """Rates of the events that ``rows.counts`` counts, with bounds, in one line."""
+def counts_text(counted: Mapping[str, int]) -> str:
+    """Events so far, with their exposures, in one line."""
     parts = []
     for name, rate in RATES.items():
         if counted[rate.exposure]:
-            below = rate.sequence(counted, CONFIDENCE).bounds[1]
-            events, exposure = counter_text(counted[name], name), counter_text(counted[rate.exposure], rate.unit)
-            parts.append(f"{events} in {exposure} (rate below {below:.2g})")
+            parts.append(f"{counter_text(counted[name], name)} in {counter_text(counted[rate.exposure], rate.unit)}")
     return ", ".join(parts)
 
 

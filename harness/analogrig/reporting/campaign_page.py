@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,16 +18,12 @@ from analogrig.campaigns.summary import (
     ERROR_BINS,
     ERROR_STEP,
     MOST_NOT_PASSED,
-    RATES,
     Summary,
+    independent,
 )
-from analogrig.identity import Identity
-from analogrig.pages import FOLDER, TABLES, assemble_page
+from analogrig.pages import TABLES, render_page
 from analogrig.reporting.campaign import BOUNDS, COLUMNS, labelled
-from analogrig.reporting.maps import Square, Squares, heat_map, legend
-from analogrig.reporting.markings import figure, levels, words
-from analogrig.reporting.markup import SORTABLE, cell, heading, pairs, row, table, text
-from analogrig.reporting.tables import provenance
+from analogrig.reporting.page import provenance
 from analogrig.storage import replace_file
 from analogrig.wording import number_of
 
@@ -35,7 +33,105 @@ MOST_NUMBERS, MOST_SQUARES = 3_000, 20_000
 MOST_ROWS = 2_000
 """Largest number of cells in the table."""
 
-_BARS, _BARS_WIDTH, _BARS_HEIGHT, _BARS_LEFT = 100, 290, 120, 52
+_BARS = 100
+
+
+class Square(NamedTuple):
+    """Square of a map."""
+
+    value: float | None
+    """None: unknown."""
+    label: str
+    note: str = ""
+    """Second line, such as the bound of a rate."""
+    title: str = ""
+    """Description of the cell for its tooltip and for screen readers."""
+    link: str = ""
+
+
+@dataclass(frozen=True)
+class Map:
+    """Panel of a map. Without numbers its squares are small, and only their tooltips have the numbers."""
+
+    caption: str
+    across: str
+    down: str
+    """Titles of the axes; that down may be empty."""
+    squares: Mapping[tuple[str, str], Square]
+    """Squares by the values on the axes across and down."""
+    has_numbers: bool = True
+
+    @property
+    def columns(self) -> list[str]:
+        return list(dict.fromkeys(across for across, _ in self.squares))
+
+    @property
+    def rows(self) -> list[str]:
+        return list(dict.fromkeys(down for _, down in self.squares))
+
+    @property
+    def width(self) -> int:
+        return 74 if self.has_numbers else 9
+
+    @property
+    def height(self) -> int:
+        return 42 if self.has_numbers else 9
+
+    @property
+    def has_links(self) -> bool:
+        return any(square.link for square in self.squares.values())
+
+    def places(self) -> Iterator[tuple[int, int, Square]]:
+        """Squares with the numbers of their columns and rows."""
+        rows = self.rows
+        for i, across in enumerate(self.columns):
+            for j, down in enumerate(rows):
+                yield i, j, self.squares[across, down]
+
+
+@dataclass(frozen=True)
+class PlottedQuantity:
+    """PlottedQuantity of the maps."""
+
+    name: str
+    form: str
+    of: Callable[[Summary], float | None]
+    note: Callable[[Summary], str]
+    most: float = 0.0
+    """Value of the deepest colour."""
+    maps: Sequence[Map] = ()
+
+    def square(self, value: float | None, note: str = "", title: str = "", link: str = "") -> Square:
+        return Square(value, "–" if value is None else format(value, self.form), note, title, link)
+
+
+class PlottedHistogram(NamedTuple):
+    """Bars over an axis with the title ``across`` from ``first`` to ``last``; ``counted``: what is counted."""
+
+    caption: str
+    across: str
+    counted: str
+    counts: list[int]
+    first: str
+    last: str
+
+
+class _Cell(NamedTuple):
+    number: int
+    labels: Mapping[str, str]
+    summary: Summary
+    not_passed: Sequence[tuple[int, str, str]]
+
+
+class _Trial(NamedTuple):
+    """Trial that has not passed."""
+
+    cell: _Cell
+    is_first: bool
+    """True for the first one of its cell, to which links lead."""
+    seed: int
+    outcome: str
+    why: str
 
 
 def write_page(results: Results, path: Path) -> None:
@@ -49,134 +145,97 @@ def write_page(results: Results, path: Path) -> None:
 
 def render(results: Results) -> str:
     """The page as text: at most 5 MB, whatever the number of cells and trials."""
-    spec, total = results.plan.spec, results.total
-    scenario = str(results.plan.scenario["name"])
-    return assemble_page(
-        FOLDER / "campaign.html",
+    cells = [
+        _Cell(number, *labels_and_summary, found.not_passed)
+        for number, (labels_and_summary, found) in enumerate(zip(labelled(results), results.aggregates, strict=True))
+    ]
+    quantities, hidden = _mapped(results, cells)
+    return render_page(
+        "campaign.html",
         (TABLES,),
-        title=text(f"campaign {spec.name}"),
-        outcome=results.outcome,
-        heading=text(f"Campaign {spec.name}: {results.outcome.upper()}"),
-        sentence=text(
-            f"{scenario}: {total.trials:,} trials in {len(results.aggregates):,} cells, {total.samples:,} samples;"
-            f" {total.missed:,} of {total.visible:,} visible changes missed, {total.late:,} detected late,"
-            f" {total.false_alarms:,} false alarms, {total.inconclusive:,} trials inconclusive."
-        ),
-        maps=_maps(results) + _drawn_maps(results) + _distributions(results),
-        table=_table(results),
-        trials=_not_passed(results),
-        provenance=_provenance(results.played_by),
+        title=f"campaign {results.plan.spec.name}",
+        results=results,
+        cells=cells,
+        axes=[_axis(results.plan, axis) for axis in cells[0].labels],
+        columns=COLUMNS,
+        quantities=quantities,
+        hidden_maps=hidden,
+        drawn=_drawn(results),
+        histograms=list(_histograms(results)),
+        trials=[_Trial(cell, not i, *trial) for cell in cells[:MOST_ROWS] for i, trial in enumerate(cell.not_passed)],
+        provenance=[pair for identity in results.played_by for pair in provenance(identity)],
+        bounds=BOUNDS,
+        confidence=CONFIDENCE,
+        most_rows=MOST_ROWS,
+        most_not_passed=MOST_NOT_PASSED,
     )
-
-
-@dataclass(frozen=True)
-class _Mapped:
-    """Quantity of the maps."""
-
-    name: str
-    form: str
-    of: Callable[[Summary], float | None]
-    note: Callable[[Summary], str]
-
-    def square(self, summary: Summary, title: str, link: str) -> Square:
-        return Square(*_shown(self.of(summary), self.form), self.note(summary), title, link)
-
-
-def _shown(value: float | None, form: str) -> tuple[float | None, str]:
-    return value, "–" if value is None else format(value, form)
 
 
 def _at_most(rate: float) -> str:
     return "≤ 100%" if rate > 0.99 else f"≤ {100 * rate:.2g}%"
 
 
-_LATENCY = _Mapped(
+_LATENCY = PlottedQuantity(
     "Mean latency [samples]",
     ".1f",
     lambda summary: summary.latency_n,
     lambda summary: "" if summary.bound_n is None else f"bound {summary.bound_n:.1f}",
 )
-_MISSES = _Mapped(
+_MISSES = PlottedQuantity(
     "Miss rate",
     ".1%",
     lambda summary: summary.missed / summary.visible if summary.visible else None,
     lambda summary: _at_most(summary.miss_rate[1]) if summary.visible else "",
 )
-_MAPPED = (_LATENCY, _MISSES)
-
-_NOTE = (
-    f"Second line of a square: the information bound of the latency; ≤ the upper bound of the rate at {CONFIDENCE:.0%}."
-)
 
 
-def _maps(results: Results) -> str:
-    """Maps of each quantity, one panel for every combination of the values that are not on the axes."""
-    axes = [axis for axis, values in results.plan.spec.grid.items() if len(values) > 1][:2]
+def _mapped(results: Results, cells: Sequence[_Cell]) -> tuple[list[PlottedQuantity], int]:
+    """Quantities with a map for every combination of the values that are not on the axes, and how many are hidden."""
+    plan = results.plan
+    axes = [axis for axis, values in plan.spec.grid.items() if len(values) > 1][:2]
     if not axes:
-        return ""
+        return [], 0
     across, down = (*axes, "")[:2]
-    groups: dict[str, dict[tuple[str, str], tuple[int, Mapping[str, str], Summary]]] = {}
-    for number, (names, summary) in enumerate(labelled(results)):
-        where = _place(results.plan, {name: value for name, value in names.items() if name not in axes})
-        groups.setdefault(where, {})[names[across], names[down] if down else ""] = number, names, summary
-    size = len(_MAPPED) * max(map(len, groups.values()))
+    groups: dict[str, dict[tuple[str, str], _Cell]] = {}
+    for cell in cells:
+        where = _place(plan, {name: value for name, value in cell.labels.items() if name not in axes})
+        groups.setdefault(where, {})[cell.labels[across], cell.labels[down] if down else ""] = cell
+    size = 2 * max(map(len, groups.values()))
     shown, numbered = list(groups.items())[: MOST_SQUARES // size], MOST_NUMBERS // size
-    sections = []
-    for quantity in _MAPPED:
-        known = [value for _, summary in results.cells if (value := quantity.of(summary)) is not None]
-        most = max(known, default=0.0)
-        panels = (
-            heat_map(
-                where or "all cells",
-                (_axis(results.plan, across), _axis(results.plan, down) if down else ""),
-                dict(_squares(results.plan, quantity, found, has_numbers=i < numbered)),
-                most,
-                with_numbers=i < numbered,
-            )
-            for i, (where, found) in enumerate(shown)
-        )
-        sections.append(_section(quantity.name, most, quantity.form, panels))
-    hidden = len(groups) - len(shown)
-    note = f"<p>{number_of(hidden, 'more map')} of each quantity: see the JSON file.</p>" if hidden else ""
-    return (
-        f'<section aria-labelledby="maps"><h2 id="maps">Maps</h2><p>{text(_NOTE)} A square leads to its cell and the'
-        f" trials that have not passed.</p>{''.join(sections)}{note}</section>"
-    )
+    titles = _axis(plan, across), _axis(plan, down) if down else ""
+    out = []
+    for quantity in (_LATENCY, _MISSES):
+        maps = []
+        for i, (where, found) in enumerate(shown):
+            squares = {key: _square(plan, quantity, cell, has_numbers=i < numbered) for key, cell in found.items()}
+            maps.append(Map(where or "all cells", *titles, squares, has_numbers=i < numbered))
+        out.append(dataclasses.replace(quantity, most=_most(map(quantity.of, (c.summary for c in cells))), maps=maps))
+    return out, len(groups) - len(shown)
 
 
-def _squares(
-    plan: Plan,
-    quantity: _Mapped,
-    found: Mapping[tuple[str, str], tuple[int, Mapping[str, str], Summary]],
-    *,
-    has_numbers: bool,
-) -> Iterator[tuple[tuple[str, str], Square]]:
-    for key, (number, names, summary) in found.items():
-        link = f"#cell-{number}" if has_numbers and number < MOST_ROWS else ""
-        yield (
-            key,
-            quantity.square(summary, _title(plan, names, summary) if has_numbers else _short(names, summary), link),
-        )
+def _most(values: Iterable[float | None]) -> float:
+    return max((value for value in values if value is not None), default=0.0)
 
 
-def _title(plan: Plan, names: Mapping[str, str], summary: Summary) -> str:
-    latency = "none detected" if summary.latency_n is None else f"latency {summary.latency_n:.1f} samples"
-    bound = "" if summary.bound_n is None else f" (bound {summary.bound_n:.1f})"
-    rate = f" (rate {_at_most(summary.miss_rate[1])})" if summary.visible else ""
-    return (
-        f"{_place(plan, names)}: {latency}{bound}, {summary.missed:,} of {summary.visible:,} changes missed{rate},"
-        f" {number_of(summary.false_alarms, 'false alarm', form=',')}"
-    )
-
-
-def _short(names: Mapping[str, str], summary: Summary) -> str:
+def _square(plan: Plan, quantity: PlottedQuantity, cell: _Cell, *, has_numbers: bool) -> Square:
+    summary = cell.summary
+    link = f"#cell-{cell.number}" if has_numbers and cell.number < MOST_ROWS else ""
     latency = "–" if summary.latency_n is None else f"{summary.latency_n:.1f}"
-    return f"{', '.join(names.values())}: {latency}, {summary.missed}/{summary.visible}"
+    title = f"{', '.join(cell.labels.values())}: {latency}, {summary.missed}/{summary.visible}"
+    if has_numbers:
+        delay = "none detected" if summary.latency_n is None else f"latency {latency} samples"
+        bound = "" if summary.bound_n is None else f" (bound {summary.bound_n:.1f})"
+        rate = f" (rate {_at_most(summary.miss_rate[1])})" if summary.visible else ""
+        title = (
+            f"{_place(plan, cell.labels)}: {delay}{bound}, {summary.missed:,} of {summary.visible:,} changes"
+            f" missed{rate}, {number_of(summary.false_alarms, 'false alarm', form=',')}"
+        )
+    return quantity.square(quantity.of(summary), quantity.note(summary), title, link)
 
 
-def _place(plan: Plan, names: Mapping[str, str]) -> str:
+def _place(plan: Plan, labels: Mapping[str, str]) -> str:
     """Values on some axes in words."""
-    parts = ((*plan.axis(axis), value) for axis, value in names.items())
+    parts = ((*plan.axis(axis), value) for axis, value in labels.items())
     return ", ".join(f"{name} {value}{f' {unit}' if unit else ''}" for name, unit, value in parts)
 
 
@@ -186,56 +245,51 @@ def _axis(plan: Plan, axis: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _section(name: str, most: float, form: str, panels: Iterator[str]) -> str:
-    return f'<h3>{text(name)}</h3>{legend(name, most, form)}<div class="maps">{"".join(panels)}</div>'
-
-
-def _drawn_maps(results: Results) -> str:
-    """Maps over the first two drawn axes, all cells together."""
+def _drawn(results: Results) -> list[PlottedQuantity]:
+    """Quantities with a map over the first two drawn axes, all cells together; empty if nothing is drawn."""
     found = results.distribution
     if not found.axes:
-        return ""
+        return []
     names = [
         [f"{low + (i + 0.5) * (high - low) / DRAWN_BINS:.4g}" for i in range(DRAWN_BINS)]
         for low, high in found.axes.values()
     ]
-    axes = (*(_axis(results.plan, axis) for axis in found.axes), "")[:2]
+    across, down = (*(_axis(results.plan, axis) for axis in found.axes), "")[:2]
     keys = [(name, other) for name in names[0] for other in (names[1] if len(names) > 1 else [""])]
-    sections = []
-    for quantity, sums, counts in zip(
-        _MAPPED, (found.latency_n, found.missed), (found.detected, found.visible), strict=True
+    out = []
+    for quantity, sums, counts in (
+        (_LATENCY, found.latency_n, found.detected),
+        (_MISSES, found.missed, found.visible),
     ):
-        squares: Squares = {
-            key: Square(*_shown(total / count if count else None, quantity.form), *_drawn_notes(quantity, total, count))
+        squares = {
+            key: quantity.square(total / count if count else None, *_drawn_notes(quantity, total, count))
             for key, total, count in zip(keys, sums.ravel().tolist(), counts.ravel().tolist(), strict=True)
         }
-        most = max((each.value for each in squares.values() if each.value is not None), default=0.0)
-        panel = heat_map("drawn values, middle of each bin", axes, squares, most)
-        sections.append(_section(quantity.name, most, quantity.form, iter([panel])))
-    return f'<section aria-labelledby="drawn"><h2 id="drawn">Drawn values</h2>{"".join(sections)}</section>'
+        maps = [Map("drawn values, middle of each bin", across, down, squares)]
+        out.append(dataclasses.replace(quantity, most=_most(each.value for each in squares.values()), maps=maps))
+    return out
 
 
-def _drawn_notes(quantity: _Mapped, total: int, count: int) -> tuple[str, str]:
+def _drawn_notes(quantity: PlottedQuantity, total: int, count: int) -> tuple[str, str]:
     """Second line and tooltip of a bin."""
     if quantity is _LATENCY:
         return "", f"{number_of(count, 'change', form=',')} detected"
     title = f"{total:,} of {count:,} changes missed"
     if not count:
         return "", title
-    bound = RATES["missed"].sequence({"missed": total, "visible": count}, CONFIDENCE).bounds[1]
+    bound = independent(total, count).bounds[1]
     return _at_most(bound), title
 
 
-def _distributions(results: Results) -> str:
-    """Histograms of the detection delay and of the errors of M, B, K."""
+def _histograms(results: Results) -> Iterator[PlottedHistogram]:
+    """Histograms of the detection delay and of the errors of the estimates."""
     delays = results.latencies
-    bars = []
     if len(delays.values):
         edges = np.unique(np.linspace(delays.values[0], delays.values[-1] + 1, _BARS + 1).astype(np.int64))
         counts = np.add.reduceat(delays.counts, np.searchsorted(delays.values, edges[:-1]))
         counts[np.searchsorted(delays.values, edges[:-1]) == np.searchsorted(delays.values, edges[1:])] = 0
         ends = f"{edges[0]}", f"{edges[-1] - 1}"
-        bars.append(_histogram("Detection delay", "delay [samples]", "changes", counts.tolist(), ends))
+        yield PlottedHistogram("Detection delay", "delay [samples]", "changes", counts.tolist(), *ends)
     for name, errors in zip(results.plan.estimates, results.distribution.errors, strict=False):
         inner = errors[1:-1]
         if errors.any():
@@ -245,86 +299,6 @@ def _distributions(results: Results) -> str:
             outside = int(errors[0] + errors[-1])
             beyond = f"; {number_of(outside, 'trial', form=',')} beyond 100 %" if outside else ""
             ends = f"{-half * ERROR_STEP:.0%}", f"{half * ERROR_STEP:.0%}"
-            bars.append(
-                _histogram(f"Error of {name}{beyond}", f"relative error of {name}", "trials", shown.tolist(), ends)
+            yield PlottedHistogram(
+                f"Error of {name}{beyond}", f"relative error of {name}", "trials", shown.tolist(), *ends
             )
-    if not bars:
-        return ""
-    return (
-        '<section aria-labelledby="spread"><h2 id="spread">Distributions over all trials</h2>'
-        f'<div class="maps">{"".join(bars)}</div></section>'
-    )
-
-
-def _histogram(caption: str, across: str, up: str, counts: Sequence[int], ends: tuple[str, str]) -> str:
-    """Bars over an axis with the title ``across``, of which ``ends`` are the ends; ``up``: what is counted."""
-    most, step = max(1, *counts), _BARS_WIDTH / len(counts)
-    top = 22
-    parts = [words(_BARS_LEFT, 12, up, is_faint=True)]
-    for value in levels(most):
-        y = top + _BARS_HEIGHT * (1.0 - value / most)
-        parts.append(f'<path d="M{_BARS_LEFT} {y:.1f}h{_BARS_WIDTH}" stroke="var(--line)"/>')
-        parts.append(words(_BARS_LEFT - 6, y + 4, f"{value:g}", "end"))
-    bars = "".join(
-        f'<path d="M{_BARS_LEFT + i * step:.1f} {top + _BARS_HEIGHT}v{-_BARS_HEIGHT * count / most:.1f}h{step:.1f}'
-        f'V{top + _BARS_HEIGHT}z"/>'
-        for i, count in enumerate(counts)
-        if count
-    )
-    parts.append(f'<g fill="var(--first)">{bars}</g>')
-    right, below = _BARS_LEFT + _BARS_WIDTH, top + _BARS_HEIGHT + 15
-    parts += [words(_BARS_LEFT, below, ends[0], "start"), words(right, below, ends[1], "end")]
-    parts.append(words((_BARS_LEFT + right) / 2, below + 14, across, is_faint=True))
-    caption = f"{caption}: {sum(counts):,} {up}"
-    label = f"{caption}; {across} from {ends[0]} to {ends[1]}, highest bar {most:,}"
-    return figure(caption, label, right + 6, below + 20, parts, has_links=False)
-
-
-def _table(results: Results) -> str:
-    cells = labelled(results)
-    not_passed = [bool(each.not_passed) for each in results.aggregates]
-    head = heading((_axis(results.plan, axis) for axis in cells[0][0]), (column.title for column in COLUMNS))
-    caption = f"{BOUNDS.capitalize()}; latency and bound in samples from the change"
-    if len(cells) > MOST_ROWS:
-        caption += f"; {number_of(len(cells) - MOST_ROWS, 'more cell')}: see the JSON file"
-    rows = (
-        _row(number, list(names.values()), summary, has_trials=not_passed[number])
-        for number, (names, summary) in enumerate(cells[:MOST_ROWS])
-    )
-    return table(caption, head, rows, SORTABLE, MOST_ROWS)
-
-
-def _row(number: int, names: Sequence[str], summary: Summary, *, has_trials: bool) -> str:
-    cells = [f'<th scope="row" class="number">{text(name)}</th>' for name in names]
-    for column in COLUMNS:
-        content = column.cell(summary, "–")
-        if has_trials and column.title in ("failed", "inconclusive") and content != "0":
-            content = f'<a href="#trials-{number}">{content}</a>'
-        cells.append(f'<td class="number">{content}</td>')
-    return row(cells, f"cell-{number}")
-
-
-def _not_passed(results: Results) -> str:
-    """First trials of each cell that have not passed, with their reasons."""
-    names = [each for each, _ in labelled(results)]
-    rows = []
-    for number, found in enumerate(results.aggregates[:MOST_ROWS]):
-        for i, (seed, outcome, why) in enumerate(found.not_passed):
-            places = [f'<th scope="row" class="number">{text(value)}</th>' for value in names[number].values()]
-            cells = [*places, cell(seed, "number"), cell(outcome), cell(why, "text reason")]
-            rows.append(row(cells, "" if i else f"trials-{number}"))
-    if not rows:
-        return "<p>Every trial has passed.</p>"
-    head = heading((_axis(results.plan, axis) for axis in names[0]), ("seed",), ("outcome", "reason"))
-    caption = f"The first {MOST_NOT_PASSED} of each cell; all trials are in the SQLite file"
-    return table(caption, head, rows, SORTABLE, MOST_ROWS)
-
-
-def _provenance(played_by: Sequence[Identity]) -> str:
-    if not played_by:
-        return ""
-    rows = (pair for identity in played_by for pair in provenance(identity))
-    return (
-        '<section aria-labelledby="made"><h2 id="made">What made it</h2>'
-        f"{pairs('Every command that has played a part', rows)}</section>"
-    )

@@ -25,6 +25,8 @@ def write_signals(
 ) -> dict[str, Any]:
     """Play ``scenario`` on ``rig`` and write volts, codes and clipping flags, one row a sample, as .csv or .npz.
 
+    The last two columns hold the time of a sample: ``machine_s``, and ``plant_s``, in which the plant's equations hold.
+
     :returns: ``samples``; ``clipped``, the number of samples with any channel clipped; ``overloads``, the first sample
         with a lit overload lamp by amplifier.
     :raises ConfigurationError: the suffix of ``path`` is neither .csv nor .npz.
@@ -41,23 +43,40 @@ def write_signals(
     volts, codes, clipped = (
         np.concatenate([getattr(block, name) for block in blocks]) for name in ("volts", "codes", "clipped")
     )
+    periods_s = performance.sample_period_s * np.array([1.0, performance.time_scale])
+    times = np.arange(len(codes))[:, None] * periods_s
     with replace_file(path) as file:
         if path.suffix == ".csv":
-            _write_csv(scenario.program.channels, volts, codes, clipped, file)
+            _write_csv(scenario.program.channels, times, volts, codes, clipped, file)
         else:
-            np.savez(file, channels=np.array(scenario.program.channels), volts=volts, codes=codes, clipped=clipped)
+            np.savez(
+                file,
+                channels=np.array(scenario.program.channels),
+                volts=volts,
+                codes=codes,
+                clipped=clipped,
+                machine_s=times[:, 0],
+                plant_s=times[:, 1],
+            )
     overloads = dict(performance.hindsight().lamps)
     return {"samples": len(codes), "clipped": int(clipped.any(axis=1).sum()), "overloads": overloads}
 
 
 def _write_csv(
-    channels: Sequence[str], volts: NDArray[Any], codes: NDArray[Any], clipped: NDArray[Any], file: BinaryIO
+    channels: Sequence[str],
+    times: NDArray[Any],
+    volts: NDArray[Any],
+    codes: NDArray[Any],
+    clipped: NDArray[Any],
+    file: BinaryIO,
 ) -> None:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["sample", *(f"{channel}_{kind}" for kind in ("v", "code", "clipped") for channel in channels)])
-    for index, row in enumerate(zip(volts.tolist(), codes.tolist(), clipped.astype(int).tolist(), strict=True)):
-        writer.writerow([index, *(f"{v:.6f}" for v in row[0]), *row[1], *row[2]])
+    names = [f"{channel}_{kind}" for kind in ("v", "code", "clipped") for channel in channels]
+    writer.writerow(["sample", *names, "machine_s", "plant_s"])
+    rows = zip(volts.tolist(), codes.tolist(), clipped.astype(int).tolist(), times.tolist(), strict=True)
+    for index, row in enumerate(rows):
+        writer.writerow([index, *(f"{v:.6f}" for v in row[0]), *row[1], *row[2], *(f"{t:.9g}" for t in row[3])])
     file.write(out.getvalue().encode("ascii"))
 
 

@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.datasheet import ModelOrders
-from analogrig.reporting.markup import heading, number, row, table, text
 from analogrig.run import INPUT, OUTPUT, Run
 from analogrig.wording import number_of
 
-_MOST_ROWS = 20
+_MOST_FITS = 20
 _SETTLING_N = 50
 """Samples in which a simulation forgets that it began with the measured values."""
 
@@ -35,7 +34,12 @@ _EXCITED_DB = 40.0
 _MOST_BRIDGED_N = 16
 """Longest gap that a spectrum bridges; a longer one ends its stretch."""
 
-_WIDTH, _HEIGHT, _LEFT, _TOP, _BELOW = 640, 200, 64, 12, 42
+_LEFT, _RIGHT, _TOP, _HEIGHT = 64.0, 630.0, 12.0, 200.0
+"""Axes of a plot, in pixels of the drawing in run.html."""
+
+
+_Curves = dict[str, tuple[NDArray[np.float64], str]]
+"""Values and style of each curve by its name."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,7 @@ def fits(run: Run) -> tuple[StretchFit, ...]:
     starts = sorted({start for start, _ in run.records} | {index + 1 for index in run.alarm_index.tolist()})
     spans = [span for span in itertools.pairwise([*starts, run.samples]) if span[1] - span[0] >= _LEAST_N]
     spans = [span for span in spans if _scored(run, *span).sum() >= _SETTLING_N]
-    return tuple(_fit(run, *span) for span in spans[-_MOST_ROWS:])
+    return tuple(_fit(run, *span) for span in spans[-_MOST_FITS:])
 
 
 def _first_scored(start: int, end: int) -> int:
@@ -173,8 +177,7 @@ def lines(run: Run) -> list[str]:
     found = fits(run)
     if not found:
         return ["  the device reports no estimates of a model"]
-    unit = _gain_unit(run)
-    head = f"  samples          resonance [Hz]  damping  gain [{unit}]  predicted  simulated"
+    head = f"  samples          resonance [Hz]  damping  gain [{_gain_unit(run)}]  predicted  simulated"
     return [head, *(_line(each) for each in found)]
 
 
@@ -186,48 +189,6 @@ def _line(fit: StretchFit) -> str:
     )
     simulated = "unstable" if fit.simulated is None else f"{fit.simulated:.1%}"
     return f"  {fit.start:7}-{fit.end - 1:<8} {mode}  {fit.predicted:9.1%}  {simulated:>9}"
-
-
-def section(run: Run) -> str:
-    """Section of the page; empty if the plant is known."""
-    if run.conditions.segments or not run.samples:
-        return ""
-    return (
-        '<section aria-labelledby="measured"><h2 id="measured">Measured data</h2>'
-        "<p>Nothing is known of the plant, so nothing is judged. The figures show how well the device's own model"
-        f" describes the samples.</p>{_alarms(run)}{_fit_table(run)}{_spectrum(run)}</section>"
-    )
-
-
-def _alarms(run: Run) -> str:
-    alarms = run.alarm_index.tolist()
-    if not alarms:
-        return f"<p>No alarm in {number_of(run.samples, 'sample', form=',')}.</p>"
-    shown = ", ".join(map(str, alarms[:_MOST_ROWS])) + (", …" if len(alarms) > _MOST_ROWS else "")
-    return f"<p>{number_of(len(alarms), 'alarm', form=',')}, at {text(shown)}.</p>"
-
-
-def _fit_table(run: Run) -> str:
-    found = fits(run)
-    if not found:
-        return "<p>The device reports no estimates of a model.</p>"
-    note = (
-        "<p>Each row is the estimate after the last sample of a stretch between alarms. Its fit is that in the second"
-        " half of the stretch: the share of the output's standard deviation that it predicts one sample ahead, and"
-        " simulates from the input alone. Missing samples do not count; a simulation bridges those of the input.</p>"
-    )
-    gain = f"Gain [{_gain_unit(run)}]"
-    numbers = ("Resonance [Hz]", "Damping ratio", gain, "Predicted", "Simulated", "Error [codes]", "Its correlation")
-    return note + table("Estimates and their fit", heading(("Samples",), numbers), (_fit_row(each) for each in found))
-
-
-def _fit_row(fit: StretchFit) -> str:
-    mode = fit.mode
-    values = (None, None, None) if mode is None else (mode.resonance_hz, mode.damping, mode.gain)
-    cells = [number(value, ".5g") for value in values]
-    cells += [number(fit.predicted, ".1%"), number(fit.simulated, ".1%")]
-    cells += [number(fit.innovation_codes, ".3g"), number(fit.neighbours, "+.2f")]
-    return row([f'<th scope="row">{fit.start}–{fit.end - 1}</th>', *cells])
 
 
 def _gain_unit(run: Run) -> str:
@@ -307,91 +268,108 @@ def _model_response(run: Run, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
     return np.asarray(np.abs(value) * scales[1] / scales[0])
 
 
-def _spectrum(run: Run) -> str:
+# -------------------------------------------------------------------------------------------------------- for the page
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Curve of a plot."""
+
+    name: str
+    style: str
+    """``line``, ``dashed`` or ``dots``."""
+    points: list[tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Curves over the frequency, in pixels of the drawing."""
+
+    caption: str
+    curves: list[Curve]
+    levels: list[tuple[float, str]]
+    """Places and labels of the levels."""
+    ticks: list[tuple[float, str]]
+    """Places and labels on the axis of the frequency, from its start to its end."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Figures of a run whose plant is unknown."""
+
+    alarms: list[int]
+    fits: tuple[StretchFit, ...]
+    gain_unit: str
+    gaps: list[str]
+    """Sentences about the missing samples of the spectra."""
+    plots: list[Plot] | None
+    """None: the run is too short for a spectrum."""
+
+
+def measured(run: Run) -> Measured | None:
+    """Figures for the page; None if the plant is known, or there are no samples."""
+    if run.conditions.segments or not run.samples:
+        return None
     found = spectrum(run)
-    if found is None:
-        return "<p>The run is too short for a spectrum.</p>"
-    units = [run.conditions.channels[name].unit for name in run.conditions.program.measured]
-    densities = {
-        f"input [dB of {units[0]}²/Hz]": (_decibels(found.input_density, 10.0), "line"),
-        f"output [dB of {units[1]}²/Hz]": (_decibels(found.output_density, 10.0), "dashed"),
-    }
-    curves = {"output over input": (_decibels(measured_response(found), 20.0), "dots")}
-    model = _model_response(run, found.frequency_hz)
-    if model is not None:
-        curves["the device's last estimate"] = (_decibels(model, 20.0), "line")
-    gain = (
-        f"Frequency response in dB of {_gain_unit(run)}, where the coherence is at least {_COHERENT:g} and the input"
-        f" within {_EXCITED_DB:g} dB of its largest density"
-    )
-    return _gap_note(run, found) + "".join(
-        _plot(found.frequency_hz[1:], {name: (values[1:], style) for name, (values, style) in each.items()}, caption)
-        for caption, each in (("Power spectral density", densities), (gain, curves))
-    )
+    gaps, plots = ([], None) if found is None else (_gaps(run, found), _plots(run, found))
+    return Measured(run.alarm_index.tolist(), fits(run), _gain_unit(run), gaps, plots)
 
 
-def _gap_note(run: Run, found: Spectrum) -> str:
-    """Paragraph about the missing samples of a spectrum; empty without any."""
+def _gaps(run: Run, found: Spectrum) -> list[str]:
     notes = []
     if found.end - found.start < run.samples:
         gap = f"more than {_MOST_BRIDGED_N} samples"
         notes.append(f"The spectra are those of samples {found.start} to {found.end - 1}, without a gap of {gap}.")
     if found.bridged_n:
         notes.append(f"Straight lines bridge {number_of(found.bridged_n, 'missing sample', form=',')} in the spectra.")
-    return f"<p>{' '.join(notes)}</p>" if notes else ""
+    return notes
+
+
+def _plots(run: Run, found: Spectrum) -> list[Plot]:
+    units = [run.conditions.channels[name].unit for name in run.conditions.program.measured]
+    densities = {
+        f"input [dB of {units[0]}²/Hz]": (_decibels(found.input_density, 10.0), "line"),
+        f"output [dB of {units[1]}²/Hz]": (_decibels(found.output_density, 10.0), "dashed"),
+    }
+    responses = {"output over input": (_decibels(measured_response(found), 20.0), "dots")}
+    model = _model_response(run, found.frequency_hz)
+    if model is not None:
+        responses["the device's last estimate"] = (_decibels(model, 20.0), "line")
+    response = (
+        f"Frequency response in dB of {_gain_unit(run)}, where the coherence is at least {_COHERENT:g} and the input"
+        f" within {_EXCITED_DB:g} dB of its largest density"
+    )
+    captioned = {"Power spectral density": densities, response: responses}
+    plots = (_plot(caption, found.frequency_hz[1:], curves) for caption, curves in captioned.items())
+    return [plot for plot in plots if plot is not None]
 
 
 def _decibels(values: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
+    """Values in decibels but the first, which is that at 0 Hz; NaN where there are none."""
     with np.errstate(all="ignore"):
-        out = factor * np.log10(values)
+        out = factor * np.log10(values[1:])
     return np.where(np.isfinite(out), out, np.nan)
 
 
-def _plot(frequency_hz: NDArray[np.float64], curves: dict[str, tuple[NDArray[np.float64], str]], caption: str) -> str:
-    """Figure of some curves over the frequency."""
+def _plot(caption: str, frequency_hz: NDArray[np.float64], curves: _Curves) -> Plot | None:
+    """Plot of some curves in decibels; None if they have no value."""
     seen = np.concatenate([values[np.isfinite(values)] for values, _ in curves.values()])
     if not len(seen):
-        return ""
+        return None
     low = 10.0 * math.floor(float(seen.min()) / 10.0)
     high, most_hz = max(10.0 * math.ceil(float(seen.max()) / 10.0), low + 10.0), float(frequency_hz[-1])
-    x = _LEFT + (_WIDTH - _LEFT - 10) * frequency_hz / most_hz
-    parts = [*_level_lines(low, high), *_frequency_words(most_hz)]
-    for name, (values, style) in curves.items():
-        y = _TOP + _HEIGHT * (high - values) / (high - low)
-        parts.append(f"<g>{_curve(x, y, style)}<title>{text(name)}</title></g>")
-    named = "; ".join(f"{_STYLES[style]}: {name}" for name, (_, style) in curves.items())
-    return (
-        f'<figure><figcaption>{text(caption)} over Hz of the plant. {text(named)}</figcaption><div class="scroll">'
-        f'<svg role="img" aria-label="{text(caption)}" width="{_WIDTH}" height="{_TOP + _HEIGHT + _BELOW}"'
-        f' font-size="12">{"".join(parts)}</svg></div></figure>'
-    )
-
-
-_STYLES = {"line": "line", "dashed": "dashed line", "dots": "dots"}
-
-
-def _curve(x: NDArray[np.float64], y: NDArray[np.float64], style: str) -> str:
-    points = [(a, b) for a, b in zip(x.tolist(), y.tolist(), strict=True) if math.isfinite(b)]
-    if style == "dots":
-        return "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="1.5" fill="currentColor"/>' for a, b in points)
-    dash = ' stroke-dasharray="5 3"' if style == "dashed" else ""
-    line = " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
-    return f'<polyline points="{line}" fill="none" stroke="currentColor"{dash}/>'
-
-
-def _level_lines(low: float, high: float) -> Iterator[str]:
     step = 10.0 * math.ceil((high - low) / 60.0)
-    for i in range(int((high - low) / step) + 1):
-        y = _TOP + _HEIGHT * (1.0 - i * step / (high - low))
-        yield f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - 10}" stroke="currentColor" stroke-opacity=".2"/>'
-        yield _words(_LEFT - 8, y + 4, f"{low + i * step:g}", "end")
 
+    def place(values: Any) -> Any:
+        return _TOP + _HEIGHT * (high - values) / (high - low)
 
-def _frequency_words(most_hz: float) -> Iterator[str]:
-    for i in range(5):
-        x = _LEFT + (_WIDTH - _LEFT - 10) * i / 4
-        yield _words(x, _TOP + _HEIGHT + 16, f"{most_hz * i / 4:.4g}", ("start", *["middle"] * 3, "end")[i])
-
-
-def _words(x: float, y: float, words: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="currentColor">{text(words)}</text>'
+    x = _LEFT + (_RIGHT - _LEFT) * frequency_hz / most_hz
+    return Plot(
+        caption,
+        [
+            Curve(name, style, [(a, b) for a, b in zip(x.tolist(), place(y).tolist(), strict=True) if math.isfinite(b)])
+            for name, (y, style) in curves.items()
+        ],
+        levels=[(place(level), f"{level:g}") for level in np.arange(low, high + 1.0, step).tolist()],
+        ticks=[(_LEFT + (_RIGHT - _LEFT) * i / 4, f"{most_hz * i / 4:.4g}") for i in range(5)],
+    )

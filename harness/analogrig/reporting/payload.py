@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.judging.verdict import ChangeVerdict, Verdict, trajectory
+from analogrig.judging.estimates import trajectory
+from analogrig.judging.verdict import ChangeVerdict, Verdict
 from analogrig.plant import Plant, estimated_response
 from analogrig.run import CHUNK_SAMPLES, IMPORTED, Run, missing_samples
 

@@ -14,9 +14,7 @@ from urllib.parse import quote
 from analogrig.config import read_bounded
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.output import FORMAT, FORMAT_VERSION, REPORT_FILE, VERDICT_FILE
-from analogrig.pages import FOLDER, TABLES, assemble_page
-from analogrig.reporting.markings import figure, levels, words
-from analogrig.reporting.markup import SORTABLE, cell, heading, number, row, table, text
+from analogrig.pages import SIGNS, TABLES, render_page
 from analogrig.storage import replace_file
 from analogrig.wording import number_of
 
@@ -29,15 +27,8 @@ _MOST_BYTES = 16_000_000
 """Largest verdict that is read."""
 
 _MOST_TRENDS = 40
-_WIDTH, _HEIGHT, _LEFT, _TOP, _BELOW = 600, 180, 56, 26, 62
-_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?", "unjudged": "–"}
-_STYLES = {"passed": "good", "failed": "bad", "inconclusive": "neutral", "unjudged": "neutral"}
-_COLOURS = {
-    "passed": "var(--alarm)",
-    "failed": "var(--false)",
-    "inconclusive": "var(--truth)",
-    "unjudged": "var(--truth)",
-}
+_LEFT, _RIGHT, _TOP, _HEIGHT, _LABEL = 56, 580, 26, 180, 110
+"""First and last point of a plot, its axis, and the room for a label, in pixels of the drawing in session.html."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +61,11 @@ class Entry:
     def kind(self) -> tuple[str, str, str]:
         """Scenario, rig and device: runs of one kind form a trend."""
         return self.scenario, self.rig, self.device
+
+    @property
+    def link(self) -> str:
+        """URL of the page."""
+        return quote(self.page)
 
 
 @dataclass(frozen=True)
@@ -147,7 +143,7 @@ def _entry(table: Mapping[str, Any], parent: Path, folder: Path, start: Path) ->
     by, changes = table["recorded_by"] or {}, table["tweaks"]
     exact = [each for each in changes if each["latency"] is not None and each["bound"]]
     latency, bound = (math.fsum(float(each[key]) for each in exact) for key in ("latency", "bound"))
-    if table["outcome"] not in _SIGNS or not math.isfinite(latency + bound):
+    if table["outcome"] not in SIGNS or not math.isfinite(latency + bound):
         raise ValueError("outcome, latency or bound")
     return Entry(
         folder=parent.relative_to(folder).as_posix(),
@@ -179,110 +175,77 @@ def write_session(session: RunList, path: Path) -> None:
 
 def render(session: RunList) -> str:
     """The page as text."""
-    shown = [outcome for outcome in _SIGNS if outcome != "unjudged" or session.count(outcome)]
+    shown = [outcome for outcome in SIGNS if outcome != "unjudged" or session.count(outcome)]
     counts = ", ".join(f"{session.count(outcome)} {outcome}" for outcome in shown)
+    unread = (*session.unended, *session.unread)
     worst = next((outcome for outcome in ("failed", "inconclusive", "unjudged") if session.count(outcome)), "passed")
-    lines = (*session.unended, *session.unread)
-    worst = "inconclusive" if worst == "passed" and lines else worst
-    unread = "".join(f"<li>{text(line)}</li>" for line in lines)
-    return assemble_page(
-        FOLDER / "session.html",
+    return render_page(
+        "session.html",
         (TABLES,),
-        title=text(f"{number_of(len(session.runs), 'run')}: {counts}"),
-        outcome=worst,
-        heading=text(number_of(len(session.runs), "run")),
-        sentence=text(f"{counts}."),
-        unread=f"<ul>{unread}</ul>" if unread else "",
+        title=f"{number_of(len(session.runs), 'run')}: {counts}",
+        outcome="inconclusive" if worst == "passed" and unread else worst,
+        counts=counts,
+        unread=unread,
         trends=_trends(session.runs),
-        runs=_table(session.runs),
+        runs=session.runs,
+        most_trends=_MOST_TRENDS,
+        most_runs=MOST_RUNS,
     )
 
 
-def _table(runs: Sequence[Entry]) -> str:
-    head = heading(
-        ("Started", "Outcome", "Run", "Scenario", "Rig", "Device", "Build", "Commit"),
-        ("Seed", "Samples", "Changes", "Missed", "False alarms", "Latency / bound"),
-    )
-    caption = "In the order of their start; latency over bound of all detected changes"
-    return table(caption, head, map(_row, runs), SORTABLE, MOST_RUNS)
+@dataclass(frozen=True)
+class _Point:
+    """Run in a plot."""
+
+    run: Entry
+    x: float
+    y: float
+    is_labelled: bool
+    """True if its build and commit stand below: they are not those of the run before, and there is room."""
+
+    @property
+    def title(self) -> str:
+        run = self.run
+        ratio = "no change detected" if run.ratio is None else f"{run.ratio:.2f} bounds"
+        alarms = number_of(run.false_alarms, "false alarm")
+        return f"{run.folder}, seed {run.seed}: {run.outcome}, {ratio}, {run.missed} missed, {alarms}"
 
 
-def _row(run: Entry) -> str:
-    name = text(run.folder if run.folder != "." else "here")
-    link = f'<a href="{text(quote(run.page))}">{name}</a>' if run.page else name
-    places = [run.scenario, run.rig, run.device, run.build, run.commit]
-    numbers = [run.samples, run.changes, run.missed, run.false_alarms]
-    outcome = cell(f"{_SIGNS[run.outcome]} {run.outcome}", f"text {_STYLES[run.outcome]}")
-    return row(
-        [
-            cell(run.started[:19].replace("T", " "), "date"),
-            outcome,
-            f'<th scope="row">{link}</th>',
-            *map(cell, places),
-            number(run.seed, "d"),
-            *(number(value, ",d") for value in numbers),
-            number(run.ratio, ".2f"),
-        ]
-    )
+@dataclass(frozen=True)
+class _Trend:
+    """Plot of the delay in bounds over the runs of one kind, in the order of their start."""
+
+    caption: str
+    most: float
+    """Value at the top of the plot."""
+    points: list[_Point]
+
+    def height(self, ratio: float) -> float:
+        """Place of a ratio on the vertical axis."""
+        return _height(ratio, self.most)
 
 
-def _trends(runs: Sequence[Entry]) -> str:
-    """One plot for each kind of run that was played more than once."""
-    kinds = [kind for kind in dict.fromkeys(run.kind for run in runs) if sum(run.kind == kind for run in runs) > 1]
-    if not kinds:
-        return "<p>No scenario was played twice with the same device: there is no trend.</p>"
-    more = f"<p>The first {_MOST_TRENDS} of {len(kinds)} are drawn.</p>" if len(kinds) > _MOST_TRENDS else ""
-    plots = [_trend(kind, [run for run in runs if run.kind == kind]) for kind in kinds[:_MOST_TRENDS]]
-    return f'<div class="maps">{"".join(plots)}</div>{more}'
+def _trends(runs: Sequence[Entry]) -> list[_Trend]:
+    """A plot for each kind of run that was played more than once."""
+    by_kind: dict[tuple[str, str, str], list[Entry]] = {}
+    for run in runs:
+        by_kind.setdefault(run.kind, []).append(run)
+    return [_trend(kind, alike) for kind, alike in by_kind.items() if len(alike) > 1]
 
 
-def _trend(kind: tuple[str, str, str], runs: Sequence[Entry]) -> str:
-    """Plot of the delay in bounds over the runs, in the order of their start; ticks where build or commit change."""
+def _trend(kind: tuple[str, str, str], runs: Sequence[Entry]) -> _Trend:
     most = 1.1 * max([1.0, *(run.ratio for run in runs if run.ratio is not None)])
-    step = (_WIDTH - _LEFT - 20) / max(1, len(runs) - 1)
-    places = [(run, _LEFT + i * step, _TOP + _HEIGHT * (1.0 - (run.ratio or 0.0) / most)) for i, run in enumerate(runs)]
-    parts = [words(_LEFT, 12, "latency / bound", "start", is_faint=True)]
-    parts += [_level(value, most) for value in levels(most)]
+    step = (_RIGHT - _LEFT) / max(1, len(runs) - 1)
+    points = []
     free, made_by = -math.inf, ("", "")
-    for run, x, _ in places:
-        if (run.build, run.commit) != made_by and x >= free:
-            parts.append(words(x, _TOP + _HEIGHT + 16, run.build or "–", "start"))
-            parts.append(words(x, _TOP + _HEIGHT + 32, run.commit or "–", "start"))
-            parts.append(f'<path d="M{x:.1f} {_TOP}v{_HEIGHT}" stroke="var(--line)"/>')
-            free = x + 110
+    for i, run in enumerate(runs):
+        x = _LEFT + i * step
+        is_labelled = (run.build, run.commit) != made_by and x >= free
+        free = x + _LABEL if is_labelled else free
         made_by = run.build, run.commit
-    line = " ".join(f"{x:.1f},{y:.1f}" for run, x, y in places if run.ratio is not None)
-    parts.append(f'<polyline points="{line}" fill="none" stroke="var(--muted)"/>')
-    parts += [_point(run, x, y) for run, x, y in places]
-    below = "build of the device and commit of analogrig, in the order of the runs"
-    parts.append(words(_LEFT, _TOP + _HEIGHT + 52, below, "start", is_faint=True))
-    caption = f"{kind[0]} on {kind[1]}, device {kind[2]}"
-    has_links = any(run.page for run in runs)
-    return figure(
-        caption, f"{caption}: latency over bound", _WIDTH, _TOP + _HEIGHT + _BELOW, parts, has_links=has_links
-    )
+        points.append(_Point(run, x, _height(run.ratio or 0.0, most), is_labelled))
+    return _Trend(f"{kind[0]} on {kind[1]}, device {kind[2]}", most, points)
 
 
-def _level(value: float, most: float) -> str:
-    y = _TOP + _HEIGHT * (1.0 - value / most)
-    line = f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - 10}" stroke="var(--line)"/>'
-    return line + words(_LEFT - 8, y + 4, f"{value:g}", "end")
-
-
-def _point(run: Entry, x: float, y: float) -> str:
-    """Mark of a run, which leads to its page: a disc if it passed, a cross if it failed, else a ring."""
-    colour = _COLOURS[run.outcome]
-    ring = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="none" stroke="{colour}" stroke-width="2"/>'
-    shapes = {
-        "passed": f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>',
-        "failed": f'<path d="M{x - 5:.1f} {y - 5:.1f}l10 10m0 -10l-10 10" stroke="{colour}" stroke-width="3"/>',
-        "inconclusive": ring,
-        "unjudged": ring,
-    }
-    ratio = "no change detected" if run.ratio is None else f"{run.ratio:.2f} bounds"
-    alarms = number_of(run.false_alarms, "false alarm")
-    title = f"{run.folder}, seed {run.seed}: {run.outcome}, {ratio}, {run.missed} missed, {alarms}"
-    mark = f"{shapes[run.outcome]}<title>{text(title)}</title>"
-    if not run.page:
-        return f"<g>{mark}</g>"
-    return f'<a href="{text(quote(run.page))}" aria-label="{text(title)}">{mark}</a>'
+def _height(ratio: float, most: float) -> float:
+    return _TOP + _HEIGHT * (1.0 - ratio / most)

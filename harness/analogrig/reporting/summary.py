@@ -17,7 +17,6 @@ from analogrig.judging.verdict import (
     missing_text,
 )
 from analogrig.program import Program
-from analogrig.protocol.bus_load import BusLoad, load_of
 from analogrig.reporting import measured
 from analogrig.run import Run
 from analogrig.wording import counter_text, number_of
@@ -44,7 +43,6 @@ def summary(run: Run, verdict: Verdict) -> str:
             f"  sample  {'named':{width}}  right  extent   error       delay  bound   onset error  (samples)",
             *(_diagnosis_line(*each, width) for each in diagnoses),
         ]
-    load = load_of(run)
     raised = verdict.false_alarms if verdict.knows_truth else run.alarm_index.tolist()
     facts = {
         "false alarms" if verdict.knows_truth else "alarms": f"{_alarms(raised)} in {number_of(run.samples, 'sample')}",
@@ -55,7 +53,6 @@ def summary(run: Run, verdict: Verdict) -> str:
         missing_text(run): verdict.missing_n and number_of(verdict.missing_n, "sample"),
         "overload lamps": verdict.overloads and lamps_text(verdict.overloads),
         "on the line": traffic_text(conditions.link_counters),
-        "bus": load and load_text(load),
     }
     lines += ["", *(f"  {name}: {text}" for name, text in facts.items() if text)]
     if not verdict.knows_truth:
@@ -92,15 +89,6 @@ def lamps_text(overloads: Mapping[str, int]) -> str:
     """Lit overload lamps in order of time: ``U1 from sample 51``; ``none`` without one."""
     in_order = sorted(overloads.items(), key=lambda lamp: (lamp[1], lamp[0]))
     return ", ".join(f"{amplifier} from sample {sample}" for amplifier, sample in in_order) or "none"
-
-
-def load_text(load: BusLoad) -> str:
-    """Load of the CAN bus by the exchange, in one line."""
-    faster = "" if load.data_bitrate is None else f", data {load.data_bitrate} bit/s"
-    late = "" if load.latency_s is None else f", answers within {load.latency_s * 1e3:.3g} ms"
-    fits = load.utilisation <= 1.0
-    used = f"{load.utilisation:.1%} of it" if fits else f"{load.utilisation:.3g} times what it carries,"
-    return f"{load.bitrate} bit/s{faster}: {used} in real time{late}; at most {load.most_samples_per_s:.5g} samples/s"
 
 
 def _alarms(samples: Sequence[int]) -> str:

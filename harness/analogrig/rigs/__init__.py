@@ -10,7 +10,9 @@ as in ``--rig mykind``, stands for a description with all defaults:
 =============  ==========================================================================================
 describe       ``RigDescription`` (base class), ``Thing``
 perform        ``Rig`` (base class), ``Performance``, ``Hindsight``, ``CAPABILITIES``
-sample         ``Block``, ``Channel``, ``Segment``
+sample         ``Block``, ``Channel``, ``Segment``, ``BLOCK_SAMPLES``, ``WRONG_SAMPLES``, ``DEFAULT_RIG``
+emulator       ``EmulatorRig``, ``EmulatorDescription``, ``ComputerDescription``, ``CardDescription``,
+               ``MeasuredValues``, ``Stream``, ``emulator_errors``, ``is_emulated``
 errors         ``RigTimeout``, ``RigClosed``, ``RigRefused``; ``RigError`` is in ``analogrig``
 =============  ==========================================================================================
 """
@@ -25,7 +27,19 @@ CAPABILITIES = ("excite", "tweak")
 if TYPE_CHECKING:
     from analogrig.errors import RigClosed, RigRefused, RigTimeout
     from analogrig.plant import Segment
-    from analogrig.rigs.rig import Block, Hindsight, Performance, Rig, RigDescription
+    from analogrig.rigs.description import DEFAULT_RIG
+    from analogrig.rigs.emulator import (
+        CardDescription,
+        ComputerDescription,
+        EmulatorDescription,
+        EmulatorRig,
+        MeasuredValues,
+        Stream,
+        emulator_errors,
+        is_emulated,
+    )
+    from analogrig.rigs.recording import WRONG_SAMPLES
+    from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
     from analogrig.run import Channel
     from analogrig.trust import Thing
 else:
@@ -34,19 +48,33 @@ else:
     __getattr__ = loader(
         __name__,
         {
+            "analogrig.rigs.description": "DEFAULT_RIG",
             "analogrig.errors": "RigClosed RigRefused RigTimeout",
             "analogrig.plant": "Segment",
-            "analogrig.rigs.rig": "Block Hindsight Performance Rig RigDescription",
+            "analogrig.rigs.emulator": (
+                "CardDescription ComputerDescription EmulatorDescription EmulatorRig MeasuredValues Stream "
+                "emulator_errors is_emulated"
+            ),
+            "analogrig.rigs.recording": "WRONG_SAMPLES",
+            "analogrig.rigs.rig": "BLOCK_SAMPLES Block Hindsight Performance Rig RigDescription",
             "analogrig.run": "Channel",
             "analogrig.trust": "Thing",
         },
     )
 
 __all__ = [
+    "BLOCK_SAMPLES",
     "CAPABILITIES",
+    "DEFAULT_RIG",
+    "WRONG_SAMPLES",
     "Block",
+    "CardDescription",
     "Channel",
+    "ComputerDescription",
+    "EmulatorDescription",
+    "EmulatorRig",
     "Hindsight",
+    "MeasuredValues",
     "Performance",
     "Rig",
     "RigClosed",
@@ -54,5 +82,8 @@ __all__ = [
     "RigRefused",
     "RigTimeout",
     "Segment",
+    "Stream",
     "Thing",
+    "emulator_errors",
+    "is_emulated",
 ]

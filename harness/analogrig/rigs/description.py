@@ -19,7 +19,6 @@ KINDS = Kinds(
     "analogrig.rigs",
     {
         "emulator": "analogrig.rigs.emulator:EmulatorDescription",
-        "real": "analogrig.hardware.wiring:RealDescription",
     },
 )
 """Description of each kind of rig."""
@@ -31,7 +30,7 @@ RIGS_VARIABLE, RIGS_FILE = "ANALOGRIG_RIGS", "rigs.toml"
 """Environment variable that names the rigs file of a laboratory, and the default file name in the working directory."""
 
 
-def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] = ()) -> Rig:
+def open_rig(name: str | Path, *, self_test: bool = True, allow: Trust | Iterable[str] = ()) -> Rig:
     """Open a rig by name. Use it in a ``with`` statement: leaving it switches outputs off and closes connections.
 
     ``recording:FILE`` replays a recording. Other names stand for a table ``[rig.NAME]`` of the rigs file, or else
@@ -44,7 +43,7 @@ def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] 
     :raises ConfigurationError: no such rig, its description is wrong, or it names what is not allowed.
     :raises RecordingError: the recording cannot be read.
     """
-    description, where, file = _read(name)
+    description, where, file = _read(str(name) if isinstance(name, Path) else name)
     try:
         Trust.of(allow).check(description.things, file, where)
         description.check()

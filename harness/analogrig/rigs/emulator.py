@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
-from analogrig.plant import Plant, Segment
+from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
 from analogrig.run import OUTPUT, Channel
@@ -43,8 +43,6 @@ from analogrig_emulator import (
     Pot,
     PotTurn,
     ProgramCircuit,
-    RepeatedCourses,
-    RepeatedPlay,
     Resistor,
     Sampler,
     Supply,
@@ -52,14 +50,8 @@ from analogrig_emulator import (
     WideProgram,
     Wired,
     acquired,
-    ahead_ticks,
-    drawn_offsets_v,
-    is_repeatable,
-    normals,
     preset,
     probes_per_sample,
-    sample_plays,
-    uniforms,
 )
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V, MOST_HUM_V = 1000.0, 1e-3, 1.0, 10.0
@@ -309,19 +301,6 @@ class SetUp(NamedTuple):
     changes: tuple[PotTurn, ...]
 
 
-class _Prepared(NamedTuple):
-    """Data that all plays of one scenario share, for every seed."""
-
-    key: tuple[object, ...]
-    """Parts of the scenario on which the data depend."""
-    computer: SuspensionComputer
-    card: Card
-    play: RepeatedPlay | None
-    """Repeated play; None where more than offsets and phase depends on the seed."""
-    channels: Mapping[str, Channel]
-    segments: tuple[Segment, ...]
-
-
 class EmulatorRig(Rig):
     """The emulated analogue computer and its card."""
 
@@ -330,12 +309,11 @@ class EmulatorRig(Rig):
 
     def __init__(self, description: EmulatorDescription, block_samples: int = BLOCK_SAMPLES) -> None:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
-        self._description = description
+        self.described = description
         description.card.card(
             tuple(description.card.range_v) or ("input",)
         )  # refused here, and not when it is first played
-        self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
-        self._last_prepared: _Prepared | None = None
+        self.amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._cards: dict[tuple[str, ...], Card] = {}
         self._table = dataclasses.asdict(description)  # to write it takes as long as to play a thousand samples
         self._block_samples = block_samples
@@ -343,17 +321,10 @@ class EmulatorRig(Rig):
     def description(self) -> Mapping[str, Any]:
         return self._table
 
-    def in_blocks(self, samples: int) -> EmulatorRig:
-        """The same rig with blocks of at most ``samples`` samples. Only the speed differs.
-
-        Data for a scenario that fits in one block are prepared once for all seeds.
-        """
-        return EmulatorRig(self._description, samples)
-
     def card(self, program: Program) -> Card:
         """Card with the channels of a program."""
         if program.channels not in self._cards:
-            self._cards[program.channels] = self._description.card.card(program.channels)
+            self._cards[program.channels] = self.described.card.card(program.channels)
         return self._cards[program.channels]
 
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:
@@ -383,45 +354,18 @@ class EmulatorRig(Rig):
         rate_hz = card.true_rate_hz * probes_per_sample(card)
 
         def wired(gain: float) -> Wired:
-            machine = _drawn_machine(self._description.computer, _with_gain(program, gain), seed, rate_hz)
-            is_digital = self._description.computer.pots == "dial"
-            return Wired(machine, _nominal(program, gain) if is_digital else machine)
+            machine = drawn_machine(self.described.computer, _with_gain(program, gain), seed, rate_hz)
+            is_digital = self.described.computer.pots == "dial"
+            return Wired(machine, nominal_machine(program, gain) if is_digital else machine)
 
         excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         return Courses(wired, card, excitation, samples, OUTPUT)
 
-    def courses_together(self, scenario: Scenario, seeds: Sequence[int], samples: int) -> RepeatedCourses | None:
-        """Courses without ramps of the machines of several plays; None where these differ in more than offsets.
-
-        :raises EmulatorError: as ``courses``.
-        """
-        program, card = scenario.program, self.card(scenario.program)
-        if not self._draws_offsets_and_phase_alone(scenario):
-            return None
-        machine = _drawn_machine(self._description.computer, program.circuit, seeds[0], card.true_rate_hz)
-        if not is_repeatable(machine, ()):
-            return None
-        wired = Wired(machine, _nominal(program) if self._description.computer.pots == "dial" else machine)
-        phases, offsets_v = self._drawn(scenario, seeds, machine)
-        return RepeatedCourses(wired, scenario.excitation, phases, offsets_v, samples, OUTPUT)
-
-    def _drawn(
-        self, scenario: Scenario, seeds: Sequence[int], computer: SuspensionComputer
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Phases (seeds,) and offsets of the amplifiers (seeds, amplifiers) in volts."""
-        numbers = uniforms(seeds, Stream.COMPONENTS, computer.program.amplifiers)
-        offsets_v = drawn_offsets_v(self._amplifier, numbers, self._description.computer.offset_v)
-        if scenario.random_phase:
-            return uniforms(seeds, Stream.EXCITATION, 1)[:, 0], offsets_v
-        return np.full(len(seeds), scenario.excitation.phase), offsets_v
-
     def perform(self, scenario: Scenario, seed: int) -> Performance:
-        if repeated := self._repeat(scenario, [seed]):
-            return repeated[0]
         computer, excitation, changes = self.set_up(scenario, seed)
         card = self.card(scenario.program)
         with emulator_errors(f"scenario {scenario.name}: "):
-            machine = self._description.computer.add_noise(computer, seed)
+            machine = self.described.computer.add_noise(computer, seed)
             jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
                 machine,
@@ -435,15 +379,12 @@ class EmulatorRig(Rig):
         return Performance(
             sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
-            channels=_channels(card, computer, scenario.program),
+            channels=channels_of(card, computer, scenario.program),
             blocks=_sample(volts, Sampler(card, NormalStream(seed, Stream.CARD))),
             hindsight=lambda: Hindsight(
-                scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(card))
+                scenario.segments(), lit_lamps(computer.machine.lamps, probes_per_sample(card))
             ),
         )
-
-    def perform_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
-        return self._repeat(scenario, seeds) or super().perform_all(scenario, seeds)
 
     def perform_in_steps(
         self,
@@ -461,8 +402,8 @@ class EmulatorRig(Rig):
 
         :raises ConfigurationError: the rig cannot be played in steps.
         """
-        if self._description.computer.noise:
-            raise ConfigurationError(f"{self._description.name}: computer.noise: a play in steps has no such noise")
+        if self.described.computer.noise:
+            raise ConfigurationError(f"{self.described.name}: computer.noise: a play in steps has no such noise")
         computer, card = set_up.computer, self.card(program)
         with emulator_errors():
             machine = _SteppedMachine(computer, lengths, probes_per_sample(card), probes)
@@ -470,77 +411,15 @@ class EmulatorRig(Rig):
         return Performance(
             sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
-            channels=_channels(card, computer, program),
+            channels=channels_of(card, computer, program),
             blocks=_sample(map(alter, volts), Sampler(card, NormalStream(seed, Stream.CARD))),
-            hindsight=lambda: Hindsight((), _lit_lamps(computer.machine.lamps, probes_per_sample(card))),
+            hindsight=lambda: Hindsight((), lit_lamps(computer.machine.lamps, probes_per_sample(card))),
         )
-
-    def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
-        """Prepared data of the scenario; the last set is reused for the same key."""
-        key = (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
-        if self._last_prepared is None or self._last_prepared.key != key:
-            computer, excitation, changes = self.set_up(scenario, seed)
-            card = self.card(scenario.program)
-            with emulator_errors(f"scenario {scenario.name}: "):
-                excitation.check_rate(computer.sample_rate_hz)
-                able = self._draws_offsets_and_phase_alone(scenario) and is_repeatable(computer, changes)
-                play = RepeatedPlay(computer, scenario.samples, changes) if able else None
-            channels = _channels(card, computer, scenario.program)
-            self._last_prepared = _Prepared(key, computer, card, play, channels, scenario.segments())
-        return self._last_prepared
-
-    def _draws_offsets_and_phase_alone(self, scenario: Scenario) -> bool:
-        """True if plays of the scenario differ in the amplifiers' offsets and the phase of their edges alone."""
-        card, drawn = self.card(scenario.program), self._description.computer
-        is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm
-        is_nominal &= not drawn.noise and not drawn.supply_hum_v
-        is_nominal &= drawn.specimen is None and drawn.values is None
-        is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
-        return is_nominal and is_on_time and not scenario.excitation.is_smooth
-
-    def _repeat(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
-        """Performances whose blocks are computed together with the first one; none if there is no repeated play."""
-        if scenario.samples > self._block_samples:
-            return []
-        prepared = self._prepare(scenario, seeds[0])
-        if (play := prepared.play) is None:
-            return []
-        taken: list[tuple[Block, Mapping[str, int]]] = []
-
-        def blocks(i: int) -> Iterator[Block]:
-            if not taken:
-                taken.extend(self._repeated_blocks(prepared, play, scenario, seeds))
-            yield taken[i][0]
-
-        def hindsight(i: int) -> Hindsight:
-            return Hindsight(prepared.segments, taken[i][1] if taken else {})
-
-        return [
-            Performance(
-                sample_period_s=1.0 / prepared.card.rate_hz,
-                time_scale=prepared.computer.scales.time,
-                channels=prepared.channels,
-                blocks=blocks(i),
-                hindsight=functools.partial(hindsight, i),
-            )
-            for i in range(len(seeds))
-        ]
-
-    def _repeated_blocks(
-        self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seeds: Sequence[int]
-    ) -> Iterator[tuple[Block, Mapping[str, int]]]:
-        """Samples and lit lamps of each seed."""
-        phases, offsets_v = self._drawn(scenario, seeds, prepared.computer)
-        with emulator_errors(as_error=RigError):
-            volts, lamps = play.play_all(scenario.excitation, phases, offsets_v)
-            codes, clipped = sample_plays(prepared.card, volts, normals(seeds, Stream.CARD, volts.shape[1:]))
-        for each, *samples in zip(lamps, volts, codes, clipped, strict=True):
-            yield Block(0, *samples), _lit_lamps(each, 1)
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         card = self.card(scenario.program)
         rate_hz = card.true_rate_hz * probes_per_sample(card)
-        computer = _drawn_machine(self._description.computer, scenario.program.circuit, seed, rate_hz, anew=True)
+        computer = drawn_machine(self.described.computer, scenario.program.circuit, seed, rate_hz, anew=True)
         computer.set(**self.pot_settings(scenario.plant, scenario.program.parameters))
         return computer
 
@@ -551,14 +430,14 @@ class EmulatorRig(Rig):
         """
         names = {plant.program.names[name] for name in changed}
         values = plant.parameters()
-        if self._description.computer.pots == "coefficient":
+        if self.described.computer.pots == "coefficient":
             return {name: value for name, value in values.items() if name in names}
-        dials = _nominal(plant.program).dials_for(**values)
+        dials = nominal_machine(plant.program).dials_for(**values)
         pots = plant.program.circuit.pots
         return {f"{pot}_dial": dial for pot, dial in dials.items() if names.intersection(pots[pot].settings)}
 
 
-def _channels(card: Card, computer: SuspensionComputer, program: Program) -> dict[str, Channel]:
+def channels_of(card: Card, computer: SuspensionComputer, program: Program) -> dict[str, Channel]:
     return {
         name: Channel(
             low_v=card.ranges_v[i][0],
@@ -603,7 +482,7 @@ def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
     return rig.computes_circuit
 
 
-def _lit_lamps(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
+def lit_lamps(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
     """Lit lamps, with the card's sample; the machine takes `probes` for each of those."""
     return {amplifier: -(-probe // probes) for amplifier, probe in lamps.items() if probe is not None}
 
@@ -630,7 +509,7 @@ _last_machine: tuple[tuple[object, ...], SuspensionComputer] | None = None
 """Machine drawn last, with what it was drawn from."""
 
 
-def _drawn_machine(
+def drawn_machine(
     computer: ComputerDescription, program: ProgramCircuit, seed: int, rate_hz: float, *, anew: bool = False
 ) -> SuspensionComputer:
     """Machine of a seed; the last one unless ``anew``. Courses leave a machine as it is, and drawing takes long."""
@@ -641,21 +520,8 @@ def _drawn_machine(
     return last[1]
 
 
-def nominal_courses(scenario: Scenario) -> Courses:
-    """Noise-free courses of the output on a nominal machine at 20,000 samples/s, with the scenario's own phase.
-
-    :raises EmulatorError: the machine cannot play the excitation.
-    """
-
-    def wired(gain: float) -> Wired:
-        machine = SuspensionComputer(_with_gain(scenario.program, gain))
-        return Wired(machine, machine)
-
-    return Courses(wired, Card(), scenario.excitation, scenario.samples, OUTPUT)
-
-
 @functools.lru_cache(maxsize=8)
-def _nominal(program: Program, gain: float = 1.0) -> SuspensionComputer:
+def nominal_machine(program: Program, gain: float = 1.0) -> SuspensionComputer:
     """Nominal machine, used only to compute dials."""
     return SuspensionComputer(_with_gain(program, gain), opamp="ideal")
 

@@ -7,7 +7,7 @@ on the class of a rig or a description: both state what they are capable of.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -104,10 +104,6 @@ class Rig(Protocol):
         :raises ConfigurationError: the scenario cannot be played on this rig.
         :raises RigError: the rig failed; also while the blocks are taken.
         """
-
-    def perform_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
-        """Performance of each seed, as of ``perform``; a rig may compute their blocks together."""
-        return [self.perform(scenario, seed) for seed in seeds]
 
     def description(self) -> Mapping[str, Any]:
         """Name and settings in plain values, for the record."""

@@ -9,23 +9,24 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Concatenate
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from analogrig.errors import LimitError
 from analogrig.judging.advice import misfits
-from analogrig.judging.bursts import BURST, Design, bound_rate
+from analogrig.judging.betting import BettingSequence
+from analogrig.judging.bursts import Design, bound_rate
 from analogrig.judging.exposure import exposure
 from analogrig.judging.response import step_responses
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChangeVerdict, Verdict, judge
 from analogrig.reporting.summary import bound_text, response_text
 from analogrig.run import Run
 from analogrig.scenario import Statement
-from analogrig.testing.statement import Arguments, Finding, register, statement_of
+from analogrig.testing.statement import Arguments, Finding, check_limits, check_share, register, statement_of
 from analogrig.wording import number_of
 
 
@@ -36,16 +37,14 @@ def _statement(
 
     @functools.wraps(judge)
     def judge_and_note(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
-        for limit in (*args, *kwargs.values()):
-            if isinstance(limit, float) and not math.isfinite(limit):
-                raise ValueError(f"{judge.__name__}: a limit must be a finite number, not {limit}")
+        call = check_limits(judge, played, *args, **kwargs)
         if played.verdict.valid:
-            finding = judge(played, *args, **kwargs)
+            finding = judge(*call.args, **call.kwargs)
             if not finding:
                 finding = dataclasses.replace(finding, why="; ".join([finding.why, *misfits(played.verdict)]))
         else:
             finding = Finding(holds=False, why=f"{played.verdict.outcome.upper()}: {played.verdict.reasons[0]}")
-        statement = statement_of(judge_and_note, played, *args, **kwargs)
+        statement = statement_of(judge_and_note, *call.args, **call.kwargs)
         finding = dataclasses.replace(finding, statement=statement, run=played.run)
         played.note(finding)
         return finding
@@ -59,7 +58,8 @@ class Played:
     """One play of a scenario, its verdict, and statements about it, each of which returns a Finding.
 
     No statement holds for a play that is INCONCLUSIVE or UNJUDGED. ``hil_play`` fails the test instead of returning
-    such a play, unless called with ``allow_inconclusive=True``. ValueError: a limit of a statement is not finite.
+    such a play, unless called with ``allow_inconclusive=True``. LimitError: a limit of a statement is
+    no number, not finite or negative.
     """
 
     run: Run
@@ -109,8 +109,10 @@ class Played:
 
     @_statement
     def stays_quiet(self) -> Finding:
-        """Finding: no alarm except one for each change."""
+        """Finding: no alarm except one for each change, and none while the trigger was not armed."""
         alarms, doubtful = self.verdict.false_alarms, self.verdict.doubtful_alarms
+        if unarmed := self.verdict.unarmed_alarms:
+            return Finding(holds=False, why=f"{number_of(len(unarmed), 'alarm')} while unarmed, first at {unarmed[0]}")
         if doubtful and not alarms:
             return Finding(holds=False, why=f"INCONCLUSIVE: the alarm at {doubtful[0]} is false, or not: {_UNKNOWN}")
         where = ", ".join(map(str, alarms[:5])) + (", ..." if len(alarms) > 5 else "")
@@ -177,14 +179,17 @@ class Played:
         :param time_tolerance: so many samples earlier or later it may have been so.
         """
         theta = self.run.theta.astype(np.float64)
-        wanted = np.asarray(reference, dtype=np.float64)
+        wanted, allowed = _numbers(reference, "reference"), _numbers(tolerance, "tolerance")
         if wanted.shape != theta.shape:
-            raise ValueError(f"reference has the shape {wanted.shape}, theta {theta.shape}")
-        if np.isnan(tolerance).any():
-            raise ValueError("tolerance must be a number, not nan")
-        allowed = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), theta.shape)
+            raise LimitError(f"follows: reference has the shape {wanted.shape}, theta {theta.shape}")
+        if not (allowed >= 0.0).all():
+            raise LimitError("follows: tolerance: must be 0 or more everywhere, and not nan")
+        try:
+            allowed = np.broadcast_to(allowed, theta.shape)
+        except ValueError:
+            raise LimitError(f"follows: tolerance has the shape {allowed.shape}, theta {theta.shape}") from None
         inside = np.zeros(theta.shape, dtype=bool)
-        for shift in range(-time_tolerance, time_tolerance + 1):
+        for shift in range(-min(time_tolerance, len(theta)), min(time_tolerance, len(theta)) + 1):
             at = np.clip(np.arange(len(theta)) + shift, 0, len(theta) - 1)
             inside |= (np.abs(theta - wanted[at]) <= allowed[at]) | np.isnan(wanted[at])
         outside = np.argwhere(~inside)
@@ -193,6 +198,17 @@ class Played:
         sample, element = (int(i) for i in outside[0])
         why = f"theta[{element}] leaves the tube at sample {sample}: {theta[sample, element]:g}"
         return Finding(holds=False, why=f"{why}, not {wanted[sample, element]:g} +- {allowed[sample, element]:g}")
+
+
+def _numbers(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """:raises LimitError: ``values`` are no array of numbers."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind in "iuf":
+            return array.astype(np.float64)
+    except ValueError:  # rows of different lengths
+        pass
+    raise LimitError(f"follows: {name}: must be an array of numbers, not {str(values)[:40]!r}")
 
 
 _UNKNOWN = "it depends on when the change came, which is not known better"
@@ -224,17 +240,24 @@ def _failure_at_instant(tweak: ChangeVerdict, within: float | None) -> str:
 
 
 def rate_below(
-    rate: float, played: Iterable[Played], *, confidence: float, burst: float = BURST, or_misfit: bool = False
+    rate: float, played: Iterable[Played], *, confidence: float, burst: float | None = None, or_misfit: bool = False
 ) -> Finding:
     """Finding: with ``confidence`` (0 to 1) the false-alarm rate is below ``rate`` alarms per sample.
 
-    The number of plays must be fixed beforehand. The finding does not hold if one of them is not valid. A play counts
-    once, with the samples in which its trigger was armed (``analogrig.judging.exposure``).
+    The finding does not hold if one of the plays is not valid. A play counts once, with the samples in which its
+    trigger was armed (``analogrig.judging.exposure``). By default the bound holds whatever the dependence within a play
+    (``analogrig.judging.betting``), and plays may be added until it holds.
 
-    :param burst: mean number of alarms of a burst that the bound covers; 1: alarms are taken as independent.
+    :param burst: assume bursts of so many alarms on average, 1: independent alarms. This takes fewer samples. The
+        number of plays must then be fixed beforehand.
     :param or_misfit: leave out the plays in which the device reports a misfit; the finding names the causes.
-    :raises ValueError: ``rate``, ``confidence`` or ``burst`` is out of range.
+    :raises LimitError: ``rate``, ``confidence`` or ``burst`` is out of range.
     """
+    check_limits(rate_below, rate, played, confidence=confidence, burst=burst, or_misfit=or_misfit)
+    check_share(rate, "rate_below: rate")
+    check_share(confidence, "rate_below: confidence")
+    if burst is not None and burst < 1.0:
+        raise LimitError(f"rate_below: burst: must be 1 or more, not {burst:g}")
     plays = list({_samples_of(each.run): each for each in played}.values())
     explained = [each for each in plays if or_misfit and each.verdict.fit]
     finding = _rate_below(rate, [each for each in plays if each not in explained], confidence, burst)
@@ -257,27 +280,44 @@ def _with_misfits(finding: Finding, explained: Sequence[Played], plays_n: int) -
     return dataclasses.replace(finding, why=f"{finding.why}; {why}")
 
 
-def _rate_below(rate: float, plays: Sequence[Played], confidence: float, burst: float) -> Finding:
+def _rate_below(rate: float, plays: Sequence[Played], confidence: float, burst: float | None) -> Finding:
     invalid = [each.verdict.reasons[0] for each in plays if not each.verdict.valid]
     if invalid:
         of = number_of(len(plays), "play")
         return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {of}, such as: {invalid[0]}")
     alarms = [len(each.verdict.false_alarms) for each in plays]
-    armed = [exposure(each.run).armed for each in plays]
+    shown = [exposure(each.run) for each in plays]
+    armed = [each.armed for each in shown]
+    if unarmed := next((each.contradiction for each in shown if each.contradiction), ""):
+        return Finding(holds=False, why=unarmed)
     if not any(armed):
-        why = exposure(plays[0].run).lack_of_evidence if plays else "there is none"
+        why = shown[0].lack_of_evidence if plays else "there is none"
         return Finding(holds=False, why=f"no alarm could be raised in any of {number_of(len(plays), 'play')}: {why}")
-    bounds = bound_rate(alarms, armed, confidence, burst)
     why = f"{number_of(sum(alarms), 'false alarm')} in {number_of(sum(armed), 'sample')}"
-    why += (
-        f": the rate is below {bounds.high:.3g} per sample with {100.0 * confidence:g}% confidence, for {bounds.basis}"
-    )
+    if burst is None:
+        bets = _bets(plays, alarms, armed, confidence)
+        high, basis, needed = bets.bounds[1], bets.basis, bets.needed(rate)
+        how = bets.broken or f"takes {needed:.0f} plays like these"
+        cure = ", or the hold-off of the device in its data sheet, or an assumption, such as burst=5"
+    else:
+        bounds = bound_rate(alarms, armed, confidence, burst)
+        high, basis, cure = bounds.high, bounds.basis, ""
+        how = f"takes {number_of(Design(rate, confidence, sum(alarms), bounds.burst).trials, 'sample')}"
+    why += f": the rate is below {high:.3g} per sample with {100.0 * confidence:g}% confidence, for {basis}"
     if sum(alarms) > rate * sum(armed):
         why += f"; {rate:g} was asked, which is less than observed"
-    elif bounds.high > rate:
-        needed = Design(rate, confidence, sum(alarms), bounds.burst).trials
-        why += f"; to show {rate:g} with so many alarms takes {number_of(needed, 'sample')}"
-    return Finding(bounds.high <= rate, why)
+    elif high > rate:
+        why += f"; to show {rate:g} with so many alarms {how}{cure}"
+    return Finding(high <= rate, why)
+
+
+def _bets(plays: Sequence[Played], alarms: Sequence[int], armed: Sequence[int], confidence: float) -> BettingSequence:
+    runs = [each.run for each in plays]
+    most = max(sum(run.datasheet.most_alarms(end - start) for start, end in run.records) for run in runs)
+    bets = BettingSequence(confidence, most, max(run.samples for run in runs))
+    for events, exposure_n in zip(alarms, armed, strict=True):
+        bets.add(events, exposure_n)
+    return bets
 
 
 def _samples_of(run: Run) -> tuple[str, bytes]:
@@ -286,7 +326,7 @@ def _samples_of(run: Run) -> tuple[str, bytes]:
 
 
 def _of_all(
-    plays: Sequence[Played], rate: float, confidence: float, burst: float, *, or_misfit: bool
+    plays: Sequence[Played], rate: float, confidence: float, burst: float | None, *, or_misfit: bool
 ) -> Statement | None:
     """Statement about all plays; None if a scenario and its first seed do not describe them all."""
     conditions = [each.run.conditions for each in plays]
@@ -295,5 +335,6 @@ def _of_all(
         each.seed != first.seed + number or each.scenario != first.scenario for number, each in enumerate(conditions)
     ):
         return None
-    arguments = {"rate": rate, "confidence": confidence, "plays": len(plays), "burst": burst}
+    arguments = {"rate": rate, "confidence": confidence, "plays": len(plays)}
+    arguments |= {} if burst is None else {"burst": burst}
     return Statement("rate_of_plays_below", arguments | ({"or_misfit": True} if or_misfit else {}))

@@ -14,9 +14,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol
 
+import numpy as np
+
 from analogrig import config
-from analogrig.errors import ConfigurationError
-from analogrig.scenario import Scenario, Statement
+from analogrig.errors import ConfigurationError, LimitError
+from analogrig.scenario import MAX_TRIES, Scenario, Statement
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
@@ -109,6 +111,43 @@ def _is_plain(hint: Any) -> bool:
     return all(each in (bool, int, float, str, type(None)) for each in typing.get_args(hint) or (hint,))
 
 
+@functools.cache
+def _plain_hints(judge: Callable[..., Any]) -> dict[str, Any]:
+    """Types of the parameters that take plain values, by name."""
+    hints = typing.get_type_hints(judge)
+    return {name: hints[name] for name in inspect.signature(judge).parameters if _is_plain(hints.get(name))}
+
+
+def check_limits(judge: Callable[..., Any], *arguments: Any, **limits: Any) -> inspect.BoundArguments:
+    """Arguments of a call of ``judge`` with its limits as their types; no number may be negative.
+
+    :raises LimitError: a limit is of another type, out of range or not finite.
+    """
+    bound = inspect.signature(judge).bind(*arguments, **limits)
+    bound.apply_defaults()
+    for name, hint in _plain_hints(judge).items():
+        value = bound.arguments[name]
+        if value is not None or type(None) not in typing.get_args(hint):
+            bound.arguments[name] = _as_limit(hint, value, f"{judge.__name__}: {name}")
+    return bound
+
+
+def _as_limit(hint: Any, value: Any, where: str) -> Any:
+    try:
+        limit = config.convert(hint, value.item() if isinstance(value, np.generic) else value, where)
+    except ConfigurationError as error:
+        raise LimitError(str(error)) from None
+    if isinstance(limit, int | float) and limit < 0:
+        raise LimitError(f"{where}: must be 0 or more, not {limit:g}")
+    return limit
+
+
+def check_share(limit: float, where: str) -> None:
+    """:raises LimitError: ``limit`` is not between 0 and 1."""
+    if not 0.0 < limit < 1.0:
+        raise LimitError(f"{where}: must be between 0 and 1, both excluded, not {limit:g}")
+
+
 def statement_of(judge: Callable[..., Finding], *arguments: Any, **limits: Any) -> Statement | None:
     """Statement that a call of ``judge`` judges; None if no file can hold its limits."""
     known = KNOWN.get(judge.__name__)
@@ -129,11 +168,12 @@ def experiment(
     def judge_and_note(
         play: Play, scenario: Scenario, seed: int, /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Finding:
+        call = check_limits(judge, play, scenario, seed, *args, **kwargs)
         try:
-            finding = judge(play, scenario, seed, *args, **kwargs)
+            finding = judge(*call.args, **call.kwargs)
         except Inconclusive as outcome:
             finding = outcome.finding
-        statement = statement_of(judge_and_note, play, scenario, seed, *args, **kwargs)
+        statement = statement_of(judge_and_note, *call.args, **call.kwargs)
         finding = dataclasses.replace(finding, statement=statement)
         play.note(finding, seed)
         return finding
@@ -153,7 +193,10 @@ def with_some_seed(
     :param play: the fixture ``hil_play``.
     :param scenario: a shipped name, a .toml file or a Scenario.
     :param judge: the statement, such as ``Played.stays_quiet``.
+    :raises LimitError: ``tries`` is out of range.
     """
+    if not 1 <= _as_limit(int, tries, "with_some_seed: tries") <= MAX_TRIES:
+        raise LimitError(f"with_some_seed: tries: must be 1 to {MAX_TRIES}, not {tries}")
     failed: list[Finding] = []
     for number in range(tries):
         played = play(scenario, seed + number, allow_inconclusive=True)

@@ -22,7 +22,7 @@ from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
 from analogrig.scenario import DEFAULT_PROGRAM, Expectations, PotChange, Scenario
-from analogrig.testing import profiles
+from analogrig.testing.plugin.settings import EXAMPLES, current_profile
 from analogrig_emulator import Excitation, ProgramParameter
 
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}
@@ -47,7 +47,7 @@ QUIET_N = 1300
 MOST_DISPLACEMENT_V = 8.0
 """Largest displacement that a scenario may reach."""
 
-for _name, _examples in profiles.EXAMPLES.items():
+for _name, _examples in EXAMPLES.items():
     settings.register_profile(
         f"analogrig-{_name}",
         max_examples=_examples,
@@ -66,7 +66,7 @@ def profile(name: str = "") -> settings:
     :param name: one of these profiles; empty: that of --hil-profile, in a session without the plugin that of the
         environment variable ANALOGRIG_HIL_PROFILE, else ``ci``.
     """
-    return settings.get_profile(f"analogrig-{name or profiles.current()}")
+    return settings.get_profile(f"analogrig-{name or current_profile()}")
 
 
 def _usually(usual: Any, others: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
@@ -90,8 +90,9 @@ def suspensions() -> st.SearchStrategy[Plant]:
     return st.builds(_suspension, mass, stiffness, _usually(None, _number(*DAMPING_RATIO, 2)))
 
 
-def plants(program: Program) -> st.SearchStrategy[Plant]:
+def plants(program: Program | str) -> st.SearchStrategy[Plant]:
     """Plants of a program with each parameter anywhere in its range; the usual ones are the program's own values."""
+    program = Program.of(program, "program")
     drawn = {
         name: _usually(row.value, st.floats(row.low, row.high).map(_round).filter(_within(row)))
         for name, row in _ranged(program).items()
@@ -312,7 +313,7 @@ def scenarios(
     longest_ramp_n: int = 0,
     free: bool = False,
     expect: Expectations | None = None,
-    program: Program | None = None,
+    program: Program | str | None = None,
 ) -> Scenario:
     """Scenarios: a plant, an excitation, and changes with time to learn in between.
 

@@ -95,15 +95,15 @@ class Answered:
 
     @property
     def alarms(self) -> tuple[RaisedAlarm, ...]:
-        return tuple(itertools.chain.from_iterable(part.alarms for part in self.parts))
+        return tuple(RaisedAlarm(*each) for part in self.parts for each in part.alarms.tolist())
 
     @property
     def diagnoses(self) -> tuple[ReportedDiagnosis, ...]:
-        return tuple(itertools.chain.from_iterable(part.diagnoses for part in self.parts))
+        return tuple(ReportedDiagnosis(*each) for part in self.parts for each in part.diagnoses.tolist())
 
     @property
     def misfits(self) -> tuple[ReportedMisfit, ...]:
-        return tuple(itertools.chain.from_iterable(part.misfits for part in self.parts))
+        return tuple(ReportedMisfit(*each) for part in self.parts for each in part.misfits.tolist())
 
     @property
     def alarm_indices(self) -> list[int]:

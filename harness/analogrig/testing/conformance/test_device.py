@@ -16,8 +16,7 @@ import pytest
 from analogrig.answers import Samples
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import Datasheet
-from analogrig.devices.description import Capability, DeviceDescription
-from analogrig.devices.device import Device
+from analogrig.devices.device import Capability, Device, DeviceDescription
 from analogrig.devices.registry import recorded, trusted
 from analogrig.errors import AnalogrigError, ConfigurationError, DeviceRefused, TimeLimitReached
 from analogrig.run import LOST, UNARMED
@@ -150,7 +149,7 @@ def check_order(answered: Answered) -> None:
     first = 0
     for part in answered.parts:
         for found in (part.alarms, part.diagnoses, part.misfits):
-            indices = [each.index for each in found]
+            indices = found.index.tolist()
             assert indices == sorted(indices), f"{indices} are out of order"
             assert all(first <= each < first + len(part) for each in indices), (
                 f"{indices} are not within the samples {first} to {first + len(part) - 1} answered with them"

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from analogrig.rigs import CAPABILITIES
-from analogrig.testing import profiles
 from analogrig.testing.plugin import devices, junit, player, scenarios, settings
 from analogrig.testing.plugin.settings import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
 
@@ -51,7 +50,7 @@ def pytest_configure(config: pytest.Config) -> None:
     junit.begin(config)
     profile: Callable[[], str] = functools.partial(_collection_profile, config)
     config.stash[_PROFILE] = profile
-    profiles.begin_session(profile)
+    settings.begin_profile(profile)
     config.stash[devices.DEVICES] = devices.Devices()
     devices.assign_owner(config)
     scenarios.add_folder(config)
@@ -61,7 +60,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
     if (open_devices := config.stash.get(devices.DEVICES, None)) is not None:
         open_devices.close()
     if (profile := config.stash.get(_PROFILE, None)) is not None:
-        profiles.end_session(profile)
+        settings.end_profile(profile)
 
 
 def _collection_profile(config: pytest.Config) -> str:
@@ -169,8 +168,8 @@ def hil_play(request: pytest.FixtureRequest, hil_bench: Bench) -> Play:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
-    with player.keep_examples(item):
-        yield
+    with player.limits_in_one_line(item), player.keep_examples(item):
+        return (yield)
 
 
 @pytest.hookimpl(wrapper=True)

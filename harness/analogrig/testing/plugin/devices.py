@@ -38,8 +38,7 @@ class Devices:
 
         :raises AnalogrigError: it cannot be reached, or a file names it and it is not trusted.
         """
-        from analogrig.devices.opening import open_dut
-        from analogrig.devices.registry import describe, trusted
+        from analogrig.devices.registry import describe, open_dut, trusted
         from analogrig.errors import AnalogrigError
 
         only_one = trusted(name, trust).only_one

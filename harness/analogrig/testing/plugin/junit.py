@@ -54,6 +54,9 @@ def play_properties(played: Played) -> Iterator[tuple[str, Any]]:
     yield "latency_n", " ".join(map(latency_property, verdict.tweaks))
     yield "bound_n", " ".join(str(tweak.bound_n) for tweak in verdict.tweaks)
     yield "false_alarms", len(verdict.false_alarms)
+    yield "unarmed_alarms", len(verdict.unarmed_alarms)
+    yield "armed_n", verdict.armed_n
+    yield "after_warm_up_n", verdict.after_warm_up_n
     yield "channel_faults", ", ".join(f"{fault.name} at {fault.sample}" for fault in verdict.channel_faults)
     yield "overruns", conditions.counters.get("receive_overruns", 0)
     if conditions.identity is not None:

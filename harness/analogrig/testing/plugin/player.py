@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import re
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,22 @@ def in_one_line(by: str = "") -> Iterator[None]:
     except (AnalogrigError, EmulatorError) as error:
         failure = f"{by}: {error}" if by and isinstance(error, ConfigurationError) else str(error)
         raise pytest.fail.Exception(failure, pytrace=False) from None
+
+
+@contextlib.contextmanager
+def limits_in_one_line(item: pytest.Item) -> Iterator[None]:
+    """Report a wrong limit of a statement without a traceback, with the line of the test."""
+    try:
+        yield
+    except Exception as error:
+        from analogrig.errors import LimitError
+
+        if not isinstance(error, LimitError):
+            raise
+        lines = [line for frame, line in traceback.walk_tb(error.__traceback__)
+                 if frame.f_code.co_filename == str(item.path)]  # fmt: skip
+        place = f"{item.path.name}:{lines[-1]}: " if lines else ""
+        raise pytest.fail.Exception(f"{place}{error}", pytrace=False) from None
 
 
 @dataclass
@@ -205,13 +222,13 @@ def write_counterexample(item: pytest.Item) -> str:
     """Write the counterexample of a failed test. Return the full finding, the place of the files and the command to
     repeat it.
 
-    The text is empty if nothing was played. A scenario of --hil-scenario-dir is not written again: it would become one
-    more test.
+    If nothing was played, as in a conversation without samples, the text is the finding alone. A scenario of
+    --hil-scenario-dir is not written again: it would become one more test.
     """
     record, folder = record_of(item), _folder(item)
     counterexample = record.example or record.counterexample(item)
     if counterexample is None:
-        return ""
+        return f"found: {record.found[0].why}" if record.found and not record.found[0] else ""
     from analogrig.testing.counterexample import SCENARIO_FILE
 
     lines = [f"found: {counterexample.why}"] if counterexample.why else []

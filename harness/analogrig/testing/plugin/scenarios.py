@@ -128,8 +128,8 @@ class ScenarioItem(pytest.Item):
 
     def _judge(self) -> Finding:
         import analogrig.testing.played
+        import analogrig.testing.properties.claimed
         import analogrig.testing.properties.conversed
-        import analogrig.testing.properties.described
         import analogrig.testing.properties.experiments  # noqa: F401 - each registers what a file can state
         from analogrig.bench import Bench
         from analogrig.rigs.description import open_rig

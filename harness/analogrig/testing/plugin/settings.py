@@ -18,12 +18,16 @@ from typing import TYPE_CHECKING, Literal
 
 import pytest
 
-from analogrig.testing import profiles
-
 if TYPE_CHECKING:
     from analogrig.trust import Trust
 
 ALLOW = "--hil-allow"
+
+EXAMPLES = {"ci": 15, "nightly": 300, "soak": 5000}
+"""Examples per property, by profile."""
+
+DEFAULT_PROFILE = "ci"
+PROFILE_VARIABLE = "ANALOGRIG_HIL_PROFILE"
 
 Source = Literal["parameter", "command line", "environment", "ini file", "default"]
 
@@ -113,7 +117,7 @@ def _new_folder_complaint(value: str) -> str:
 
 
 def _profile_complaint(value: str) -> str:
-    return "" if value in profiles.EXAMPLES else f"must be one of {', '.join(profiles.EXAMPLES)}, not {value!r}"
+    return "" if value in EXAMPLES else f"must be one of {', '.join(EXAMPLES)}, not {value!r}"
 
 
 def _seconds(value: str) -> float | None:
@@ -142,9 +146,9 @@ RUNS_DIR = Option(
 )
 HIL_PROFILE = Option(
     "hil_profile",
-    profiles.VARIABLE,
-    profiles.DEFAULT,
-    f"number of examples per property: {', '.join(f'{name} ({n})' for name, n in profiles.EXAMPLES.items())}",
+    PROFILE_VARIABLE,
+    DEFAULT_PROFILE,
+    f"number of examples per property: {', '.join(f'{name} ({n})' for name, n in EXAMPLES.items())}",
     _profile_complaint,
 )
 TIME_LIMIT = Option(
@@ -231,3 +235,26 @@ def _lines_of(file: str) -> list[str]:
         return Path(file).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
         return []
+
+
+_sessions: list[Callable[[], str]] = []
+"""Sources of the profile, one per running pytest session: a session may run another one in its process. hypothesis
+fixes the settings of a test where the test is defined, before any fixture exists."""
+
+
+def begin_profile(profile: Callable[[], str]) -> None:
+    """Make ``profile()`` the source of the profile until ``end_profile(profile)``."""
+    _sessions.append(profile)
+
+
+def end_profile(profile: Callable[[], str]) -> None:
+    """Undo ``begin_profile``; no effect if the session never began."""
+    if profile in _sessions:
+        _sessions.remove(profile)
+
+
+def current_profile() -> str:
+    """Name of the profile in force: that of the pytest session, else of the environment, else the default."""
+    if _sessions:
+        return _sessions[-1]()
+    return os.environ.get(PROFILE_VARIABLE) or DEFAULT_PROFILE

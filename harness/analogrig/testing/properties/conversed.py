@@ -1,4 +1,4 @@
-"""Experiment that compares a device's answers with those that the catalogue and the reference demand."""
+"""Experiment that compares a device's answers to messages with those of the bundled library."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any, Self
 
+import can
 import pytest
 
 from analogrig.catalogue import (
+    SEQS,
     Configure,
     Configured,
     Element,
@@ -23,24 +26,31 @@ from analogrig.catalogue import (
     Result,
     SampleBlock,
 )
-from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator
+from analogrig.devices.catalogue_device import CatalogueDescription, has_our_estimator
+from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, LinkTimeout
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.can_link import CanLink
 from analogrig.links.link import FramedLink, Link
-from analogrig.links.python_can import can
 from analogrig.scenario import Scenario
-from analogrig.testing.properties.described import described_estimator
+from analogrig.testing.properties.claimed import needs_claim
 from analogrig.testing.properties.experiments import device_with_faults
-from analogrig.testing.reference.device import ReferenceDevice
-from analogrig.testing.reference.scripts import SCRIPTS, Foreign, Garbage, Numbered, Script, is_for
-from analogrig.testing.reference.settings import ORDERS, ReferenceSettings
+from analogrig.testing.properties.scripts import (
+    ORDERS,
+    SCRIPTS,
+    DeviceBuild,
+    Foreign,
+    Garbage,
+    Numbered,
+    Script,
+    is_for,
+)
 from analogrig.testing.statement import Finding, Play, experiment
 
 RELATIVE, ROUNDING, THETA_ROUNDING = 1e-2, 0.1, 2e-3
-"""Largest deviation of a value of an answer: relative to it, of innovation [codes] and statistic, of theta. The cases
-of ``described`` compare values more closely."""
+"""Largest deviation of a value of an answer: relative to it, of innovation [codes] and statistic, of theta. A device
+may round otherwise; ``computes_what_it_describes`` compares values to the bit."""
 
 AT_ONCE = 64
 """Messages that are sent together."""
@@ -53,7 +63,7 @@ PORTS = ("", "can", "can fd")
 
 @experiment
 def converses_as_catalogued(play: Play, scenario: Scenario, seed: int, script: str, port: str) -> Finding:
-    """Finding: the device answers a script of ``analogrig.testing.reference.scripts`` as the catalogue demands.
+    """Finding: the device answers a script of ``analogrig.testing.properties.scripts`` as the bundled library does.
 
     :param port: one of ``PORTS``.
     """
@@ -69,7 +79,7 @@ def converses_as_catalogued(play: Play, scenario: Scenario, seed: int, script: s
 
 
 def _on_port(play: Play, port: str) -> CatalogueDescription:
-    described_estimator(play)
+    needs_claim(play)
     description = dataclasses.replace(device_with_faults(play), wire_faults="")
     if not port:
         return description
@@ -82,39 +92,63 @@ def _on_port(play: Play, port: str) -> CatalogueDescription:
 
 
 def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[str]:
-    """Differences from the expected answers; the first ends the conversation."""
-    with contextlib.closing(description.open_link()) as link:
-        most = _largest_orders(_Talk(link, description.timeout_s))
-    with contextlib.closing(description.open_link()) as link:
-        talk = _Talk(link, description.timeout_s)
-        hello, firmware = talk.greet()
-        device = ReferenceDevice(hello, firmware, ReferenceSettings(most), on_can=isinstance(link, CanLink))
+    """Differences from the answers of the bundled library; the first ends the conversation."""
+    with Talk.with_device(description) as device:
+        bundled = InprocDevice(name="bundled", **device.line)
+        with Talk.with_device(bundled) as library:
+            builds = [DeviceBuild(largest_orders(each)) for each in (device, library)]
+    both = DeviceBuild({key: min(build.most[key] for build in builds) for key in ORDERS})
+    with Talk.with_device(description) as device, Talk.with_device(bundled) as library:
+        (hello, firmware), (_, other) = device.greet(), library.greet()
         if hello.theta_max < EstimatorConfig().parameters or not firmware.input_blocks:
             yield f"{hello} and {firmware} state no room for the default configuration"
         if "in-process" in description.capabilities and firmware.firmware_id != FirmwareId.LIBRARY:
             yield f"expected firmware {FirmwareId.LIBRARY:d} of a device in this process, as given, received {firmware}"
-        for batch in _batches(SCRIPTS[script](talk.numbers, ReferenceSettings(most)), in_blocks=talk.carries_blocks):
+        for batch in batches(SCRIPTS[script](library.numbers, both), in_blocks=device.carries_blocks):
             if not isinstance(batch, list):
-                talk.disturb(batch)
-                _count(device, batch)
+                device.disturb(batch)
+                library.disturb(batch)
                 continue
-            expected = [answer for each in batch for answer in device.enter(each)]
-            talk.send(batch)
-            for due in expected:
-                found = talk.receive()
-                if found is None or not _agrees(found, due):
+            shared = [each for each in batch if not isinstance(each, Configure) or _have_in_common(builds, each)]
+            device.send(shared)
+            library.send(shared)
+            while (answer := library.receive(timeout_s=0.0)) is not None:
+                due = answer._replace(seq=(answer.seq + firmware.seq - other.seq) % SEQS)
+                if isinstance(due, Hello | Firmware):  # what identifies a device is its own
+                    due = (hello if isinstance(due, Hello) else firmware)._replace(seq=due.seq, answers=due.answers)
+                found = device.receive()
+                if found is None or not agrees(found, due):
                     yield f"expected {due}, received {found}"
                     return
-        if (more := talk.receive(timeout_s=0.0)) is not None:
+        if (more := device.receive(timeout_s=0.0)) is not None:
             yield f"expected nothing, received {more}"
 
 
-class _Talk:
+def _have_in_common(builds: Sequence[DeviceBuild], setting: Configure) -> bool:
+    """True unless the largest orders of the builds decide whether they accept a setting."""
+    limits = [build.range_of(setting.key) for build in builds]
+    return len({each is not None and each[0] <= setting.value <= each[1] for each in limits}) == 1
+
+
+class Talk:
     """Dialogue with a device, of messages with consecutive numbers and of bytes that are none."""
 
     def __init__(self, link: Link, timeout_s: float) -> None:
         self._link, self._timeout_s = link, timeout_s
         self.numbers = Numbered(0)
+
+    @classmethod
+    @contextlib.contextmanager
+    def with_device(cls, description: CatalogueDescription) -> Iterator[Self]:
+        """Dialogue with a device that has just been started."""
+        with contextlib.closing(description.open_link()) as link:
+            yield cls(link, description.timeout_s)
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """Fields of an InprocDevice on a line of the same kind."""
+        is_can = isinstance(self._link, CanLink)
+        return {"link": "can", "fd": self.carries_blocks} if is_can else {}
 
     def greet(self) -> tuple[Hello, Firmware]:
         """:raises LinkTimeout: the device does not answer."""
@@ -144,7 +178,7 @@ class _Talk:
         return self._link.receive(self._timeout_s if timeout_s is None else timeout_s)
 
 
-def _largest_orders(talk: _Talk) -> dict[Key, int]:
+def largest_orders(talk: Talk) -> dict[Key, int]:
     """Largest orders that the build accepts, one key at a time."""
     talk.greet()
     most = {}
@@ -159,7 +193,7 @@ def _largest_orders(talk: _Talk) -> dict[Key, int]:
     return most
 
 
-def _batches(script: Script, *, in_blocks: bool) -> Iterator[list[Message] | Garbage | Foreign]:
+def batches(script: Script, *, in_blocks: bool) -> Iterator[list[Message] | Garbage | Foreign]:
     """Messages that are sent at once, and disturbances. Blocks are left out where the line does not carry them."""
     batch: list[Message] = []
     for each in script:
@@ -179,15 +213,7 @@ def _batches(script: Script, *, in_blocks: bool) -> Iterator[list[Message] | Gar
         yield batch
 
 
-def _count(device: ReferenceDevice, disturbance: Garbage | Foreign) -> None:
-    """Count a disturbance as the device has to."""
-    if isinstance(disturbance, Garbage):
-        device.counters["frames_dropped"] += disturbance.dropped
-    elif disturbance.counter:
-        device.counters[disturbance.counter] += 1
-
-
-def _agrees(found: Message, due: Message) -> bool:
+def agrees(found: Message, due: Message) -> bool:
     """True if all fields are equal, real numbers nearly."""
     is_theta = isinstance(due, Estimate) and due.element != Element.INNOVATION
     within = THETA_ROUNDING if is_theta else ROUNDING

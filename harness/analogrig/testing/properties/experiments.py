@@ -17,16 +17,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
-from analogrig.campaigns.rare import false_alarm_rate
-from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator, has_snapshots
-from analogrig.devices.description import DeviceDescription
-from analogrig.devices.device import Device
+from analogrig.bench import Bench, raise_if_interrupted
+from analogrig.campaigns.together import can_be_direct, direct_bench
+from analogrig.devices.catalogue_device import CatalogueDescription, has_our_estimator
+from analogrig.devices.device import Device, DeviceDescription
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.judging.bursts import BURST, lower_count
-from analogrig.judging.exposure import Exposure, exposure
-from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds, one_sided
+from analogrig.judging.exposure import Exposure, exposure, until_latched
+from analogrig.judging.statistics import Decision, SequentialTest, lower_rate
 from analogrig.judging.verdict import judge, unreported
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
@@ -101,7 +100,7 @@ def rate_of_plays_below(
     rate: float,
     confidence: float,
     plays: int,
-    burst: float = BURST,
+    burst: float | None = None,
     *,
     or_misfit: bool = False,
 ) -> Finding:
@@ -164,27 +163,6 @@ def false_alarms_of_plants_rarer(
     return _witness(play, drawn[most], seed, alarms[most], why)
 
 
-@experiment
-def rare_false_alarms_rarer(
-    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, estimates: int, branches: int
-) -> Finding:
-    """Finding: the lower confidence limit of a false-alarm rate too low to count is at most ``rate``.
-
-    ``analogrig.campaigns.rare`` estimates the rate.
-    """
-    rig, device = _in_this_process(play, "needs the estimator in this process")
-    if not has_snapshots(device):
-        pytest.skip(f"needs a device whose state can be saved, not {device.name}")
-    if device.estimator.trigger != "cusum":
-        pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
-    rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
-    low, high = mean_bounds(rates, confidence)
-    why = f"{np.mean(rates):.2g} false alarms per sample, {one_sided(low, high, confidence)}, allowed {rate:g}"
-    if low <= rate:
-        return Finding(holds=True, why=why)
-    return _witness(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)
-
-
 def _direct_bench(play: Play, otherwise: str) -> Bench:
     return direct_bench(*_in_this_process(play, otherwise), alarms_only=True)
 
@@ -192,7 +170,7 @@ def _direct_bench(play: Play, otherwise: str) -> Bench:
 def _count_alarms(bench: Bench, scenario: Scenario, seed: int) -> tuple[NDArray[np.int64], Exposure]:
     """Samples with an alarm, and the exposure of the play."""
     run = raise_if_interrupted(bench.play(scenario, seed))
-    return run.alarm_index, exposure(run)
+    return until_latched(run).alarm_index, exposure(run)
 
 
 def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
@@ -239,47 +217,28 @@ def changes_are_noticed_soon_and_rightly_named(
     if latency < _latency_over_bound(every) <= doubtful_latency:
         every += _play_all(play, scenario, seed + plays, most_plays - plays)
     _check_valid(*every)
-    for failed in (
-        _check_detection(every),
-        _check_latency(every, latency),
-        _check_diagnoses(every, right, confidence),
-    ):
-        if failed is not None:
-            return failed
-    return Finding(holds=True, why=f"mean latency is {_latency_over_bound(every):.3f} times the mean bound")
+    missed = [finding for played in every if not (finding := played.detects(_EVER))]
+    if missed:
+        why = f"in {len(missed)} of {len(every)} plays changes were missed: {missed[0].why}"
+        return Finding(holds=False, why=why, run=missed[0].run)
+    ratio = _latency_over_bound(every)
+    if ratio > latency:
+        slowest = max(every, key=lambda played: sum(tweak.latency_n or 0 for tweak in played.verdict.tweaks))
+        why = f"mean latency is {ratio:.2f} times the mean bound in {len(every)} plays, allowed {latency:g}"
+        return Finding(holds=False, why=why, run=slowest.run)
+    diagnoses = [tweak.diagnosis for each in every for tweak in each.verdict.tweaks if tweak.diagnosis is not None]
+    wrong_n = sum(not diagnosis.right for diagnosis in diagnoses)
+    if diagnoses and lower_rate(wrong_n, len(diagnoses), confidence) > 1.0 - right:
+        first = _first_wrong_diagnosis(every)
+        why = f"{wrong_n} of {len(diagnoses)} changes were called wrongly, allowed {1.0 - right:.0%}: {first.why}"
+        return Finding(holds=False, why=why, run=first.run)
+    return Finding(holds=True, why=f"mean latency is {ratio:.3f} times the mean bound")
 
 
 def _latency_over_bound(plays: Sequence[Played]) -> float:
     tweaks = [tweak for played in plays for tweak in played.verdict.tweaks if tweak.bound_n is not None]
     bounds_n = sum(tweak.bound_n or 0 for tweak in tweaks)
     return sum(tweak.latency_n or 0 for tweak in tweaks) / bounds_n if bounds_n else math.inf
-
-
-def _check_detection(plays: Sequence[Played]) -> Finding | None:
-    missed = [finding for played in plays if not (finding := played.detects(_EVER))]
-    if not missed:
-        return None
-    why = f"in {len(missed)} of {len(plays)} plays changes were missed: {missed[0].why}"
-    return Finding(holds=False, why=why, run=missed[0].run)
-
-
-def _check_latency(plays: Sequence[Played], latency: float) -> Finding | None:
-    ratio = _latency_over_bound(plays)
-    if ratio <= latency:
-        return None
-    slowest = max(plays, key=lambda played: sum(tweak.latency_n or 0 for tweak in played.verdict.tweaks))
-    why = f"mean latency is {ratio:.2f} times the mean bound in {len(plays)} plays, allowed {latency:g}"
-    return Finding(holds=False, why=why, run=slowest.run)
-
-
-def _check_diagnoses(plays: Sequence[Played], right: float, confidence: float) -> Finding | None:
-    diagnoses = [tweak.diagnosis for each in plays for tweak in each.verdict.tweaks if tweak.diagnosis is not None]
-    wrong_n = sum(not diagnosis.right for diagnosis in diagnoses)
-    if not diagnoses or lower_rate(wrong_n, len(diagnoses), confidence) <= 1.0 - right:
-        return None
-    first = _first_wrong_diagnosis(plays)
-    why = f"{wrong_n} of {len(diagnoses)} changes were called wrongly, allowed {1.0 - right:.0%}: {first.why}"
-    return Finding(holds=False, why=why, run=first.run)
 
 
 def _first_wrong_diagnosis(plays: Sequence[Played]) -> Finding:
@@ -359,8 +318,7 @@ def alarms_keep_hold_off_and_warm_up(
     play: Play, scenario: Scenario, seed: int, hold_off_n: int, warm_up_n: int, at_least: int
 ) -> Finding:
     """Finding: a device set to raise alarms as often as possible keeps the hold-off and the warm-up."""
-    restless = {"trigger": "prediction-error", "ceiling": 0.5, "arl0": None, "isolation": False}
-    _configure(play, hold_off_n=hold_off_n, warm_up_n=warm_up_n, **restless)
+    _configure(play, hold_off_n=hold_off_n, warm_up_n=warm_up_n, **RESTLESS)
     played = _play_valid(play, scenario, seed)
     run, index = played.run, played.run.alarm_index
     if len(index) < at_least:
@@ -371,6 +329,10 @@ def alarms_keep_hold_off_and_warm_up(
         at = index[int(np.argmin(gaps)) + 1]
         wrong.append(f"an alarm at {at}, {gaps.min()} samples after the last, in the hold-off of {hold_off_n}")
     return Finding(not wrong, "; ".join(wrong) or f"{len(index)} alarms, at least {gaps.min()} samples apart", run=run)
+
+
+RESTLESS = {"trigger": "prediction-error", "ceiling": 0.5, "arl0": None, "isolation": False}
+"""Settings of a device that raises alarms as often as it can."""
 
 
 def _configure(play: Play, **settings: Any) -> None:
@@ -426,16 +388,18 @@ def faults_among_the_samples_cost_no_more_than_samples(
     with device.connect() as alone:
         without = _play_valid(play.on(play.bench.rig, alone), scenario, seed).run
         for kind, faults in _cases(kinds, device, without, each):
-            run = _play_with_faults(
-                without, dataclasses.replace(device, wire_faults=faults, most_lost_n=scenario.samples)
-            )
-            if not judge(run).valid or not _took_effect(run):
+            # a real rig would not take the same samples twice
+            again = RecordingRig.of(without, Path("without"))
+            with dataclasses.replace(device, wire_faults=faults, most_lost_n=scenario.samples).connect() as dut:
+                run = Bench(again, dut).play(again.scenario(), without.conditions.seed)
+            is_affected = run.lost.any() or any(run.conditions.counters.get(name, 0) for name in _EFFECTS)
+            if not judge(run).valid or not is_affected:
                 continue
             valid.add(kind)
-            if harm := _harm(
-                run, Bench(_rig_with_gaps(without, run.lost), alone).play(_replay_scenario(without), seed)
-            ):
-                return Finding(holds=False, why=f"with {faults} on the line {harm}", run=run)
+            declared = Bench(rig_with_gaps(without, run.lost), alone).play(again.scenario(), seed)
+            if wrong := difference(run, declared, ~run.lost):
+                why = f"with {faults} on the line {wrong} than with {int(run.lost.sum())} samples declared missing"
+                return Finding(holds=False, why=why, run=run)
     if "repeat" in kinds and _START not in valid:
         return Finding(holds=False, why=f"{_START} is never passed over: no run with one is valid", run=run)
     valid.discard(_START)
@@ -468,25 +432,9 @@ def _cases(kinds: Sequence[str], device: CatalogueDescription, run: Run, each: i
         yield from ((_START, f"repeat@to:{first - 1},seed={seed}") for seed in range(_LATE_STARTS))
 
 
-def _replay_scenario(run: Run) -> Scenario:
-    return RecordingRig.of(run, Path("without")).scenario()
-
-
-def _play_with_faults(without: Run, device: DeviceDescription) -> Run:
-    """Play the same samples, which a real rig would not take twice, over a line with faults."""
-    with device.connect() as dut:
-        return Bench(RecordingRig.of(without, Path("without")), dut).play(
-            _replay_scenario(without), without.conditions.seed
-        )
-
-
-def _rig_with_gaps(run: Run, lost: NDArray[np.bool_]) -> RecordingRig:
+def rig_with_gaps(run: Run, missing: NDArray[np.bool_]) -> RecordingRig:
     """Rig that replays the samples of a run, some of them declared missing."""
-    return RecordingRig.of(dataclasses.replace(run, clipped=run.clipped | lost[:, np.newaxis]), Path("missing"))
-
-
-def _took_effect(run: Run) -> bool:
-    return bool(run.lost.any()) or any(run.conditions.counters.get(name, 0) for name in _EFFECTS)
+    return RecordingRig.of(dataclasses.replace(run, clipped=run.clipped | missing[:, np.newaxis]), Path("missing"))
 
 
 _EFFECTS = (
@@ -500,12 +448,32 @@ _EFFECTS = (
 """Device counters that count the effects of a fault."""
 
 
-def _harm(run: Run, declared: Run) -> str:
-    """Difference between a run and one whose lost samples were declared missing; empty if there is none."""
-    heard = ~run.lost
-    for name in ("theta", "innovation", "statistic"):
-        ours, theirs = (getattr(each, name)[heard].view(np.uint32) for each in (run, declared))
-        if not np.array_equal(ours, theirs):
-            at = int(np.flatnonzero(heard)[np.argmax((ours != theirs).reshape(len(ours), -1).any(axis=1))])
-            return f"{name} at sample {at} is another than with {int(run.lost.sum())} samples declared missing"
-    return "" if np.array_equal(run.alarm_index, declared.alarm_index) else "there are other alarms"
+def difference(run: Run, longer: Run, compared: NDArray[np.bool_] | None = None) -> str:
+    """First difference of a run from one that may be longer; empty if there is none.
+
+    :param compared: samples whose values are compared, all by default. Flags and diagnoses are compared with all only.
+    """
+    n = run.samples
+    at = np.arange(n) if compared is None else np.flatnonzero(compared)
+    for name in ("theta", "innovation", "statistic", *(("flags",) if compared is None else ())):
+        ours, theirs = (np.ascontiguousarray(getattr(each, name)[at]) for each in (run, longer))
+        different = (ours.view(np.uint8) != theirs.view(np.uint8)).reshape(len(at), -1).any(axis=1)
+        if different.any():
+            return f"{name} at sample {at[np.argmax(different)]} is another"
+    for event in _EVENTS if compared is None else _EVENTS[:1]:
+        if _messages(run, event, n) != _messages(longer, event, n):
+            return f"{event[1]} is another"
+    return ""
+
+
+def _messages(run: Run, event: Sequence[str], end: int) -> list[tuple[int, float]]:
+    """Index and value of the messages of a kind about the samples before ``end``."""
+    index, value = (getattr(run, name).tolist() for name in event)
+    return [message for message in zip(index, value, strict=True) if message[0] < end]
+
+
+_EVENTS = (
+    ("alarm_index", "alarm_statistic"),
+    ("diagnosis_index", "diagnosis_change"),
+    ("misfit_index", "misfit_cause"),
+)

@@ -27,8 +27,8 @@ from analogrig.catalogue import (
     SampleFlag,
     pack,
 )
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.links import frame
-from analogrig.testing.reference.settings import ORDERS, WHOLE, ReferenceSettings
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,64 @@ class Foreign:
     """Counter of the device that counts it; empty for none."""
     kind: Mapping[str, bool] = field(default_factory=dict)
     """Flags of python-can."""
+
+
+_LEAST = float(np.finfo(np.float32).tiny)
+_VARIANCE, _CODE, _U16, _U8 = (1e-9, 1e9), (-1e6, 1e6), (0, 65_535), (0, 255)
+_DEFAULT = EstimatorConfig()
+_EDGE = _DEFAULT.edge_codes
+
+RANGES: Mapping[Key, tuple[float, float]] = {
+    Key.OFFSET: (0, 1),
+    Key.NOISE_ESTIMATED: (0, 1),
+    Key.REFRESH_N: _U16,
+    Key.STUCK_N: _U8,
+    Key.IDLE_N: _U16,
+    Key.EDGE_INSTANTS: (0, 2),
+    Key.TRIGGER: (0, 3),
+    Key.RESET: (0, 1),
+    Key.ABSOLUTE: (0, 1),
+    Key.HOLD_OFF_N: _U16,
+    Key.WARM_UP_N: _U16,
+    Key.ISOLATION: (0, 1),
+    Key.MISFIT: (0, 1),
+    Key.FORGETTING: (0.5, 1.0),
+    Key.RANDOM_WALK: (0.0, 1e9),
+    Key.P0: _VARIANCE,
+    Key.P0_OFFSET: _VARIANCE,
+    Key.NOISE_VARIANCE: _VARIANCE,
+    Key.EDGE_CODES: (_LEAST, 2e6),
+    Key.CODE_LOW: (-1e6, 1e6 - _EDGE),
+    Key.CODE_HIGH: (-1e6 + _EDGE, 1e6),
+    Key.CEILING: (1e-45, 1e9),
+    Key.FORCE_ZERO: _CODE,
+}
+"""Accepted values of est.h with the other fields at their defaults. Fields with whole limits have whole values."""
+
+WHOLE = frozenset(key for key, (low, _) in RANGES.items() if isinstance(low, int))
+ORDERS = (Key.NA, Key.NB, Key.NK, Key.NC)
+"""Keys whose largest value is a matter of the build."""
+
+
+DEFAULTS: Mapping[int, float] = {int(key): float(np.float32(value)) for key, value in _DEFAULT.settings()}
+"""Default settings of a device, by key."""
+
+
+@dataclass(frozen=True)
+class DeviceBuild:
+    """Limits of a build of the device."""
+
+    most: Mapping[Key, int]
+    """Largest orders."""
+
+    def range_of(self, key: int) -> tuple[float, float] | None:
+        """Least and largest value of a key; None if the build has none of that number."""
+        if key in ORDERS:
+            return (0 if key in (Key.NK, Key.NC) else 1), self.most[Key(key)]
+        if Key.C1 <= key < Key.C1 + self.most[Key.NA]:
+            largest = float(np.finfo(np.float32).max)
+            return -largest, largest
+        return RANGES.get(Key(key)) if key in set(Key) else None
 
 
 Script = Iterator[Message | Garbage | Foreign]
@@ -93,7 +151,7 @@ def _codes(index: int) -> tuple[int, int]:
     return 700 + 3100 * level + index % 3, round(900.0 + 2500.0 * answer + noise)
 
 
-def settings(numbers: Numbered, build: ReferenceSettings) -> Script:
+def settings(numbers: Numbered, build: DeviceBuild) -> Script:
     """Every key at its limits, beyond them, and between whole values; then configurations that do not go together."""
     for key in range(max(Key) + 3):
         limits = build.range_of(key)
@@ -101,7 +159,6 @@ def settings(numbers: Numbered, build: ReferenceSettings) -> Script:
         for value in (*values, math.nan, math.inf, -math.inf):
             yield numbers.configure(key, value)
     yield numbers.configure(255, 1.0)
-    default = dict(build.defaults().values)
     for unfit in (
         {Key.C1: -2.0, Key.C2: 1.0},
         {Key.C1: 0.0, Key.C2: 1.0},
@@ -116,12 +173,12 @@ def settings(numbers: Numbered, build: ReferenceSettings) -> Script:
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.5},
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.0},
     ):
-        yield from (numbers.configure(key, value) for key, value in default.items())
+        yield from (numbers.configure(key, value) for key, value in DEFAULTS.items())
         yield from (numbers.configure(key, value) for key, value in unfit.items())
         yield numbers.control(Command.START, RUN)
         yield numbers.control(Command.STOP)
     yield numbers.control(Command.RESET)
-    yield from (numbers.configure(key, value) for key, value in default.items())
+    yield from (numbers.configure(key, value) for key, value in DEFAULTS.items())
 
 
 def _near(low: float, high: float, *, is_whole: bool) -> Iterator[float]:
@@ -141,7 +198,7 @@ def _sure(numbers: Numbered) -> Script:
         yield numbers.configure(key, value)
 
 
-def control(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001 - scripts have one form
+def control(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001 - scripts have one form
     """Commands in every state, with arguments at their limits; samples that no run takes."""
     yield from _sure(numbers)
     yield numbers.control(Command.STATUS)
@@ -191,9 +248,12 @@ def control(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG
     yield Identify(numbers.next())
     yield numbers.control(Command.STOP)
     yield numbers.control(Command.STATUS)
+    yield numbers.control(Command.START, 6)  # between two reports of the run before
+    yield numbers.block(0, run=6)
+    yield numbers.control(Command.STOP)
 
 
-def order(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
+def order(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """Repeated, late and skipped messages and samples, and indices that wrap around."""
     yield from _sure(numbers)
     yield numbers.control(Command.START, RUN)
@@ -232,7 +292,7 @@ def order(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG00
     yield numbers.control(Command.STOP)
 
 
-def alarms(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
+def alarms(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """Runs with alarms of each trigger, over single samples and over blocks with missing samples."""
     yield from _sure(numbers)
     for trigger, ceiling in ((3, 2.0), (1, 40.0), (2, 20.0)):
@@ -248,7 +308,7 @@ def alarms(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG0
     yield numbers.control(Command.RESET)
 
 
-def crowd(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
+def crowd(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """More messages at once than their answers fit into the output of a port."""
     yield from _sure(numbers)
     yield numbers.control(Command.START, RUN)
@@ -259,7 +319,7 @@ def crowd(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG00
     yield numbers.control(Command.STOP)
 
 
-def damage(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
+def damage(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """Bytes that are no frame, between frames; every damaged one is counted once, and harms no other."""
     good = frame.encode(pack(Control(0, Command.REPORT_INTERVAL, 0x01000001)))
     full = frame.encode(pack(SampleBlock(0, 14, 1, 1, tuple(range(257, 257 + 2 * BLOCK_SAMPLES)))))
@@ -285,7 +345,7 @@ def damage(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG0
     yield numbers.control(Command.STATUS)
 
 
-def foreign(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
+def foreign(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """Frames of other nodes, of wrong lengths, and reports of errors, between frames of the harness."""
     ours, eight = LAYOUTS["Control"].id, bytes([0, Command.REPORT_INTERVAL, 0, 0, 1, 0, 0, 1])
     for each in (
@@ -309,7 +369,7 @@ def foreign(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG
     yield numbers.control(Command.STATUS)
 
 
-def losses(numbers: Numbered, build: ReferenceSettings) -> Script:  # noqa: ARG001
+def losses(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """So many lost and ignored samples that a counter fills all its bytes."""
     yield numbers.control(Command.REPORT_INTERVAL, 65_535)
     yield numbers.control(Command.START, RUN)
@@ -329,6 +389,6 @@ def is_for(script: str, *, can: bool) -> bool:
     return SCRIPTS[script] not in (_ON_SERIAL if can else _ON_CAN)
 
 
-SCRIPTS: Mapping[str, Callable[[Numbered, ReferenceSettings], Script]] = {
+SCRIPTS: Mapping[str, Callable[[Numbered, DeviceBuild], Script]] = {
     each.__name__: each for each in (settings, control, order, alarms, crowd, losses, damage, foreign)
 }

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import assume, given
 
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.judging.information import detectable
 from analogrig.judging.verdict import DIAGNOSES
 from analogrig.rigs.rig import Rig
@@ -26,7 +27,6 @@ from analogrig.testing.statement import Play, with_some_seed
 from analogrig.testing.strategies import FIRST_CHANGE_N, profile, scenarios, seeds
 from analogrig_emulator import Excitation
 
-ARL0 = 1e5
 MOST_INFORMATION = 6.0
 """A change is found once its information has reached so many times ln ARL0, and MOST_SLACK_N samples more."""
 MOST_SLACK_N = 40
@@ -71,7 +71,8 @@ def test_every_change_that_can_be_seen_is_found_once(
     hil_rig: Rig, hil_play: Play, scenario: Scenario, seed: int
 ) -> None:
     assume(is_playable(hil_rig, scenario))
-    assume(detectable(scenario, ARL0**MOST_INFORMATION))
+    emulated = hil_rig if hil_rig.computes_circuit else "emulator"
+    assume(detectable(scenario, DEFAULT_ARL0**MOST_INFORMATION, rig=emulated))
     assert with_some_seed(hil_play, scenario, seed, Played.passes)
 
 

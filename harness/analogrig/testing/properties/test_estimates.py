@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from analogrig.judging.verdict import ESTIMATES
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
-from analogrig.scenario import Scenario
+from analogrig.scenario import Expectations, Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.properties.experiments import (
     alarms_keep_hold_off_and_warm_up,
@@ -27,9 +27,10 @@ WITHIN = 0.1
 PAUSED = Scenario(
     samples=16_000,
     excitation=Excitation(low_v=0.1, high_v=9.9, frequency_hz=200.0 / 130.0, shape="pulse", duty=0.01),
+    expect=Expectations(least_exposure=0.0),
     name="paused",
 )
-"""An edge, and another 130 samples later, every 13,000: between them nothing is to be learned."""
+"""An edge, and another 130 samples later, every 13,000: between them nothing is to be learned, and no trigger armed."""
 PAUSE_END_N = 13_000
 
 STEADY = Scenario(samples=2000, excitation=Excitation(low_v=0.1, high_v=9.9), name="steady")

@@ -1,1 +1,0 @@
-"""Real rigs: drivers, wiring, pots, self-test, dating of changes, calibration, simulator."""

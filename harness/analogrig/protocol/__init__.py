@@ -1,1 +1,0 @@
-"""Our message catalogue: messages, conversation and exchange of samples."""
