@@ -20,13 +20,14 @@ import cantools
 
 import analogrig
 import analogrig_emulator
-from analogrig import cli, errors
+from analogrig import errors
 from analogrig.campaigns.spec import CampaignSpec
+from analogrig.cli import command_line
 from analogrig.devices.registry import KINDS
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.emulator import EmulatorDescription
 from analogrig.scenario import Scenario
+from analogrig_instruments.wiring import RealDescription
 
 ROOT = Path(__file__).parents[2]
 CATALOGUE = ROOT / "estimator_c" / "catalogue" / "analogrig.dbc"
@@ -80,7 +81,7 @@ def write_reference(folder: Path) -> None:
 
 
 def _commands() -> Iterator[str]:
-    parser = cli._parser()  # noqa: SLF001
+    parser = command_line.make_parser()
     yield "# Commands"
     yield ""
     yield "Generated from the command line's own parser. Every command takes `--help`."
@@ -161,7 +162,7 @@ def _field_texts(described: type) -> dict[str, str]:
     """Return the docstring under each field, those of base classes included."""
     out: dict[str, str] = {}
     for cls in reversed(described.__mro__):
-        if not dataclasses.is_dataclass(cls):
+        if "__dataclass_params__" not in vars(cls):
             continue
         (body,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
         assert isinstance(body, ast.ClassDef)
