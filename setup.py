@@ -15,7 +15,9 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import ClassVar
@@ -34,23 +36,21 @@ HOST = Path("harness/analogrig/bin/analogrig-device")
 WIDE_HOST = Path("harness/analogrig/bin/analogrig-device-wide")
 TETHER = Path("harness/analogrig/bin/analogrig-tether")
 LIBRARY_CHILD = Path("harness/analogrig/bin/analogrig-library")
-EXIT_GUARD = Path("harness/analogrig/_exit_guard.so")
 STAMP = Path("harness/analogrig/_commit.txt")
 UPLOT = {
     Path("harness/analogrig/reporting/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
     Path("harness/analogrig/reporting/uPlot.min.css"): "uplot/static/uPlot.min.css",
 }
 DEVICES = (DEVICE, WIDE_DEVICE, FIXED_DEVICE, HOST, WIDE_HOST)
-PRODUCTS = (CATALOGUE, ENGINE, *DEVICES, TETHER, LIBRARY_CHILD, EXIT_GUARD, *UPLOT)
+PRODUCTS = (CATALOGUE, ENGINE, *DEVICES, TETHER, LIBRARY_CHILD, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
-ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c",)
+ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c", "emulator/analogrig_emulator/engine/fast/*.c")
 DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/fit/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
 TETHER_SOURCES = ("harness/analogrig/devices/tether.c",)
 LIBRARY_CHILD_SOURCES = ("harness/analogrig/devices/library_child.c",)
-EXIT_GUARD_SOURCES = ("harness/analogrig/devices/exit_guard.c",)
 DATA = Path("analogrig")
 """The package of the wheel that receives SHIPPED, at the same paths below it."""
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
@@ -64,7 +64,7 @@ ESTIMATOR = (
 SHIPPED = (*FIXTURES, *ESTIMATOR)
 GENERATED = tuple(f"analogrig_{part}.{suffix}" for part in ("catalogue", "codec") for suffix in "ch")
 """C that comes from the catalogue. The wheel has it in estimator_c/generated, a checkout in build/generated."""
-OTHER_SOURCES = ("emulator/analogrig_emulator/engine/*.h", *SHIPPED)
+OTHER_SOURCES = ("emulator/analogrig_emulator/engine/**/*.h", *SHIPPED)
 
 # Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
 # A computer has room for extended least squares as well.
@@ -119,6 +119,8 @@ class BuildProducts(Command):
     def run(self) -> None:
         """Make every product; each appears whole or not at all."""
         in_tree = self.inplace or self.editable_mode
+        if self.editable_mode and self._is_current():
+            return
 
         def placed(product: Path) -> Path:
             return product if in_tree else Path(self.build_lib) / in_wheel(product)
@@ -130,15 +132,28 @@ class BuildProducts(Command):
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
         folders = (*(f"estimator_c/{part}" for part in ("core", "isolation", "fit", "device", "ports/loop")), generated)
         include = tuple(f"-I{path}" for path in folders)
-        compile_c(placed(ENGINE), sources(ENGINE_SOURCES), SHARED)
-        for library, host, room in ((DEVICE, HOST, ROOM), (WIDE_DEVICE, WIDE_HOST, WIDE_ROOM)):
-            compile_c(placed(library), (*sources(LIBRARY_SOURCES), *device), (*SHARED, *room, *include))
-            compile_c(placed(host), (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *room, *include))
         fixed = (*SHARED, *ROOM, *FIXED_ORDERS, "-DNDEBUG", *FLAT, *include)
-        compile_c(placed(FIXED_DEVICE), (*sources(LIBRARY_SOURCES), *(file for file in device if file != CORE)), fixed)
-        compile_c(placed(TETHER), sources(TETHER_SOURCES), POSIX)
-        compile_c(placed(LIBRARY_CHILD), sources(LIBRARY_CHILD_SOURCES), LIBRARY_CHILD_FLAGS, ("-ldl", "-lm"))
-        compile_c(placed(EXIT_GUARD), sources(EXIT_GUARD_SOURCES), (*SHARED, *POSIX))
+        but_core = (file for file in device if file != CORE)
+        compiled = [
+            partial(compile_c, placed(FIXED_DEVICE), (*sources(LIBRARY_SOURCES), *but_core), fixed),
+            partial(compile_c, placed(ENGINE), sources(ENGINE_SOURCES), SHARED),
+            partial(compile_c, placed(TETHER), sources(TETHER_SOURCES), POSIX),
+            partial(
+                compile_c, placed(LIBRARY_CHILD), sources(LIBRARY_CHILD_SOURCES), LIBRARY_CHILD_FLAGS, ("-ldl", "-lm")
+            ),
+        ]
+        linked: list[partial[None]] = []
+        for library, host, room in ((DEVICE, HOST, ROOM), (WIDE_DEVICE, WIDE_HOST, WIDE_ROOM)):
+            parts = {file: generated.with_name("objects") / library.stem / f"{file.stem}.o" for file in device}
+            for_part = ("-c", "-fPIC", *room, *include)
+            compiled += [partial(compile_c, part, (file,), for_part) for file, part in parts.items()]
+            for_library, for_host = (*SHARED, *room, *include), (*POSIX, *HOST_ROOM, *room, *include)
+            linked += [
+                partial(compile_c, placed(library), (*sources(LIBRARY_SOURCES), *parts.values()), for_library),
+                partial(compile_c, placed(host), (*sources(HOST_SOURCES), *parts.values()), for_host),
+            ]
+        in_parallel(compiled)
+        in_parallel(linked)
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), placed(product))
         if not in_tree:
@@ -146,6 +161,11 @@ class BuildProducts(Command):
                 copied.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, copied)
             (Path(self.build_lib) / in_wheel(STAMP)).write_text(f"{commit()}\n", encoding="ascii")
+
+    def _is_current(self) -> bool:
+        """True if the products in the source tree are newer than all sources: `make` has compiled them just before."""
+        newest = max(Path(file).stat().st_mtime for file in (*self.get_source_files(), "setup.py"))
+        return all(product.is_file() and product.stat().st_mtime > newest for product in PRODUCTS)
 
     def _shipped(self, generated: Path) -> dict[Path, Path]:
         """Files of the wheel that are copies, and their originals."""
@@ -155,7 +175,7 @@ class BuildProducts(Command):
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
-        programs = (*HOST_SOURCES, *LIBRARY_SOURCES, *TETHER_SOURCES, *LIBRARY_CHILD_SOURCES, *EXIT_GUARD_SOURCES)
+        programs = (*HOST_SOURCES, *LIBRARY_SOURCES, *TETHER_SOURCES, *LIBRARY_CHILD_SOURCES)
         return [str(path) for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *programs, *OTHER_SOURCES))]
 
     def get_outputs(self) -> list[str]:
@@ -204,14 +224,23 @@ def generate_codecs(generated: Path, tables: Path) -> None:
     os.utime(tables)  # it may have been left as it was; make must see that it is up to date
 
 
+def in_parallel(work: Iterable[Callable[[], None]]) -> None:
+    """Run as many compilers at a time as there are processors."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for done in [pool.submit(each) for each in work]:
+            done.result()
+
+
 def compile_c(product: Path, files: Iterable[Path], flags: Iterable[str], libraries: Iterable[str] = ()) -> None:
-    """Compile and link in one go.
+    """Compile, and link unless the flags hold -c.
 
     A program that has the old product open keeps it: the new one is a new file, moved into place.
     """
     part = product.with_name(f".{product.name}.{os.getpid()}")
     options = ["-O2", *words("CFLAGS"), *flags, *BIT_EXACT]
-    command = [*compiler(), *options, "-o", str(part), *map(str, files), *libraries, *words("LDFLAGS")]
+    linking = () if "-c" in options else (*libraries, *words("LDFLAGS"))
+    command = [*compiler(), *options, "-o", str(part), *map(str, files), *linking]
+    part.parent.mkdir(parents=True, exist_ok=True)
     logging.getLogger(__name__).info(shlex.join(command))
     try:
         if subprocess.run(command, check=False).returncode != 0:

@@ -1,23 +1,24 @@
-"""`make test-bare`: run `make test` on a PATH that holds python3, a C compiler, make, git and coreutils alone.
+"""`make test-bare`: the first commands of README.md in a clone, on a PATH with python3, gcc, make, git and coreutils.
 
-The tests that need another tool skip. The run must succeed, and its table must name every tool of tests/tools.py: a
-tool that no test waits for does not belong in the list.
+Nothing else of the machine is there, and nothing of the environment around: no variable but PATH, HOME and where the
+packages are. The tests that need another tool skip, and everything else must pass.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from tests import tools
 
-FOLDER = tools.ROOT / "build" / "bare" / "bin"
+FOLDER = tools.ROOT / "build" / "bare"
+
+KEPT = ("HOME", "TMPDIR", "PIP_", "UV_", "SSL_", "REQUESTS_", "http", "HTTP", "no_proxy", "NO_PROXY")
+"""Beginnings of the variables that the clone sees: those that say where packages come from."""
 
 COMPILER = "cc gcc gcov as ld ar nm ranlib strip"
 COREUTILS = """
@@ -42,37 +43,31 @@ def make_path(folder: Path) -> None:
     (folder / "python3").chmod(0o755)
 
 
-def waited_for(output: str) -> set[str]:
-    """Names of the tools in the table at the end of a session."""
-    table = re.search(r"= missing tools =+\n.*\n((?: *\d+  .*\n)*)", output)
-    return set(re.findall(r"^ *\d+  (.*?)  ", table[1], re.MULTILINE)) if table else set()
+def commands() -> list[str]:
+    """The commands of the first shell block of README.md, which a new user pastes."""
+    text = (tools.ROOT / "README.md").read_text(encoding="utf-8")
+    block = text.split("```sh\n", 1)[1].split("```", 1)[0]
+    return [line.partition("#")[0].strip() for line in block.splitlines() if line.strip()]
 
 
-def run(arguments: Sequence[str]) -> tuple[int, str]:
-    """Status and output of `make test`; the output is passed on as it comes."""
-    environment = {**os.environ, "PATH": str(FOLDER), "ANALOGRIG_CI": "bare"}
-    command = [str(FOLDER / "make"), "--no-print-directory", "test", f"PYTHON={FOLDER / 'python3'}", *arguments]
-    output = []
-    with subprocess.Popen(
-        command, cwd=tools.ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        for line in process.stdout or ():
-            sys.stdout.write(line)
-            sys.stdout.flush()
-            output.append(line)
-    return process.returncode, "".join(output)
-
-
-def main(arguments: Sequence[str]) -> int:
-    make_path(FOLDER)
-    status, output = run(arguments)
-    expected = {name for name in tools.PACKAGES if not (FOLDER / name).exists()}
-    found = waited_for(output) - set(tools.BUILT)  # make tools may have built them already
-    if status == 0 and not arguments and found != expected:
-        sys.stderr.write(f"test-bare: the table differs from tests/tools.py in {', '.join(sorted(found ^ expected))}\n")
-        return 1
-    return status
+def main() -> int:
+    """Status of the first command that fails."""
+    make_path(FOLDER / "bin")
+    clone = FOLDER / "clone"
+    shutil.rmtree(clone, ignore_errors=True)
+    subprocess.run(["git", "clone", "--quiet", tools.ROOT, clone], check=True)
+    environment = {key: value for key, value in os.environ.items() if key.startswith(KEPT)}
+    environment["PATH"] = str(FOLDER / "bin")
+    for command in commands():
+        sys.stdout.write(f"{command}\n")
+        sys.stdout.flush()
+        status = subprocess.run(["sh", "-c", command], cwd=clone, env=environment, check=False).returncode
+        if status != 0:
+            sys.stderr.write(f"test-bare: in {clone}, {command} ended with status {status}\n")
+            return status
+    shutil.rmtree(clone)
+    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -1,6 +1,6 @@
 """For all tests: skip those whose tools are missing, name the tools, and end with a table of them.
 
-In CI a skip is a failure: ANALOGRIG_CI=1 allows none, ANALOGRIG_CI=bare only those for a missing tool.
+Any other skip is a failure; ANALOGRIG_CI=1 allows none.
 """
 
 from __future__ import annotations
@@ -18,8 +18,13 @@ from tests.wheels import distributions, environment, users_environment, wheel
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+FOREIGN = ("MAKE", "MFLAGS", "PYTHONPATH", "PYTEST_ADDOPTS", "PYTEST_PLUGINS")
+"""Beginnings of the variables of the make around this session, or of its user's other work: children see none."""
+for name in [name for name in os.environ if name.startswith(FOREIGN)]:
+    del os.environ[name]
+
 collect_ignore = ["user_repository"]  # test_packaging.py runs it where it belongs
-if "ANALOGRIG_CI" in os.environ and not tools.silverbox_file().is_file():
+if not tools.silverbox_file().is_file():
     collect_ignore.append("harness/test_silverbox.py")  # it needs data that is not part of the repository
 if "ANALOGRIG_WHEELS" not in os.environ:
     collect_ignore.append("test_manylinux.py")
@@ -30,8 +35,7 @@ __all__ = ["distributions", "environment", "users_environment", "wheel"]  # the 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 
-ALLOWED_SKIPS = os.environ.get("ANALOGRIG_CI", "")
-"""Empty: any. "bare": those for a missing tool. Anything else: none."""
+NOTHING_MAY_SKIP = os.environ.get("ANALOGRIG_CI") == "1"
 LACKING = pytest.StashKey[tuple[str, ...]]()
 SLOWEST = (
     "test_foreign_repositories",
@@ -54,9 +58,7 @@ SLOWEST = (
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "tools(*names): programs or files of tests/tools.py that the test needs")
-    config.addinivalue_line(
-        "markers", "equipped: needs a tool that a bare machine lacks; added to such tests by itself"
-    )
+    config.addinivalue_line("markers", "heavy: takes more than 5 s of processor time; make test-heavy runs it")
     for number in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_IGN:
             # Under nohup or in the background. Children inherit an ignored signal, but not a handler: with one, a test
@@ -76,8 +78,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             lacking = tools.missing(needed)
         except KeyError as error:
             raise pytest.UsageError(f"{item.nodeid} needs {error}: tests/tools.py has no such tool") from error
-        if set(needed) - tools.BARE:
-            item.add_marker(pytest.mark.equipped)
         if lacking:
             item.stash[LACKING] = lacking
             item.add_marker(pytest.mark.skip(reason=tools.reason(lacking)))
@@ -100,14 +100,14 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
 
 
 def _without_skips(report: Report) -> Report:
-    if report.outcome != "skipped" or hasattr(report, "wasxfail") or not ALLOWED_SKIPS:
+    if report.outcome != "skipped" or hasattr(report, "wasxfail"):
         return report
-    if ALLOWED_SKIPS == "bare" and hasattr(report, "lacking"):
+    if hasattr(report, "lacking") and not NOTHING_MAY_SKIP:
         return report
     text = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
-    allowed = "only a missing tool may skip a test" if ALLOWED_SKIPS == "bare" else "nothing may skip"
+    allowed = "ANALOGRIG_CI=1: nothing may skip" if NOTHING_MAY_SKIP else "only a missing tool may skip a test"
     report.outcome = "failed"
-    report.longrepr = f"{text} (ANALOGRIG_CI is set: {allowed})"
+    report.longrepr = f"{text} ({allowed})"
     return report
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import itertools
+import json
 import re
 import subprocess
 import sys
@@ -24,6 +25,9 @@ PAGE = ROOT / "harness" / "docs" / "evidence" / "house.md"
 
 PARTS = ("harness", "emulator", "estimator_c", "tests")
 PRODUCT = PARTS[:3]
+
+FEW, SMALL = 6, 60
+"""Lines of a function, and of a module, below which a reader may gain if it joins another."""
 
 NOW = "now"
 """Name of the tree of the files as they are."""
@@ -49,6 +53,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "_catalogue",
         "estimator_config",
         "storage",
+        "entry_points",
+        "kinds",
         "program",
         "plant",
         "lazy",
@@ -59,9 +65,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("protocol",),
     ("devices", "rigs", "judging"),
     ("bench",),
-    ("recordings",),
-    ("campaigns", "testing", "hardware", "reporting", "analogrig"),
-    ("live",),
+    ("recordings", "claims"),
+    ("campaigns", "testing", "reporting", "analogrig"),
     ("cli", "device_program"),
 )
 """Modules and folders of ``analogrig``, lowest level first. An import to a higher level runs upwards."""
@@ -115,6 +120,7 @@ def _contents(commit: str, names: Sequence[str]) -> Iterator[bytes]:
 def metrics(tree: Tree) -> dict[str, str]:
     """Every figure of the table, by its name."""
     return {
+        **{f"lines of Python: {part}": f"{n:,}" for part, n in _python_lines(tree).items()},
         **{f"lines of code: {part}": f"{_lines(tree, part):,}" for part in PARTS},
         "Python modules of the product": str(len(list(tree.python(*PRODUCT)))),
         "public names at the top of modules": str(sum(1 for _ in _public(tree))),
@@ -123,6 +129,11 @@ def metrics(tree: Tree) -> dict[str, str]:
         "isinstance on concrete rigs and devices": str(isinstances(tree)),
         "imports that run upwards": _named([f"{a} to {b}" for a, b in upward(arrows(tree))]),
         "circles of imports between folders": _named([" ".join(sorted(circle)) for circle in circles(arrows(tree))]),
+        "circles of imports between modules": _named([" ".join(sorted(each)) for each in circles(module_arrows(tree))]),
+        "depth of classes": str(max(class_depths(tree).values(), default=0)),
+        f"private functions called once, of at most {FEW} lines": str(len(called_once(tree))),
+        f"modules below {SMALL} lines": str(len(small_modules(tree))),
+        **(_traced() if tree.name == NOW else {}),
         "docstrings": f"{len(_docstrings(tree)):,}",
         "docstrings with a bad first word": f"{share_of_bad(tree):.1%}",
         "most frequent first words": ", ".join(word for word, _ in _first_words(tree).most_common(6)),
@@ -141,6 +152,99 @@ def _named(names: Sequence[str]) -> str:
 def _lines(tree: Tree, part: str) -> int:
     wanted = [text for name, text in tree.files.items() if name.startswith(f"{part}/") and CODE.search(name)]
     return sum(text.count("\n") for text in wanted)
+
+
+def _python_lines(tree: Tree) -> Counter[str]:
+    """Lines of the core, of each package beside it, and of the other parts."""
+    lines: Counter[str] = Counter()
+    for path, text in tree.files.items():
+        part, _, rest = path.partition("/")
+        if path.endswith(".py") and part in PARTS:
+            package = rest.partition("/")[0] if part == "harness" else part
+            lines[package if package.startswith("analogrig") else part] += text.count("\n")
+    return lines
+
+
+def _traced() -> dict[str, str]:
+    """Figures of tests.traced; none without the environment of make."""
+    python = ROOT / ".venv" / "bin" / "python"
+    if not python.exists():
+        return {}
+    done = subprocess.run([python, "-m", "tests.traced"], cwd=ROOT, capture_output=True, text=True, check=True)
+    return {name: str(value) for name, value in json.loads(done.stdout).items()}
+
+
+def module_arrows(tree: Tree) -> Arrows:
+    """Imports between the modules of the product, those within functions included, but not those for types alone."""
+    modules = {
+        path.partition("/")[2].removesuffix(".py").removesuffix("/__init__").replace("/", "."): module
+        for path, module in tree.python("harness", "emulator")
+    }
+    found: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for name, module in modules.items():
+        for node in _run_nodes(module):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                for alias in node.names:
+                    inner = f"{node.module}.{alias.name}"
+                    target = inner if inner in modules else node.module
+                    if target in modules and target != name:
+                        found[name, target] = [(name, target)]
+    return found
+
+
+def _run_nodes(module: ast.Module) -> Iterator[ast.AST]:
+    """Nodes of a module except those below ``if TYPE_CHECKING:``."""
+    ahead: list[ast.AST] = [module]
+    while ahead:
+        node = ahead.pop()
+        yield node
+        is_typing = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        ahead += node.orelse if is_typing and isinstance(node, ast.If) else ast.iter_child_nodes(node)
+
+
+def class_depths(tree: Tree) -> dict[str, int]:
+    """Classes of the product above each of its classes, itself included; errors are a tree of their own."""
+    bases = {
+        node.name: [ast.unparse(base).partition("[")[0].rpartition(".")[2] for base in node.bases]
+        for _, module in tree.python(*PRODUCT)
+        for node in ast.walk(module)
+        if isinstance(node, ast.ClassDef)
+    }
+
+    def depth(name: str) -> int:
+        return 1 + max((depth(base) for base in bases[name] if base in bases and base != name), default=0)
+
+    def is_error(name: str) -> bool:
+        return (name not in bases and name.endswith(("Error", "Exception", "Interrupt"))) or any(
+            is_error(base) for base in bases.get(name, ()) if base != name
+        )
+
+    return {name: depth(name) for name in bases if not is_error(name)}
+
+
+def called_once(tree: Tree) -> list[str]:
+    """Private functions of at most FEW lines, without docstring, whose name stands once beside its definition."""
+    found = []
+    for path, module in tree.python(*PRODUCT):
+        names = Counter(node.id for node in ast.walk(module) if isinstance(node, ast.Name))
+        names += Counter(node.attr for node in ast.walk(module) if isinstance(node, ast.Attribute))
+        for node in ast.walk(module):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("_") and not node.name.startswith("__"):
+                body = node.body[1:] if ast.get_docstring(node) else node.body
+                lines = (node.end_lineno or 0) - (body[0].lineno if body else node.lineno) + 2
+                if names[node.name] == 1 and lines <= FEW and not node.decorator_list:
+                    found.append(f"{path}: {node.name}")
+    return found
+
+
+def small_modules(tree: Tree) -> list[str]:
+    """Modules of the product below SMALL lines, without those that every package has."""
+    return [
+        path
+        for path, text in tree.files.items()
+        if path.endswith(".py") and path.partition("/")[0] in PRODUCT and "/templates/" not in path
+        if not Path(path).name.startswith("__") and "/examples/" not in path and text.count("\n") < SMALL
+    ]
 
 
 def _words(tree: Tree) -> int:
@@ -276,7 +380,8 @@ def table(trees: Sequence[Tree], headings: Sequence[str]) -> str:
     """Markdown table with a column of figures for each tree."""
     columns = [metrics(tree) for tree in trees]
     rows = [("", *headings), ("---",) * (len(trees) + 1)]
-    rows += [(name, *(column[name] for column in columns)) for name in columns[0]]
+    names = dict.fromkeys(name for column in reversed(columns) for name in column)
+    rows += [(name, *(column.get(name, "-") for column in columns)) for name in names]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 

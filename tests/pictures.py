@@ -15,7 +15,7 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 from analogrig.cli import main as analogrig
-from analogrig.live.commands import Restart, SetPlaying, Step, Turn
+from analogrig_live.commands import Restart, SetPlaying, Step, Turn
 from tests import tools
 from tests.harness.live.benches import LiveBench
 

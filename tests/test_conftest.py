@@ -1,4 +1,4 @@
-"""Tests wait for tools by name, and in CI nothing may skip: the hooks of tests/conftest.py, each in its own session."""
+"""Tests wait for tools by name, and skip for nothing else: the hooks of tests/conftest.py, each in its own session."""
 
 from __future__ import annotations
 
@@ -52,6 +52,7 @@ WAITING = """
 def suite(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.Pytester:
     pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text())
     monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # what else is installed takes time, and may talk
     monkeypatch.delenv("ANALOGRIG_CI", raising=False)
     return pytester
 
@@ -71,29 +72,21 @@ def waiting(suite: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.P
     return suite
 
 
-def test_skips_are_skips_outside_ci(skipping: pytest.Pytester) -> None:
-    skipping.runpytest_subprocess().assert_outcomes(skipped=3, xfailed=1)
-
-
-@pytest.mark.parametrize(("mode", "says"), [("1", "nothing may skip"), ("bare", "only a missing tool may skip")])
-def test_skips_fail_in_ci_and_keep_their_reason(
-    mode: str, says: str, skipping: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("setting", "says"), [("0", "only a missing tool may skip a test"), ("1", "ANALOGRIG_CI=1: nothing may skip")]
+)
+def test_other_skips_fail_and_keep_their_reason(
+    setting: str, says: str, skipping: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("ANALOGRIG_CI", mode)
+    monkeypatch.setenv("ANALOGRIG_CI", setting)
     result = skipping.runpytest_subprocess("--continue-on-collection-errors")
     result.assert_outcomes(failed=1, errors=2, xfailed=1)  # of the module, and of the marker
-    result.stdout.fnmatch_lines_random(
-        [f"*no oscilloscope: apt-get install oscilloscope (ANALOGRIG_CI is set: {says}*"]
-    )
+    result.stdout.fnmatch_lines_random([f"*no oscilloscope: apt-get install oscilloscope ({says})"])
     assert result.ret == pytest.ExitCode.TESTS_FAILED
 
 
-@pytest.mark.parametrize("options", [(), ("-n", "2")], ids=["alone", "xdist"])
-@pytest.mark.parametrize("mode", ["", "bare"])
-def test_session_ends_with_a_table_of_the_missing_tools(
-    mode: str, options: tuple[str, ...], waiting: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ANALOGRIG_CI", mode)
+@pytest.mark.parametrize("options", [(), ("-p", "xdist.plugin", "-n", "2")], ids=["alone", "xdist"])
+def test_session_ends_with_a_table_of_the_missing_tools(options: tuple[str, ...], waiting: pytest.Pytester) -> None:
     result = waiting.runpytest_subprocess("-rs", *options)
     result.assert_outcomes(passed=1, skipped=4)
     result.stdout.fnmatch_lines(
@@ -109,7 +102,6 @@ def test_session_ends_with_a_table_of_the_missing_tools(
         ],
         consecutive=True,
     )
-    assert bare.waited_for(result.stdout.str()) == {"cppcheck", "qemu-arm", "ngspice"}
 
 
 def test_reason_of_a_skip_names_every_missing_tool(waiting: pytest.Pytester) -> None:
@@ -122,7 +114,9 @@ def test_reason_of_a_skip_names_every_missing_tool(waiting: pytest.Pytester) -> 
     )
 
 
-def test_missing_tool_fails_a_test_in_ci(waiting: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_tool_fails_a_test_where_nothing_may_skip(
+    waiting: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("ANALOGRIG_CI", "1")
     result = waiting.runpytest_subprocess()
     result.assert_outcomes(passed=1, errors=4)
@@ -131,6 +125,23 @@ def test_missing_tool_fails_a_test_in_ci(waiting: pytest.Pytester, monkeypatch: 
 
 def test_marker_selects_the_tests_that_need_a_tool_by_a_fixture_too(waiting: pytest.Pytester) -> None:
     waiting.runpytest_subprocess("-m", "tools").assert_outcomes(skipped=4, deselected=1)
+
+
+def test_children_see_nothing_of_the_make_and_the_pytest_around(
+    suite: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite.makepyfile("""
+        import os, subprocess, sys
+
+        def test_child():
+            print("<", *sorted({*os.environ} & {"MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "PYTHONPATH",
+                "PYTEST_ADDOPTS", "PYTEST_PLUGINS"}), ">")
+    """)
+    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES"):
+        monkeypatch.setenv(name, "w")
+    monkeypatch.setenv("PYTEST_ADDOPTS", "-v")
+    result = suite.runpytest_subprocess("-s")
+    result.stdout.fnmatch_lines(["*test_child < >*"])
 
 
 def test_tool_that_is_not_in_the_list_is_refused(suite: pytest.Pytester) -> None:
@@ -158,6 +169,25 @@ def test_children_of_a_session_under_nohup_can_be_interrupted(suite: pytest.Pyte
     command = [sys.executable, "-c", ignoring, sys.executable, "-m", "pytest", "-q"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("tool", [*tools.PACKAGES, *tools.BUILT])
+def test_every_tool_of_the_list_is_waited_for(tool: str) -> None:
+    fixtures = [fixture for fixture, names in tools.FIXTURES.items() if tool in names]
+    modules = [
+        *(CHECKOUT / "tests" / "soak" / "can_guest").glob("*.py"),
+        *(CHECKOUT / "tests").rglob("test_*.py"),
+        *(CHECKOUT / "estimator_c" / "evidence").glob("*.py"),
+    ]
+    texts = [path.read_text(encoding="utf-8") for path in modules if path != Path(__file__)]
+    assert any(f'"{tool}"' in text for text in texts) or fixtures
+
+
+def test_continuous_integration_calls_the_commands_of_the_readme_as_they_stand() -> None:
+    lines = (CHECKOUT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    assert bare.commands() == ["make run", "make test"]
+    assert [line for line in lines if line.startswith("make")][1:3] == bare.commands()  # the first: make tools
+    assert not [line for line in lines if "=" in line or line.startswith(("export", "unset"))]
 
 
 @pytest.mark.parametrize("packages", [bit_exact.PACKAGES, cost.PACKAGES], ids=["bit_exact", "cost"])

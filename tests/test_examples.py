@@ -14,8 +14,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from analogrig import cli
+from analogrig.cli import command_line
 from tests.harness.processes import LONG_S
+
+pytestmark = pytest.mark.heavy
 
 CHECKOUT = Path(__file__).parents[1]
 EXAMPLES = CHECKOUT / "harness" / "examples"
@@ -94,6 +96,17 @@ def test_page_on_c_libraries_leads_to_its_verdicts(tmp_path: Path) -> None:
     assert verdicts == ["PASSED", "FAILED"]
 
 
+def test_page_on_kalman_filters_leads_to_its_verdicts(tmp_path: Path) -> None:
+    page = (LIBRARY_PAGE.parent / "test-a-kalman-filter.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```sh\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    shown = run("set -e\n" + "".join(blocks), tmp_path)
+    assert re.findall(r"seed \d+: (\w+)$", shown, re.MULTILINE) == ["PASSED"] * 3
+    assert len(re.findall("^10 passed", shown, re.MULTILINE)) == 2
+    assert "in a row" not in shown
+    (matrices,) = re.findall(r"^```text\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    assert set(matrices.splitlines()) <= set(run("analogrig patch dc-motor", tmp_path).splitlines())
+
+
 @pytest.mark.parametrize("example", ["own_dbc"], indirect=True)
 def test_ecu_is_judged_on_its_bus_and_by_its_log(example: Path) -> None:
     group = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # of this process alone on this machine
@@ -144,6 +157,6 @@ def test_ci_files_run_the_same_lines_and_each_is_understood() -> None:
     for line in scripts():
         words = shlex.split(line)
         if words[0] == "analogrig":
-            cli._parser().parse_args(words[1:])
+            command_line.make_parser().parse_args(words[1:])
         else:
             assert words[0] in {"pip", "make", "pytest"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import subprocess
@@ -14,7 +15,10 @@ import pytest
 
 from tests.wheels import environment_with, made_once, run
 
-pytestmark = pytest.mark.timeout(3600)  # environments are made from the package index, maybe on a loaded machine
+pytestmark = [
+    pytest.mark.timeout(3600),
+    pytest.mark.heavy,
+]  # environments are made from the package index, maybe on a loaded machine
 
 VERSIONS = ("3.11", "3.12", "3.13")
 THIS = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -102,14 +106,15 @@ WAYS = {
 }
 
 
-def interpreter(version: str) -> str:
-    """A Python of this version that runs, of the PATH or of pyenv; skips the test without one."""
+@functools.cache
+def interpreter(version: str) -> str | None:
+    """A Python of this version that can make an environment, of the PATH or of pyenv."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     installed = sorted(pyenv.glob(f"versions/{version}.*/bin/python{version}"))
     for python in filter(None, [shutil.which(f"python{version}"), *map(str, installed)]):
         if subprocess.run([python, "-c", "import venv"], capture_output=True, check=False).returncode == 0:
             return python
-    pytest.skip(f"no Python {version} here: pyenv install {version}")
+    return None
 
 
 @pytest.fixture(scope="session")
@@ -125,6 +130,7 @@ def with_ours(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: pyt
         users: Path = request.getfixturevalue("users_environment")
         return users
     python = interpreter(request.param)
+    assert python is not None
     made = made_once(
         tmp_path_factory,
         f"with_{request.param}",
@@ -173,7 +179,7 @@ def outcomes(programs: Path, way: Way, folder: Path, *options: str, status: int 
     ("with_ours", "way", "packages"),
     [
         *((THIS, way, packages) for way in WAYS for packages in (True, False)),
-        *((version, "python -m pytest", True) for version in VERSIONS if version != THIS),
+        *((version, "python -m pytest", True) for version in VERSIONS if version != THIS and interpreter(version)),
     ],
     indirect=["with_ours"],
 )

@@ -28,6 +28,29 @@ def test_upward_import_is_found_wherever_it_stands() -> None:
     assert metrics.circles(metrics.arrows(below)) == [{"rigs", "cli"}]
 
 
+def test_modules_beside_the_core_import_in_no_circle(tree: metrics.Tree) -> None:
+    inside = [
+        circle
+        for circle in metrics.circles(metrics.module_arrows(tree))
+        if not any(name.startswith("analogrig_emulator.machine") for name in circle)
+    ]
+    assert inside == []
+
+
+def test_circle_of_modules_is_found_within_functions_too() -> None:
+    ring = made(one="def f():\n    from analogrig.two import g\n", two="from analogrig.one import f\n")
+    assert metrics.circles(metrics.module_arrows(ring)) == [{"analogrig.one", "analogrig.two"}]
+    typed = made(one="if TYPE_CHECKING:\n    from analogrig.two import g\n", two="from analogrig.one import f\n")
+    assert metrics.circles(metrics.module_arrows(typed)) == []
+
+
+def test_figures_of_small_things() -> None:
+    tree = made(one="def _f():\n    return 1\n\n\nprint(_f())\n", two="class A(B):\n    pass\n\n\nclass B:\n    pass\n")
+    assert metrics.called_once(tree) == ["harness/analogrig/one.py: _f"]
+    assert metrics.class_depths(tree) == {"A": 2, "B": 1}
+    assert len(metrics.small_modules(tree)) == 2
+
+
 def test_docstrings_can_be_read_alone(tree: metrics.Tree) -> None:
     assert metrics.share_of_bad(tree) <= 0.03
     assert metrics.share_of_bad(made(run='"""Whether it runs."""\nN = 1\n"""The number."""\n')) == 0.5

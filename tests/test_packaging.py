@@ -43,7 +43,6 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
         "analogrig/_device.so",
         "analogrig/_device_fixed.so",
         "analogrig/_device_wide.so",
-        "analogrig/_exit_guard.so",
         "analogrig/bin/analogrig-device",
         "analogrig/bin/analogrig-device-wide",
         "analogrig/bin/analogrig-library",
@@ -171,6 +170,7 @@ def test_users_repository_passes_without_its_bug(users_environment: Path, users_
     assert "2 passed" in run(users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
 
 
+@pytest.mark.heavy
 def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
     users_environment: Path, users_repository: Path
 ) -> None:

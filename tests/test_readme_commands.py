@@ -44,7 +44,7 @@ NOT_COPIED = (
     "*.egg-info",
 )
 
-pytestmark = pytest.mark.timeout(3600)  # 90 s of CPU time, 15 minutes at a load of twenty
+pytestmark = [pytest.mark.timeout(3600), pytest.mark.heavy]  # 90 s of CPU time, 15 minutes at a load of twenty
 
 
 def commands() -> list[tuple[str, str]]:

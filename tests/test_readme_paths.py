@@ -27,6 +27,7 @@ MADE_UP = {
         "dut.toml",
         "rig.toml",
         "mine.toml",
+        "quiet.toml",
         "rigs.toml",
         "scenario.toml",
         "soft.toml",
@@ -37,7 +38,7 @@ MADE_UP = {
 }
 """Paths of files that are not in this repository, and directories named by their last part."""
 
-IS_PATH = re.compile(r"\w[\w.-]+(?:/[\w.-]*)+|[\w-]+\.(?:py|c|h|toml|json|npz|html|css|js|dbc|ld|S)")
+IS_PATH = re.compile(r"(?!CRC-)\w[\w.-]+(?:/[\w.-]*)+|[\w-]+\.(?:py|c|h|toml|json|npz|html|css|js|dbc|ld|S)")
 
 NOT_OURS = re.compile(r"build/|DIR/|\.venv/|/dev/|CLONE/|~|.*/dev/")
 

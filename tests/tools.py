@@ -5,6 +5,7 @@ missing, and ends the session with `table`.
 
     python3 -m tests.tools install    install the packages that are missing (`make tools`)
     python3 -m tests.tools            list the packages that are missing
+    python3 -m tests.tools check      fail if a test would skip for lack of a tool
 
 This module runs before the environment exists: standard library only.
 """
@@ -65,9 +66,6 @@ PACKAGES = {
     "powerpc-linux-gnu-gcc": "gcc-powerpc-linux-gnu libc6-dev-powerpc-cross",
 }
 """Packages of each program, separated by blanks."""
-
-BARE = {"gcc", "gcov"}
-"""Programs that a machine with a C compiler has."""
 
 ALTERNATIVES = {"chromium": ("chromium", "google-chrome")}
 """Other names of a program."""
@@ -217,6 +215,9 @@ def _apt(command: list[str]) -> None:
 def main(arguments: Sequence[str]) -> None:
     if list(arguments) == ["install"]:
         install()
+    elif list(arguments) == ["check"]:
+        if lacking := missing([*PACKAGES, *BUILT]):
+            sys.exit(reason(lacking))
     else:
         sys.stdout.write("".join(f"{name}\n" for name in not_installed(wanted())))
 

@@ -31,6 +31,8 @@ INHERITED = (
     "CC",
     "ANALOGRIG",
     "PYTEST_",
+    "MAKE",
+    "MFLAGS",
 )
 """Beginnings of the variables that would let a build or an installed program depend on this checkout or session."""
 

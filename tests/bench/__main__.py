@@ -1,6 +1,6 @@
 """Benchmarks, all or those named: print one table, write build/bench.json and the evidence pages of the site.
 
-python -m tests.benchmarks [NAME [OPTION ...] ...]
+python -m tests.bench [NAME [OPTION ...] ...]
 
 Options follow the name of a benchmark that has some: "reality --rows hum,drift", "statistics random-plants". With
 --quick nothing is written.

@@ -1,6 +1,6 @@
 """Deviation of the manufacturer's examples from the ideal solution: of its client's data, by specimen, by op-amps.
 
-python -m tests.benchmarks.bandwidth_lucidac
+python -m tests.bench.bandwidth_lucidac
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from analogrig.hardware.simulator.served_lucidac import specimen
 from analogrig.scenario import DEFAULT_SEED
 from analogrig_emulator.lucidac.machine import Lucidac
 from analogrig_emulator.lucidac.wiring import LucidacParts
+from analogrig_lucidac.served_machine import specimen
 from tests.served.lucidac_deviations import calibrated_deviation, deviation, play, read_configuration, run_examples
 from tests.served.lucidac_examples import EXAMPLES
 from tests.served.serving import serving

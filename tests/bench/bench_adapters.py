@@ -1,6 +1,6 @@
 """Sample rates through the adapters for any estimator.
 
-python -m tests.benchmarks adapters
+python -m tests.bench adapters
 
 Each adapter adds one function to ROWS, which yields the names and the devices to be measured. A row of an adapter takes
 a trivial estimator, unless its name says otherwise: the rate is that of the adapter.
@@ -67,18 +67,16 @@ def rates(device: Device, block_n: int) -> list[float]:
 
 
 def libraries() -> Generator[Row, None, None]:
-    """Plain C libraries, in a child process and in this one."""
+    """Plain C libraries in a child process."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "trivial.c"
         source.write_text(TRIVIAL)
         trivial = build(Path(folder) / "trivial.so", source)
         own = build(Path(folder) / "own.so", OWN)
         for library, estimator in ((trivial, ""), (own, ", RLS with 6 parameters and CUSUM")):
-            for place, in_process in (("in a child", False), ("in process", True)):
-                description = EstimatorLibrary(name="library", library=str(library), in_process=in_process)
-                with description.connect() as device:
-                    for block_n in (16_384, 1024, 1) if not estimator else (1024,):
-                        yield f"library {place}, blocks of {block_n}{estimator}", device, block_n
+            with EstimatorLibrary(name="library", library=str(library)).connect() as device:
+                for block_n in (16_384, 1024, 1) if not estimator else (1024,):
+                    yield f"library in a child, blocks of {block_n}{estimator}", device, block_n
 
 
 ROWS: tuple[Callable[[], Generator[Row, None, None]], ...] = (libraries, text_programs.rows, ecus)

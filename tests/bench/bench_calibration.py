@@ -1,6 +1,6 @@
 """Calibration of twenty random rigs: distance of the twins, and coverage of their standard errors.
 
-python -m tests.benchmarks.bench_calibration [FIRST LAST]    prints a line a rig besides
+python -m tests.bench.bench_calibration [FIRST LAST]    prints a line a rig besides
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from scipy.stats import chi2
 
-from analogrig.hardware.calibration.averages import check_scenario
-from analogrig.hardware.calibration.fit import POTS, Calibration
+from analogrig_instruments.calibration.averages import check_scenario
+from analogrig_instruments.calibration.fit import POTS, Calibration
 from tests.harness.calibration_rigs import DrawnRig, calibrate_rig, draw_rig, rms_lsb, thesis_profile, truth
 
 from .figure import Figure

@@ -1,6 +1,6 @@
 """Campaigns of many trials: time, memory, sizes, comparison, and the same results after ten kills.
 
-python -m tests.benchmarks campaign [--trials N] [--stored N]
+python -m tests.bench campaign [--trials N] [--stored N]
 
 ``--trials``: trials of 300 samples that are played three times, once on a Dask cluster of this machine and once killed
 ten times on the way. ``--stored``: trials that are stored, counted, shown and compared without being played: copies of

@@ -1,6 +1,6 @@
 """Detection delay of the shipped device for the thesis's changes, over 100 seeds, beside the information bound.
 
-python -m tests.benchmarks.bench_detection [FIRST_SEED END_SEED]
+python -m tests.bench.bench_detection [FIRST_SEED END_SEED]
 """
 
 from __future__ import annotations

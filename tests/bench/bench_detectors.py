@@ -1,7 +1,7 @@
 """Detectors at the same measured ARL0: the shipped device, the thesis's triggers, a GLR test that knows the plants, and
 estimators of packages from PyPI.
 
-python -m tests.benchmarks.bench_detectors [--quick] [DETECTOR ...]
+python -m tests.bench.bench_detectors [--quick] [DETECTOR ...]
 
 The level of each detector is calibrated by the first alarms of fresh devices whose plant does not change: counting the
 alarms of one long run would measure a device that its own alarms have altered. The ARL0 at that level is measured again
@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.answers import Samples
-from analogrig.bench import Bench, direct_bench
+from analogrig.bench import Bench
+from analogrig.campaigns.together import direct_bench
 from analogrig.judging.courses import first_at_level
 from analogrig.judging.information import change_information
 from analogrig.judging.statistics import lower_rate, upper_rate

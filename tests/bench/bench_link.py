@@ -1,6 +1,6 @@
 """Sample rate through a device that returns every element of the estimate for every sample; and real time.
 
-python -m tests.benchmarks link
+python -m tests.bench link
 """
 
 from __future__ import annotations
@@ -14,15 +14,14 @@ import numpy as np
 
 from analogrig.bench import Bench
 from analogrig.devices.can import CanDevice
-from analogrig.devices.description import DeviceDescription
-from analogrig.devices.host import HostDevice
+from analogrig.devices.device import DeviceDescription
 from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.qemu import FIRMWARE, QemuM4
-from analogrig.protocol.pace import Pace
+from analogrig.devices.pace import Pace
+from analogrig.devices.processes import FIRMWARE, HostDevice, QemuM4
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
-from tests.can_guest.__main__ import throughput_in_guest
 from tests.harness.fed import fed
+from tests.soak.can_guest.__main__ import throughput_in_guest
 
 from .figure import Figure
 
@@ -32,16 +31,12 @@ REPEATS = 5
 """Number of repetitions, of which the best is reported: the machine is shared."""
 REAL_TIME_S = 60.0
 
-QEMU = (
-    QemuM4(name="QEMU M4F, lock-step by sample", exchange="sample"),
-    QemuM4(name="QEMU M4F over slcan, lock-step by sample", exchange="sample", link="slcan"),
-)
+QEMU = (QemuM4(name="QEMU M4F, lock-step by sample", exchange="sample"),)
 
 BUSES: Mapping[str, DeviceDescription] = {
     "CAN in process": InprocDevice(name="", link="can"),
     "CAN virtual": CanDevice(name="", interface="virtual"),
     "CAN udp_multicast": CanDevice(name="", interface="udp_multicast", channel="239.74.163.2", device="inproc"),
-    "CAN slcan on a pty": HostDevice(name="", link="slcan"),
 }
 WAYS: tuple[tuple[str, Mapping[str, Any]], ...] = (
     ("lock-step by sample", {"exchange": "sample"}),

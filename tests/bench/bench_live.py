@@ -1,6 +1,6 @@
 """The live bench in real time: samples, frames, processor time, memory, and hostile clients.
 
-python -m tests.benchmarks live [--parts PART ...] [--seconds S] [--hostile S] [--minutes M]
+python -m tests.bench live [--parts PART ...] [--seconds S] [--hostile S] [--minutes M]
 
 ``--parts``: ``real-time`` (a recording, without a browser), ``screen`` (frames that a browser draws), ``hostile``
 (hostile clients at each endpoint), ``memory``; all by default. ``--seconds``: length of the recording, and of the time
@@ -32,10 +32,10 @@ from playwright.sync_api import Page, sync_playwright
 from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
-from analogrig.live.commands import Tempo, Turn
-from analogrig.live.foxglove import SUBPROTOCOL
-from analogrig.live.session import LiveSession
 from analogrig.run import Run
+from analogrig_live.commands import Tempo, Turn
+from analogrig_live.foxglove import SUBPROTOCOL
+from analogrig_live.session import LiveSession
 from tests import tools
 from tests.harness.live.benches import Action, scripted_session
 from tests.harness.processes import descendants, marked

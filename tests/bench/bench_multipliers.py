@@ -1,6 +1,6 @@
 """Speed of programs with multipliers in the loop, beside ngspice on the same circuit.
 
-python -m tests.benchmarks multipliers
+python -m tests.bench multipliers
 
 The grid is that of bench_engine with tighter tolerances, each setting run once: looser ones are off by LSBs. A deck
 that knows the circuit limits neither op-amps nor multipliers. The fastest FINALISTS of each deck within each of
@@ -200,7 +200,7 @@ def _own_s(played: Played) -> float:
 
 _COLD = """\
 import sys, time
-from tests.benchmarks.bench_multipliers import Played, SuspensionComputer
+from tests.bench.bench_multipliers import Played, SuspensionComputer
 played = Played.of(sys.argv[1], int(sys.argv[2]))
 played.excitation
 next(SuspensionComputer("front").play(played.excitation, 1))

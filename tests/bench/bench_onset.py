@@ -1,7 +1,7 @@
 """Dating of pot changes from the samples: coverage of the interval, and its width beside the least
 that any could have. Trials of tests.harness.dating_trials; fixed seeds.
 
-python -m tests.benchmarks.bench_onset [jump] [ramp] [still] [several]
+python -m tests.bench.bench_onset [jump] [ramp] [still] [several]
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from analogrig.hardware.by_hand import PlannedChange, contradictions
-from analogrig.hardware.dating.instants import Instant, NoInstant, TurnInstants, date_jump
 from analogrig.judging.statistics import lower_rate
 from analogrig.rigs.rig import Rig
+from analogrig_instruments.by_hand import PlannedChange, contradictions
+from analogrig_instruments.dating.instants import Instant, NoInstant, TurnInstants, date_jump
 from tests.harness.allowed import open_allowed
 from tests.harness.dating_trials import Clock, Several, Trial, still
 from tests.served.serving import serving

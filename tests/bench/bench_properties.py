@@ -1,6 +1,6 @@
 """False-failure rates of the shipped properties for a sound device: the table of background/properties.md.
 
-python -m tests.benchmarks properties
+python -m tests.bench properties
 
 Plays in this process, of other seeds than those of the properties themselves.
 """
@@ -14,7 +14,9 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from numpy.typing import NDArray
 
-from analogrig.bench import Bench, direct_bench
+from analogrig.bench import Bench
+from analogrig.campaigns.together import direct_bench
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.devices.registry import describe
 from analogrig.judging.information import detectable
 from analogrig.judging.statistics import upper_rate
@@ -24,7 +26,6 @@ from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.properties.experiments import is_playable
 from analogrig.testing.properties.test_detection import (
-    ARL0,
     DOUBTFUL_LATENCY,
     MOST_INFORMATION,
     MOST_LATENCY,
@@ -51,7 +52,8 @@ def figures() -> Iterator[Figure]:
     yield _of_some_seed("missing samples", failed, PLAYS)
     bench = _bench("emulator")
     patient = scenarios(expect=PATIENT)
-    found = _failures(patient, bench, Played.passes, lambda each: detectable(each, ARL0**MOST_INFORMATION))
+    level = DEFAULT_ARL0**MOST_INFORMATION
+    found = _failures(patient, bench, Played.passes, lambda each: detectable(each, level, rig="emulator"))
     yield _of_some_seed("changes are found", *found)
     healthy = scenarios(most_changes=0)
     yield _of_some_seed("estimates", *_failures(healthy, bench, lambda each: each.estimates(WITHIN), lambda _: True))

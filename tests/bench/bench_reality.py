@@ -1,6 +1,6 @@
 """The shipped device under the conditions that users meet: false alarms, misfits, missed changes and delays.
 
-python -m tests.benchmarks.bench_reality [--rows NAME,...] [--quick] [--jobs N]
+python -m tests.bench.bench_reality [--rows NAME,...] [--quick] [--jobs N]
 
 The whole table takes 900 s of processor time. ``--quick`` plays a tenth of the healthy samples and a third of the
 changes, for a look at it.
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.estimator_config import DEFAULT_ARL0
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.judging.courses import first_at_level
 
 from . import silverbox

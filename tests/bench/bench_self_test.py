@@ -1,6 +1,6 @@
 """False-positive rate of the self-test on machines within tolerance, and their distance from its limits.
 
-python -m tests.benchmarks self-test
+python -m tests.bench self-test
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analogrig.hardware.self_test import self_test
 from analogrig.judging.statistics import upper_rate
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig_emulator import CHANNELS
+from analogrig_instruments.self_test import self_test
 
 from .figure import Figure
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from analogrig.bench import Bench
 from analogrig.config import fixtures
-from analogrig.devices.opening import open_dut
-from analogrig.hardware.calibration.recorded import RecordedPlant, fit_program
+from analogrig.devices.registry import open_dut
 from analogrig.reporting.measured import Oscillation, mode_of
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.rigs.recording import RecordingRig
@@ -23,6 +22,7 @@ from analogrig.run import Run
 from analogrig_emulator import CHANNELS, PatchedProgram, load_patch
 from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.program_file import parse_program
+from analogrig_instruments.calibration.recorded import RecordedPlant, fit_program
 
 from .figure import Figure
 from .silverbox import GROWTH_END, RATE_HZ, find_file, import_record

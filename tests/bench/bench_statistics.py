@@ -2,7 +2,7 @@
 
 Plants of tests.estimator_c.plants; at least 400 trials a cell, random phase and onset, fixed seeds, ARL0 = 1e5.
 
-python -m tests.benchmarks.bench_statistics [delay] [free-running] [false-alarms] [false-alarms-free-running] [accuracy]
+python -m tests.bench.bench_statistics [delay] [free-running] [false-alarms] [false-alarms-free-running] [accuracy]
     [shipped] [start] [random-plants] [random-plants-free-running]
 
 The last four parts play the shipped device with its default settings. Random plants take 1e8 samples and some 100 s on

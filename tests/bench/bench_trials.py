@@ -1,6 +1,6 @@
 """Speed of closed-loop trials with circuit, card and estimator in one process, and the gain by a second process.
 
-python -m tests.benchmarks trials
+python -m tests.bench trials
 
 Rates are by CPU time, which neighbours on the machine spoil less than time on the wall; of the certificate both are
 given, its start included. What a second worker is worth is given by the wall too, which only means something on a
@@ -16,7 +16,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
-from analogrig.bench import DIRECT_BLOCK_SAMPLES, DirectBench, direct_bench
+from analogrig.campaigns.repeated import DIRECT_BLOCK_SAMPLES
+from analogrig.campaigns.together import DirectBench, direct_bench
 from analogrig.devices.registry import describe
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig

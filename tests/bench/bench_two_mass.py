@@ -7,9 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analogrig.devices.direct import DirectDevice
+from analogrig.datasheet import DEFAULT_ARL0
+from analogrig.devices.catalogue_device import DirectDevice
 from analogrig.devices.inproc import InprocDevice
-from analogrig.estimator_config import DEFAULT_ARL0, EstimatorConfig
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.bursts import BURST, upper_count
 from analogrig.judging.courses import first_at_level
 from analogrig.plant import Plant

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import DeviceDescription
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.python import PythonDescription
 from analogrig.devices.registry import describe
@@ -99,7 +99,9 @@ def _of_thesis(trigger: TriggerName, ceiling: float) -> DeviceDescription:
 
 
 def _python(factory: str, level: float, **settings: float) -> DeviceDescription:
-    return PythonDescription(name=factory, factory=f"{__package__}.{factory}", settings={"level": level, **settings})
+    return PythonDescription(
+        name=factory, factory=f"{__package__}.{factory}", settings={"level": level, **settings}, in_process=True
+    )
 
 
 def _glr(level: float) -> DeviceDescription:

@@ -8,7 +8,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from analogrig.devices.device import Device
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from tests.harness.scripted_ecu import PARAMETERS, ScriptedEcu, write
 
 COUNTERS = 256

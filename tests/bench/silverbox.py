@@ -15,8 +15,8 @@ from typing import Self
 
 import numpy as np
 
-from analogrig.recordings.imported import ImportDescription, ImportedColumn, import_columns
 from analogrig.run import Run
+from analogrig_imports.imported import ImportDescription, ImportedColumn, import_columns
 from tests import tools
 
 from .figure import Figure

@@ -1,6 +1,6 @@
 """Soak of the emulated LUCIDAC: random configurations against ngspice; seeds are printed.
 
-python -m tests.benchmarks.soak_lucidac [COUNT [FIRST_SEED]]
+python -m tests.bench.soak_lucidac [COUNT [FIRST_SEED]]
 
 A deck that ngspice gives up, or that takes it longer than LIMIT_S, is replaced by that of a further seed.
 """

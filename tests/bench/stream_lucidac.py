@@ -1,6 +1,6 @@
 """Stream of a LUCIDAC at its full rate, from the served machine to the driver's connection.
 
-python -m tests.benchmarks.stream_lucidac [SECONDS]
+python -m tests.bench.stream_lucidac [SECONDS]
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import resource
 import sys
 import time
 
-from analogrig.hardware.lucidac_connection import LucidacConnection
-from analogrig.hardware.lucidac_patch import module_of
-from analogrig.hardware.simulator.served_lucidac import MAC
 from analogrig_emulator.lucidac.configuration import Configuration, Integrator, LucidacLane
+from analogrig_lucidac.connection import LucidacConnection
+from analogrig_lucidac.patching import module_of
+from analogrig_lucidac.served_machine import MAC
 from tests.served.serving import serving
 
 RATE_HZ, CHANNELS = 62_500, 8

@@ -9,7 +9,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from analogrig.devices.device import Device
-from analogrig.devices.program import ProgramDevice
+from analogrig.devices.lines import ProgramDevice
 
 ALARM_ONLY = r"""
 #include <stdio.h>

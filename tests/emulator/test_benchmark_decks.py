@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from analogrig_emulator import to_spice
-from tests.benchmarks import bench_engine
-from tests.benchmarks.bench_engine import (
+from tests.bench import bench_engine
+from tests.bench.bench_engine import (
     METHODS,
     SETTINGS,
     THESIS_TWEAKS,

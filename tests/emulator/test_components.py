@@ -207,7 +207,8 @@ def test_the_dial_undoes_the_coefficient(dial: float, wiper_ohm: float, end_ohm:
 
 
 def test_end_stops_limit_the_coefficient() -> None:
-    with pytest.raises(PotError, match=r"pot M: coefficient 0.0001 lies beyond an end stop"):
+    message = r"pot M: coefficient 0.0001 is beyond the track \(0.0019917 to 0.9978\)"
+    with pytest.raises(PotError, match=message):
         PotModel(10e3, end_ohm=20.0).dial(1e-4, 1e5, "M")
 
 

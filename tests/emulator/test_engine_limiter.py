@@ -232,6 +232,41 @@ def test_a_refused_circuit_is_refused_again_and_not_played(refused: Callable[[],
     assert engine.run(3).shape == (3, 1)
 
 
+def schmitt(amp: str) -> Circuit:
+    """A limiter with hysteresis: x is about +-3 V, and switches where the input n passes a third of it."""
+    return Circuit(
+        [
+            *(SOURCE, Resistor("R0", "in", "n", 1e3), Capacitor("C0", "n", "0", 1e-9)),
+            *(OpAmp("U1", "p", "n", "o", preset(amp)), Resistor("R1", "o", "x", 2e3)),
+            *back_to_back("D", "x", "0", 3.0, 20.0),
+            *(Resistor("R2", "x", "p", 20e3), Resistor("R3", "p", "0", 10e3)),
+        ]
+    )
+
+
+COURSE = ((-2.0, 1), (0.5, 1), (0.9, 1), (1.6, -1), (0.5, -1), (-0.9, -1), (-1.7, 1), (0.9, 1), (2.0, -1), (0.0, -1))
+"""Levels of the input, each for four samples, and the sign of x after each: thresholds are +-1.03 V."""
+
+
+def course() -> dict[str, Edges]:
+    return steps(*((4.0 * i + 0.3 * (i % 3), level) for i, (level, _) in enumerate(COURSE)))
+
+
+@pytest.mark.parametrize("amp", ["tl07x", "741"])
+def test_a_limiter_with_hysteresis_remembers_the_threshold_that_was_passed_last(amp: str) -> None:
+    engine = Engine(piecewise_linear(schmitt(amp)), ["x"])
+    volts = engine.run(4 * len(COURSE), course())[3::4, 0]
+    np.testing.assert_allclose(volts, [3.1 * sign for _, sign in COURSE], atol=0.05)
+    assert engine.counts.events >= 4 * 2  # four switchings, each of which lets one limiter go and takes the other
+
+
+def test_a_limiter_with_hysteresis_agrees_with_ngspice(ngspice: NgSpice) -> None:
+    circuit, nodes, samples = schmitt("tl07x"), ("x", "p", "o"), 4 * len(COURSE)
+    reference = ngspice(to_spice(circuit, samples=samples, edges=course()), nodes, samples)
+    volts = Engine(piecewise_linear(circuit), nodes).run(samples, course())
+    assert np.abs(volts - reference).max() < 0.05 * LSB_V
+
+
 def latching(*, closed: bool, farad: float = 1e-9) -> Circuit:
     """A follower with a limiter from output to input, which a switch puts in: beyond its threshold it latches."""
     return Circuit(

@@ -114,7 +114,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., CDLL]:
 
     def compile_with(*options: str) -> CDLL:
         product = tmp_path_factory.mktemp("engine") / "_engine.so"
-        sources = sorted(Path(library.__file__).parent.glob("*.c"))
+        sources = sorted(Path(library.__file__).parent.rglob("*.c"))
         fixed = ("-std=c99", "-shared", "-fPIC", "-ffp-contract=off")
         subprocess.run(["cc", *options, *fixed, "-o", product, *sources], check=True)
         return library.load_from(product)

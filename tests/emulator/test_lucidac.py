@@ -260,5 +260,5 @@ def test_impossible_parts_are_refused_by_name(wrong: dict[str, Any], named: str)
 
 @pytest.mark.parametrize("seed", [3, 11, 48])
 def test_random_configurations_agree_with_ngspice_at_every_output(ngspice: NgSpice, seed: int) -> None:
-    """More of them: python -m tests.benchmarks.soak_lucidac. In 48 a product does not move in its first iterations."""
+    """More of them: python -m tests.bench.soak_lucidac. In 48 a product does not move in its first iterations."""
     assert ngspice_error_lsb(ngspice, seed) < 0.05

@@ -300,7 +300,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "machine slower than the plant": (
         lambda _: SLOW,
-        "line 1: .* the integrator is slow, at most .* with 1 uF: write speed = .* or less",
+        "line 1: .* the integrator is slow, at most .* with 1 uF; write speed = 25000$",
     ),
     "coefficient beyond 10": (
         lambda text: equation("omega' = (torque - d*omega) / J")(text) + "\n[signals]\ntorque = { full = 0.05 }\n",
@@ -311,7 +311,7 @@ BAD: dict[str, tuple[Change, str]] = {
             swapped('i = { unit = "A" }', 'i = { unit = "A", full = 2000.0 }')(text)
             + "\n[signals]\ntorque = { full = 1.5 }\n"
         ),
-        "line 2: term \\+ k\\*i of torque needs a coefficient of 107, and there are 10; write full = 20 for torque",
+        "line 2: term \\+ k\\*i of torque needs a coefficient of 107, .*; write signals.torque.full = 20$",
     ),
     "machine too fast": (
         swapped("speed = 10", "speed = 1e6"),

@@ -118,7 +118,7 @@ def false_alarms(
 def upper_rate(found: int, samples: int, confidence: float = 0.99) -> float:
     """Upper bound on the rate per sample, for a fixed number of samples.
 
-    Alarms are taken as independent: those of this device come alone (``analogrig certify --rare``).
+    Alarms are taken as independent: those of this device come alone.
     """
     return upper_count(found, confidence, burst=1.0) / samples
 

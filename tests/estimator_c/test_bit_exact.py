@@ -10,7 +10,7 @@ import pytest
 
 from estimator_c.evidence import bit_exact
 
-pytestmark = pytest.mark.tools(*bit_exact.PACKAGES)
+pytestmark = [pytest.mark.tools(*bit_exact.PACKAGES), pytest.mark.heavy]
 
 
 @pytest.fixture(scope="module")

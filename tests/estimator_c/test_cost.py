@@ -9,7 +9,7 @@ import pytest
 
 from estimator_c.evidence import cost
 
-pytestmark = pytest.mark.tools(*cost.PACKAGES)
+pytestmark = [pytest.mark.tools(*cost.PACKAGES), pytest.mark.heavy]
 
 KNOWN_STEP = """
 #include "subject.h"

@@ -7,6 +7,7 @@ import pytest
 from estimator_c.evidence.coverage import measured
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("gcc", "gcov")
 def test_every_line_and_branch_of_core_isolation_and_fit_is_tested() -> None:
     coverage = measured()

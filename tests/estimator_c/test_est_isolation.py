@@ -34,6 +34,7 @@ def test_changed_parameter_is_named_in_time_and_its_extent_told(
     assert found.error_refined < 0.01
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("change", SINGLE, ids=str)
 def test_report_comes_within_twice_the_isolation_bound_on_average(estimator: Estimator, change: Change) -> None:
     """The rivals of the bound are all that the isolation weighs. As long as no force acts two others at once are the

@@ -16,7 +16,6 @@ from scipy.signal import lfilter
 
 import analogrig.devices.estimator
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.estimator import ReferenceEstimator
 from tests.estimator_c.est_driver import (
     ANYWHERE,
     CUSUM,
@@ -30,6 +29,7 @@ from tests.estimator_c.est_driver import (
     Estimator,
     Result,
 )
+from tests.reference.estimator import ReferenceEstimator
 
 FRONT = (115.0, 3021.0, 24500.0)
 PERIOD_S = 0.01
@@ -483,6 +483,7 @@ def test_edges_in_the_midst_of_a_doubt_join_it(estimator: Estimator, slip: int) 
     assert result.counters["slips"] == 1
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("plant", [FRONT, (30.0, 2123.0, 20000.0)], ids=["front", "light"])
 @pytest.mark.parametrize("drift_ppm", [20.0, -20.0])
 def test_long_free_running_stretch_stays_quiet(estimator: Estimator, plant: Plant, drift_ppm: float) -> None:

@@ -99,7 +99,9 @@ int main(int argc, char** argv) {
 """
 
 
-@pytest.mark.parametrize("level", ["-O0", "-O1", "-O2", "-Os"])
+@pytest.mark.parametrize(
+    "level", ["-O0", *(pytest.param(each, marks=pytest.mark.heavy) for each in ("-O1", "-O2", "-Os"))]
+)
 @pytest.mark.parametrize(("storage", "status"), [("", -signal.SIGABRT), ("static ", 0)], ids=["automatic", "static"])
 def test_step_asserts_that_the_configuration_is_still_there(
     tmp_path: Path, level: str, storage: str, status: int
@@ -193,9 +195,11 @@ def test_every_field_of_a_configuration_has_a_comment_with_its_unit_or_range() -
 @pytest.mark.parametrize(
     ("processor", "level", "most"),
     [
-        *((stack.CORTEX_M4F, level, 420) for level in ("-Os", "-O2", "-O3")),
-        *((stack.CORTEX_M0, level, 420) for level in ("-Os", "-O2", "-O3")),
-        *((stack.AVR, level, 400) for level in ("-Os", "-O2", "-O3")),
+        *(
+            pytest.param(processor, level, most, marks=() if level == "-Os" else pytest.mark.heavy)
+            for processor, most in ((stack.CORTEX_M4F, 420), (stack.CORTEX_M0, 420), (stack.AVR, 400))
+            for level in ("-Os", "-O2", "-O3")
+        ),
         (stack.CORTEX_M4F, "-O0", 2770),
         (stack.CORTEX_M0, "-O0", 2770),
         (stack.AVR, "-O0", 1810),

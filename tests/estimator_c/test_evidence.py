@@ -22,6 +22,7 @@ BUILDS = [("-DEST_NC_MAX=0U",), ("-DEST_NC_MAX=2U",)]
 BUILD_IDS = ["usual", "extended least squares"]
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("gcc")
 @pytest.mark.parametrize("options", BUILDS, ids=BUILD_IDS)
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
@@ -32,6 +33,7 @@ def test_gcc_analyzer_finds_nothing(source: Path, options: Sequence[str], tmp_pa
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("clang-tidy")
 @pytest.mark.parametrize("part", ["core", "isolation", "fit", "device"])
 def test_clang_tidy_finds_nothing(part: str) -> None:
@@ -51,6 +53,7 @@ DEVICE_SOURCES = sorted(
 )
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("gcc")
 def test_gcc_analyzer_finds_nothing_in_the_device_and_its_port_to_this_computer(tmp_path: Path) -> None:
     command = ["gcc", "-std=c99", "-D_XOPEN_SOURCE=700", "-O2", "-fanalyzer", "-Wall", "-Wextra", "-Werror", "-c"]
@@ -75,6 +78,7 @@ def test_cppcheck_finds_nothing_in_the_device() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("frama-c")
 def test_eva_finds_that_nothing_undefined_can_happen() -> None:
     """In the default shape, with any configuration and any samples; `make eva` has all shapes."""
@@ -100,6 +104,7 @@ def numbers_in_the_code() -> set[tuple[str, int, str]]:
     }
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("cppcheck")
 def test_what_cppcheck_with_misra_finds_is_explained_and_numbered_at_its_line(tmp_path: Path) -> None:
     command = ["cppcheck", "--quiet", "--addon=misra", "--enable=warning,style,performance,portability", "--std=c99"]

@@ -21,6 +21,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("clang")
 @pytest.mark.parametrize("target", RUNS)
 def test_no_input_breaks_what_is_promised(folder: Path, target: str) -> None:

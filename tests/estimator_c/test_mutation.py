@@ -70,6 +70,7 @@ def test_slow():
 """
 
 
+@pytest.mark.heavy
 def test_a_slow_test_does_not_count_as_one_without_end(tmp_path: Path) -> None:
     (tmp_path / "test_slow.py").write_text(SLOW)
     environment = os.environ | {"PYTHONPATH": str(mutate.ROOT)}
@@ -78,6 +79,7 @@ def test_a_slow_test_does_not_count_as_one_without_end(tmp_path: Path) -> None:
     assert done.stdout == "''\n", done.stdout + done.stderr
 
 
+@pytest.mark.heavy
 def test_mutants_by_chance_are_noticed_or_explained(tmp_path: Path) -> None:
     """In a process of its own: every test there has the library of a mutant."""
     out = tmp_path / "mutation.json"

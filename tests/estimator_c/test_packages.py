@@ -33,7 +33,9 @@ CORTEX = {
     "M33": ("-mcpu=cortex-m33", "-mfloat-abi=hard", "-mfpu=fpv5-sp-d16"),
     "M55": ("-mcpu=cortex-m55", "-mfloat-abi=hard"),
 }
-LEVELS = ("-O0", "-Os", "-O2", "-O3")
+LEVELS = ("-O0", "-Os", *(pytest.param(level, marks=pytest.mark.heavy) for level in ("-O2", "-O3")))
+QUICK_CORES = ("M0", "M3", "M4F")
+"""Cores that `make test` compiles for: no hardware division, no floating point, and both."""
 
 
 def run(*command: str | Path, cwd: Path | None = None) -> str:
@@ -145,7 +147,7 @@ void* memcpy(void* to, const void* from, size_t n) {
 
 
 @pytest.mark.tools("arm-none-eabi-gcc", "qemu-arm")
-@pytest.mark.parametrize("core", ["M3", "M4F", "M7"])
+@pytest.mark.parametrize("core", ["M4F", *(pytest.param(core, marks=pytest.mark.heavy) for core in ("M3", "M7"))])
 def test_example_detects_the_change_on_a_cortex_m(tmp_path: Path, core: str) -> None:
     """In QEMU's user mode, whose programs end by the exit call of Linux."""
     (tmp_path / "start.c").write_text(START)
@@ -177,7 +179,9 @@ def compiles(compiler: str, flags: tuple[str, ...], folder: Path) -> None:
 
 
 @pytest.mark.tools("arm-none-eabi-gcc")
-@pytest.mark.parametrize("core", CORTEX)
+@pytest.mark.parametrize(
+    "core", [pytest.param(core, marks=() if core in QUICK_CORES else pytest.mark.heavy) for core in CORTEX]
+)
 def test_no_warning_on_any_cortex_m(core: str, tmp_path: Path) -> None:
     compiles("arm-none-eabi-gcc", (*CORTEX[core], "-Os"), tmp_path)
 
@@ -194,6 +198,7 @@ def test_no_warning_on_an_avr(level: str, tmp_path: Path) -> None:
     compiles("avr-gcc", ("-mmcu=atmega2560", level), tmp_path)
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("arm-none-eabi-gcc")
 def test_library_for_arduino_contains_no_fused_multiply_add(tmp_path: Path) -> None:
     """An Arduino library has no compiler options: without the pragma of src/est.c there are 300 of them."""

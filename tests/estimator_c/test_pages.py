@@ -1,4 +1,4 @@
-"""The ports of the how-to pages and the example of estimator_c/README.md compile, link and work as documented."""
+"""The ports of the how-to page and the example of estimator_c/README.md compile, link and work as documented."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ REGISTERS = {
     "a CAN controller": "uint32_t CAN1[0x400 / 4]; volatile uint32_t RANDOM;",
 }
 BOARD = ROOT / "harness/docs/howto/port-to-a-board.md"
-CAN_CONTROLLER = ROOT / "harness/docs/howto/port-to-a-can-controller.md"
 
 
 def programs(page: Path) -> list[str]:
@@ -34,11 +33,8 @@ def programs(page: Path) -> list[str]:
 
 def port_of(name: str) -> str:
     """The port of that name. DMA and RTOS replace functions of the port to a UART."""
-    uart, dma, rtos = programs(BOARD)
-    if name == "a CAN controller":
-        (program,) = programs(CAN_CONTROLLER)
-        return program
-    return {"a UART": uart, "DMA": replaced(uart, dma), "an RTOS": replaced(uart, rtos)}[name]
+    uart, dma, rtos, can = programs(BOARD)
+    return {"a UART": uart, "DMA": replaced(uart, dma), "an RTOS": replaced(uart, rtos), "a CAN controller": can}[name]
 
 
 def replaced(program: str, functions: str) -> str:
@@ -260,6 +256,7 @@ def test_rtos_port_asks_for_room_once(rtos: Rtos) -> None:
 # ---- size
 
 
+@pytest.mark.heavy
 @pytest.mark.tools("arm-none-eabi-gcc")
 def test_port_to_a_uart_takes_the_flash_and_ram_of_the_page(tmp_path: Path) -> None:
     told = re.search(r"takes ([\d.]+) kB of flash at `-Os`, ([\d.]+) kB at `-O2`, and ([\d.]+) kB of RAM", flat(BOARD))

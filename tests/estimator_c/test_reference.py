@@ -15,19 +15,17 @@ from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
 from analogrig.run import INPUT, OUTPUT, missing_samples
-from analogrig.testing.properties.described import ROUNDING, STATISTIC_ROUNDING, THETA_ROUNDING
-from analogrig.testing.properties.test_described import DRAWN, TELLING
-from analogrig.testing.reference import cases
-from analogrig.testing.reference.cases import SpoiledRig
-from analogrig.testing.reference.comparison import Expected, expected_of
-from analogrig.testing.reference.drawn import drawn
-from analogrig.testing.reference.estimator import ReferenceEstimator
+from analogrig.testing.properties.cases import PlayedCase, SpoiledRig
 from tests.estimator_c.test_est_trigger import FRONT, suspension
+from tests.reference.cases import CASES as NAMED
+from tests.reference.comparison import ROUNDING, STATISTIC_ROUNDING, THETA_ROUNDING, Expected, expected_of
+from tests.reference.drawn import DRAWN, TELLING, drawn
+from tests.reference.estimator import ReferenceEstimator
 
 N = 900
 FEW_DRAWN = (*DRAWN[:40], *TELLING)
-"""Drawn cases; the shipped properties try them all."""
-FEW_NAMED = tuple(name for name in cases.CASES if "outliers" in name or "alarms" in name)
+"""Drawn cases; test_reference_device.py tries them all."""
+FEW_NAMED = tuple(name for name in NAMED if "outliers" in name or "alarms" in name)
 """Named cases with outliers, or with alarms in close succession, which the records of this file lack."""
 FIXED: dict[str, Any] = {"refresh_n": 0, "warm_up_n": 0}
 LOCKED: dict[str, Any] = FIXED | {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked", "forgetting": 1.0}
@@ -104,8 +102,8 @@ def test_estimator_and_reference_agree(case: str, drift: float, missing: list[in
     assert (estimator.counters["slips"], estimator.counters["refreshes"]) == (reference.slips, reference.refreshes)
 
 
-def case_of(name: str) -> cases.ReferenceCase:
-    return drawn(int(name)) if name.isdecimal() else cases.CASES[name]
+def case_of(name: str) -> PlayedCase:
+    return drawn(int(name)) if name.isdecimal() else NAMED[name]
 
 
 @functools.cache

@@ -19,8 +19,8 @@ from can.interfaces.slcan import slcanBus as SlcanBus
 from can.util import CAN_FD_DLC
 
 from analogrig.catalogue import Alarm, unpack
-from analogrig.devices.host import HOST_PROGRAM
 from analogrig.devices.library import LIBRARY
+from analogrig.devices.processes import HOST_PROGRAM
 from tests.estimator_c.shells import (
     EXTENDED,
     FD,

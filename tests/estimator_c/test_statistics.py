@@ -1,4 +1,4 @@
-"""Promises of the estimator in numbers, on a few of the cells of tests.benchmarks.bench_statistics.
+"""Promises of the estimator in numbers, on a few of the cells of tests.bench.bench_statistics.
 
 Seeds are fixed, so that a test passes or fails for good; the probabilities stated are those of another seed.
 """

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analogrig.hardware.calibration.averages import DISPLACEMENT, ProgramName, record, scenarios
-from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate, noise_free_lsb
 from analogrig.program import Program
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import COMPONENTS, PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
+from analogrig_instruments.calibration.averages import DISPLACEMENT, ProgramName, record, scenarios
+from analogrig_instruments.calibration.fit import Calibration, Pots, Stock, calibrate, noise_free_lsb
 
 _LOADS = {"M": "R1", "B": "RB", "K": "RK"}
 

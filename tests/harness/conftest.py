@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.hardware.by_hand import PlannedChange
-from analogrig.hardware.dating.instants import Instant, NoInstant, TurnInstants, date_jump, date_turn
-from analogrig.hardware.dating.two_filter import Signals
 from analogrig.judging.isolation import ISOLATION_INFORMATION
 from analogrig.plant import Plant, SampledPlant
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import Excitation
+from analogrig_instruments.by_hand import PlannedChange
+from analogrig_instruments.dating.instants import Instant, NoInstant, TurnInstants, date_jump, date_turn
+from analogrig_instruments.dating.two_filter import Signals
 
 from .plants import front
 

@@ -149,7 +149,8 @@ class DelaysAlarms(Sound):
 
     def answer(self, block: Samples) -> Answers:
         whole = super().answer(block)
-        late = tuple(dataclasses.replace(alarm, index=alarm.index + len(block)) for alarm in whole.alarms)
+        late = whole.alarms.copy()
+        late["index"] += len(block)
         return dataclasses.replace(whole, alarms=late)
 
 
@@ -313,8 +314,9 @@ class HoldsOffShortly(Sound):
 
     def answer(self, block: Samples) -> Answers:
         whole = super().answer(block)
-        again = (RaisedAlarm(alarm.index + 1) for alarm in whole.alarms if alarm.index + 1 < block.first + len(block))
-        return dataclasses.replace(whole, alarms=tuple(sorted((*whole.alarms, *again), key=lambda each: each.index)))
+        alarms = [RaisedAlarm(*each) for each in whole.alarms.tolist()]
+        again = [RaisedAlarm(each.index + 1) for each in alarms if each.index + 1 < block.first + len(block)]
+        return dataclasses.replace(whole, alarms=tuple(sorted((*alarms, *again), key=lambda each: each.index)))
 
 
 class StaysFailed(Sound):

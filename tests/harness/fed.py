@@ -31,7 +31,9 @@ def fed(dut: Device, first: int, u: ArrayLike, y: ArrayLike, missing: ArrayLike)
     assert answers.theta is not None
     assert answers.innovation is not None
     assert answers.statistic is not None
-    return Fed(answers.theta, answers.innovation, answers.statistic, answers.flags, answers.alarms, answers.diagnoses)
+    alarms = tuple(RaisedAlarm(*each) for each in answers.alarms.tolist())
+    diagnoses = tuple(ReportedDiagnosis(*each) for each in answers.diagnoses.tolist())
+    return Fed(answers.theta, answers.innovation, answers.statistic, answers.flags, alarms, diagnoses)
 
 
 def catalogue(device: Device) -> CatalogueDevice:

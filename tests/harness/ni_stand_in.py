@@ -12,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.ni_daqmx import LEVELS_PER_SAMPLE
 from analogrig_emulator import TICKS_PER_SAMPLE, Edges, Excitation, SuspensionComputer, preset
+from analogrig_instruments.ni_daqmx import LEVELS_PER_SAMPLE
 
 
 class Error(Exception):

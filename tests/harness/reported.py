@@ -75,6 +75,7 @@ def reported_verdict(run: Run) -> Verdict:
         ceiling=11.5,
         missing_n=20,
         armed_n=SAMPLES - 40,
+        after_warm_up_n=SAMPLES,
         theta_hash=run.theta_hash(),
     )
 

@@ -96,29 +96,11 @@ Answer = list[can.Message]
 """Frames of the answer to one sample."""
 
 
-class ScriptedEcu:
-    """ECU in a thread on a bus of python-can. A context manager.
+class NodeOnBus:
+    """Node in a thread on a bus of python-can. A context manager."""
 
-    ``answering`` maps the index of a sample and the frames of its answer to the frames that are sent. ``hearing`` maps
-    the number of a received frame and the frame to the frames that the ECU takes.
-    """
-
-    def __init__(
-        self,
-        channel: str,
-        config: EstimatorConfig | None = None,
-        *,
-        interface: str = "virtual",
-        answering: Callable[[int, Answer], Iterable[can.Message]] = lambda _, frames: frames,
-        hearing: Callable[[int, can.Message], Iterable[can.Message]] = lambda _, frame: (frame,),
-    ) -> None:
-        self._database: Any = cantools.database.load_string(DBC, "dbc")
+    def __init__(self, channel: str, interface: str = "virtual") -> None:
         self.bus = can.Bus(interface=interface, channel=channel)
-        self._estimator = Estimator(config)
-        self._answering, self._hearing = answering, hearing
-        self._index, self._received = 0, 0
-        self.forces: list[float] = []
-        """Forces received, in newtons."""
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
 
@@ -135,9 +117,40 @@ class ScriptedEcu:
         while not self._ends.is_set():
             frame = self.bus.recv(0.05)
             if frame is not None:
-                self._received += 1
-                for heard in self._hearing(self._received - 1, frame):
-                    self._take(heard)
+                self._receive(frame)
+
+    def _receive(self, frame: can.Message) -> None:
+        raise NotImplementedError
+
+
+class ScriptedEcu(NodeOnBus):
+    """ECU in a thread on a bus of python-can.
+
+    ``answering`` maps the index of a sample and the frames of its answer to the frames that are sent. ``hearing`` maps
+    the number of a received frame and the frame to the frames that the ECU takes.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        config: EstimatorConfig | None = None,
+        *,
+        interface: str = "virtual",
+        answering: Callable[[int, Answer], Iterable[can.Message]] = lambda _, frames: frames,
+        hearing: Callable[[int, can.Message], Iterable[can.Message]] = lambda _, frame: (frame,),
+    ) -> None:
+        super().__init__(channel, interface)
+        self._database: Any = cantools.database.load_string(DBC, "dbc")
+        self._estimator = Estimator(config)
+        self._answering, self._hearing = answering, hearing
+        self._index, self._received = 0, 0
+        self.forces: list[float] = []
+        """Forces received, in newtons."""
+
+    def _receive(self, frame: can.Message) -> None:
+        self._received += 1
+        for heard in self._hearing(self._received - 1, frame):
+            self._take(heard)
 
     def _take(self, frame: can.Message) -> None:
         values = self._database.decode_message(frame.arbitration_id, frame.data)

@@ -1,137 +1,183 @@
-"""Simulated devices that raise false alarms exactly at a given rate, independently, in bursts or periodically.
+"""Simulated devices that raise false alarms at exactly a given rate, with any dependence within a play.
 
-``SimulatedPlays`` stands in for the workers of a certificate. All devices raise their alarms on one time axis that is
-cut into plays, so that bursts may span a seam, unless their kind starts anew with each play.
+A kind is the law of the number of alarms of a play that has some. Plays are independent. Each alarm takes ``GAP_N`` of
+the samples in which the trigger is armed.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.campaigns.certificate import MOST_LONGER, Question, certify
+from analogrig.campaigns.certificate import MOST_LONGER, Question
 from analogrig.campaigns.plays import Count
+from analogrig.judging.betting import log_growth_above, log_growth_below, log_wealth, quiet_plays
 
 GAP_N = 60
-"""Samples between two alarms of a burst: the hold-off of the shipped device."""
+"""Samples between two alarms of a burst: a hold-off."""
 
-REGIME_N = 5_000
-"""Samples of a regime in which alarms are frequent."""
+MOST = 41
+"""Most alarms of a play."""
 
-Instants = NDArray[np.float64]
-Sizes = Callable[[np.random.Generator, int], NDArray[np.int64]]
-Kind = Callable[[np.random.Generator, float, int, int], Instants]
-"""Instants of the alarms from random generator, rate per sample, samples of a play, and number of plays."""
+ARMED_N = (MOST - 1) * (GAP_N + 1) + 1
+"""Armed samples of a play without an alarm. A burst of MOST alarms fills a play."""
 
+_NUMBERS = np.arange(1.0, MOST + 1.0)
 
-def in_bursts(sizes: Sizes, mean: float, gap_n: float = GAP_N, spread_n: float = 0.0) -> Kind:
-    """Bursts at independent instants; ``mean``: mean of their ``sizes``.
+CHUNK = 250
+"""Devices that are simulated together."""
 
-    Alarms of a burst are ``gap_n`` samples apart and an exponential time of mean ``spread_n``.
-    """
-
-    def draw(rng: np.random.Generator, rate: float, play_n: int, plays: int) -> Instants:
-        before_n = 200 * (gap_n + spread_n)  # bursts that began before the first play
-        length = before_n + play_n * plays
-        starts = rng.uniform(-before_n, play_n * plays, rng.poisson(rate / mean * length))
-        counts = sizes(rng, len(starts))
-        gaps = gap_n + (rng.exponential(spread_n, (len(starts), counts.max(initial=1))) if spread_n else 0.0)
-        later = np.cumsum(np.broadcast_to(gaps, (len(starts), counts.max(initial=1))), axis=1) - gap_n
-        return (starts[:, None] + later)[np.arange(later.shape[1]) < counts[:, None]]
-
-    return draw
+Kind = Callable[[float, NDArray[np.float64]], Any]
+"""Weights of the numbers 1 to MOST of alarms of a play that has some, from the mean number over all plays."""
 
 
-def _of(size: int) -> Sizes:
-    return lambda _, count: np.full(count, size)
+def _poisson(mean: float, n: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.exp(n * math.log(mean) - np.cumsum(np.log(n))))
 
 
-def _geometric(mean: float) -> Sizes:
-    return lambda rng, count: rng.geometric(1.0 / mean, count)
+def _of(size: int) -> Kind:
+    return lambda _, n: n == size
 
 
-def _branching(mean: float) -> Sizes:
-    """Sizes of bursts in which each alarm is followed by a Poisson number of others (Borel's distribution)."""
-
-    def draw(rng: np.random.Generator, count: int) -> NDArray[np.int64]:
-        last = total = np.ones(count, np.int64)
-        while last.any():
-            last = rng.poisson((1.0 - 1.0 / mean) * last)
-            total = total + last
-        return total
-
-    return draw
+def _borel(_: float, n: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bursts of five on average in which each alarm is followed by a Poisson number of others."""
+    return np.asarray(np.exp((n - 1.0) * np.log(0.8 * n) - 0.8 * n - np.cumsum(np.log(n))))
 
 
-def _periodic(rng: np.random.Generator, rate: float, play_n: int, plays: int) -> Instants:
-    return np.arange(rng.uniform(0.0, 1.0 / rate), play_n * plays, 1.0 / rate)
-
-
-def _periodic_from_start(_: np.random.Generator, rate: float, play_n: int, plays: int) -> Instants:
-    """The same period in every play, counted from its start."""
-    instants = np.arange(1.0 / rate, play_n, 1.0 / rate)
-    return (np.arange(plays)[:, None] * play_n + instants).ravel()
-
-
-def _at_seams(rng: np.random.Generator, rate: float, play_n: int, plays: int) -> Instants:
-    """Bursts of five that span the end of a play, at random ones; several may meet."""
-    ends = play_n * rng.integers(0, plays + 1, rng.poisson(rate / 5.0 * play_n * plays))
-    return (ends[:, None] + GAP_N * (np.arange(5) - rng.integers(1, 5, len(ends))[:, None])).ravel()
-
-
-def _in_regimes(rng: np.random.Generator, rate: float, play_n: int, plays: int) -> Instants:
-    """A tenth of the alarms on their own, the others in rare regimes of five alarms on average."""
-    length = play_n * plays
-    alone = rng.uniform(0.0, length, rng.poisson(0.1 * rate * length))
-    starts = rng.uniform(-REGIME_N, length, rng.poisson(0.9 * rate / 5.0 * (length + REGIME_N)))
-    numbers = rng.poisson(5.0, len(starts))
-    return np.concatenate((alone, np.repeat(starts, numbers) + rng.uniform(0.0, REGIME_N, numbers.sum())))
+def _regimes(_: float, n: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A tenth of the alarms alone, the others in regimes of five on average."""
+    regimes = _poisson(5.0, n) / _poisson(5.0, n).sum()
+    return np.asarray(0.1 * (n == 1) + 0.9 * regimes / (regimes @ n))
 
 
 COVERED: Mapping[str, Kind] = {
-    "independent": in_bursts(_of(1), 1.0),
-    "bursts of two": in_bursts(_of(2), 2.0),
-    "bursts of five": in_bursts(_of(5), 5.0),
-    "geometric bursts of five on average": in_bursts(_geometric(5.0), 5.0),
-    "an alarm after each alarm with probability 0.8, 500 samples later": in_bursts(_geometric(5.0), 5.0, 0.0, 500.0),
-    "bursts of five across the seams of plays": _at_seams,
-    "rare regimes of five alarms on average, a tenth of the alarms outside": _in_regimes,
-    "periodic": _periodic,
-    "periodic from the start of each play": _periodic_from_start,
+    "independent": _poisson,
+    "bursts of two": _of(2),
+    "bursts of five": _of(5),
+    "geometric bursts of five on average": lambda _, n: 0.8**n,
+    "rare regimes of five alarms on average, a tenth of the alarms outside": _regimes,
+    "at most one alarm in a play": _of(1),
 }
-"""Kinds of alarms that the assumption of a certificate covers."""
+"""Kinds of alarms that bursts of five on average cover."""
 
 BEYOND: Mapping[str, Kind] = {
-    "bursts of twenty, not covered": in_bursts(_of(20), 20.0),
-    "0.8 alarms after each alarm on average, Poisson, not covered": in_bursts(_branching(5.0), 5.0),
+    "bursts of twenty": _of(20),
+    "0.8 alarms after each alarm on average, Poisson": _borel,
+    "90 % single alarms, 10 % bursts of 41": lambda _, n: 0.9 * (n == 1) + 0.1 * (n == MOST),
+    "all alarms in a tenth of the plays": lambda mean, n: _poisson(10.0 * mean, n),
+    "all alarms in a thousandth of the plays": lambda mean, n: _poisson(1000.0 * mean, n),
+    "alarms to the end of the play from a random instant on": lambda _, n: np.ones_like(n),
+    "sizes of bursts with a tail of power 1.5": lambda _, n: n**-1.5,
 }
-"""Kinds of alarms that it does not cover."""
+"""Kinds of alarms that they do not cover."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """Law of the number of alarms of a play at a given rate per armed sample."""
+
+    kind: Kind
+    rate: float
+
+    @functools.cached_property
+    def mean(self) -> float:
+        """Mean number of alarms of a play: the rate times its mean exposure."""
+        mean = self.rate * ARMED_N
+        for _ in range(8):  # the exposure depends on the alarms, little
+            weights = self._weights(mean)
+            chance = mean / float(weights @ _NUMBERS)
+            mean = self.rate * (ARMED_N - chance * float(weights @ (ARMED_N - exposure_n(_NUMBERS))))
+        return mean
+
+    @property
+    def chance(self) -> float:
+        """Probability that a play has an alarm."""
+        return self.mean / float(self._weights(self.mean) @ _NUMBERS)
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Numbers of alarms of plays that have some."""
+        return 1 + np.searchsorted(np.cumsum(self._weights(self.mean))[:-1], rng.random(shape), side="right")
+
+    def _weights(self, mean: float) -> NDArray[np.float64]:
+        weights = np.asarray(self.kind(mean, _NUMBERS), np.float64)
+        return np.asarray(weights / weights.sum())
+
+
+def exposure_n(alarms: NDArray[Any]) -> NDArray[Any]:
+    """Armed samples of plays with so many alarms."""
+    return np.asarray(ARMED_N - GAP_N * np.maximum(alarms - 1, 0))
+
+
+@dataclass(frozen=True)
+class Betted:
+    """Plays until the test by betting certifies and refutes each simulated device; infinite where it does not."""
+
+    certified: NDArray[np.float64]
+    refuted: NDArray[np.float64]
+
+
+def bet(law: Law, far: float, confidences: Sequence[float], devices: int) -> list[Betted]:
+    """Outcomes of tests by betting of so many devices, one for each confidence; a fixed seed.
+
+    All of them go on until the one of the highest confidence gives up.
+    """
+    rng, plays = np.random.default_rng(0), MOST_LONGER * quiet_plays(far, max(confidences), MOST, ARMED_N)
+    parts = [_bet(law, far, confidences, rng, int(plays)) for _ in range(-(-devices // CHUNK))]
+    return [
+        Betted(*(np.concatenate(column)[:devices] for column in zip(*each, strict=True)))
+        for each in zip(*parts, strict=True)
+    ]
+
+
+def _bet(
+    law: Law, far: float, confidences: Sequence[float], rng: np.random.Generator, plays: int
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Only plays with an alarm are drawn. Between two of them the wealth against a high rate only grows."""
+    mean = plays * law.chance
+    places = np.cumsum(rng.geometric(law.chance, (CHUNK, int(mean + 8.0 * math.sqrt(mean) + 20.0))), axis=1)
+    alarms, device, number = law.draw(rng, places.shape), np.arange(CHUNK), np.arange(MOST + 1)
+    quiet = (np.minimum(places, plays + 1) - 1 - np.arange(places.shape[1]))[..., None]
+    growth = log_growth_below(far, number, exposure_n(number), MOST)
+    before = np.cumsum(growth[alarms], axis=1) - growth[alarms]
+    high = log_wealth(before + quiet * growth[0])
+    loss = log_growth_above(far, number, exposure_n(number), ARMED_N)
+    low = np.where(places <= plays, log_wealth(np.cumsum(loss[alarms], axis=1) + quiet * loss[0]), -np.inf)
+    found = []
+    for limit in (-math.log1p(-each) for each in confidences):
+        first, last = (high >= limit).argmax(axis=1), (low >= limit).argmax(axis=1)
+        needed = first + _least_quiet(before[device, first], growth[0], limit, plays)
+        certified = np.where(high[device, first] >= limit, needed, np.inf)
+        found.append((certified, np.where(low[device, last] >= limit, places[device, last], np.inf)))
+    return found
+
+
+def _least_quiet(
+    before: NDArray[np.float64], growth: NDArray[np.float64], limit: float, plays: int
+) -> NDArray[np.float64]:
+    """Fewest plays without an alarm after which the joint wealth is enough, by bisection."""
+    low, high = np.zeros(len(before)), np.full(len(before), float(plays))
+    for _ in range(math.ceil(math.log2(plays)) + 1):
+        middle = np.floor(0.5 * (low + high))
+        enough = log_wealth(before + middle[:, None] * growth) >= limit
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    return high
 
 
 class SimulatedPlays:
     """Counts of the plays of one simulated device, in place of workers that play."""
 
     def __init__(self, question: Question, kind: Kind, rate: float, seed: int) -> None:
-        self._question = question
-        self._kind = kind
-        self._rate = rate
-        self._rng = np.random.default_rng(seed)
+        self._batch, self._law, self._rng = question.batch, Law(kind, rate), np.random.default_rng(seed)
 
-    def play(self, work: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
-        """Yield as many counts as the certificate may need; ``work`` is its ``count_run``."""
-        (case,) = work.args
-        armed_n = case.scenario.samples - self._question.datasheet.warm_up_n
-        plays = math.ceil(MOST_LONGER * self._question.design_n / armed_n) + 1
-        instants = self._kind(self._rng, self._rate, armed_n, plays)
-        alarms = np.histogram(instants, bins=np.arange(plays + 1) * armed_n)[0]
-        return zip(tasks, (Count(int(each), armed_n) for each in alarms), strict=False)
-
-
-def certificates(question: Question, kind: Kind, rate: float, devices: int) -> Counter[str]:
-    """Outcomes of the certificates of so many simulated devices; seeds from 0 on."""
-    return Counter(certify(question, SimulatedPlays(question, kind, rate, seed)).outcome for seed in range(devices))
+    def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+        """Yield batches of counts for ever."""
+        for task in tasks:
+            alarms = self._law.draw(self._rng, (self._batch,)) * (self._rng.random(self._batch) < self._law.chance)
+            armed = exposure_n(alarms)
+            yield task, [Count(int(each), int(n)) for each, n in zip(alarms, armed, strict=True)]

@@ -11,7 +11,7 @@ import pytest
 from analogrig.catalogue import Change
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import judge
-from analogrig.run import Run
+from analogrig.run import LOST, UNREPORTED, Run
 from tests.harness.runs import ESTIMATOR, made_run
 
 from .plants import front
@@ -19,7 +19,7 @@ from .plants import front
 FRONT = front(115.0, 3021.0, 24500.0)
 SOFT = front(115.0, 3021.0, 18000.0)
 LOADED = np.full(800, 2900.0)
-GOOD_THETA = np.tile([-1.7503, 0.769, 0.0, 0.0575, 0.0527, 0.0], (800, 1))
+GOOD_THETA = np.tile([-1.7503, 0.769, 0.0, 0.00587, 0.00538, 0.0], (800, 1))
 """Thesis Equ 4.8, in codes of the runs made by hand, nearly."""
 
 
@@ -97,6 +97,14 @@ def test_change_within_the_warm_up_is_named() -> None:
 
 def test_implausible_estimate_is_named() -> None:
     assert "samples 0-799 describes no plant" in advised(made_run(LOADED, [(0, FRONT)]))
+
+
+@pytest.mark.parametrize("flag", [UNREPORTED, LOST])
+def test_estimate_that_was_never_reported_is_not_called_implausible(flag: int) -> None:
+    run = made_run(LOADED, [(0, FRONT)])
+    text = advised(dataclasses.replace(run, flags=np.full(800, flag, np.uint8)))
+    assert "no estimate until the end of samples 0-799" in text
+    assert "describes no plant" not in text
 
 
 @pytest.mark.parametrize(("frequency_hz", "told"), [(20.0, True), (200.0, False)])

@@ -16,14 +16,13 @@ from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig, write_rep
 from analogrig.answers import Answers, RaisedAlarm, Samples
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import Datasheet, ModelOrders
-from analogrig.devices.adapted import AdaptedDescription
-from analogrig.devices.device import Device
+from analogrig.devices.device import AdaptedDescription, Device
 from analogrig.devices.estimator import Estimator
+from analogrig.devices.pace import Pace
 from analogrig.errors import DeviceRefused, RecordingError
 from analogrig.judging.advice import advice
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, STATISTIC, as_json
-from analogrig.protocol.pace import Pace
 from analogrig.reporting.summary import summary
 from analogrig.run import UNARMED
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.benchmarks import bench_detectors, pages
-from tests.benchmarks.bench_detectors import CALIBRATION_SEED, QUICK, _arl0, _bench, _first_alarms, _play_change
-from tests.benchmarks.detectors import CANDIDATES, CHANGES
+from tests.bench import bench_detectors, pages
+from tests.bench.bench_detectors import CALIBRATION_SEED, QUICK, _arl0, _bench, _first_alarms, _play_change
+from tests.bench.detectors import CANDIDATES, CHANGES
 
 PRESENT = [name for name, candidate in CANDIDATES.items() if not candidate.missing]
 

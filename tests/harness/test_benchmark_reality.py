@@ -11,7 +11,7 @@ import pytest
 from scipy import signal, stats
 from scipy.linalg import toeplitz
 
-from analogrig.bench import direct_bench
+from analogrig.campaigns.together import direct_bench
 from analogrig.catalogue import SteppedFlag
 from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import EstimatorConfig
@@ -20,15 +20,17 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
-from tests.benchmarks import __main__ as benchmarks
-from tests.benchmarks import bench_reality, bench_statistics, silverbox
-from tests.benchmarks.bench_reality import Effort, Healthy, delays_of
-from tests.benchmarks.conditions import CONDITIONS
-from tests.benchmarks.false_alarms import CLUSTER_N, FalseAlarms, count_false_alarms
-from tests.benchmarks.played import Change, accumulate
-from tests.benchmarks.shipped import Misfit, answers_to, exposure_n, shipped
+from tests.bench import __main__ as benchmarks
+from tests.bench import bench_reality, bench_statistics, silverbox
+from tests.bench.bench_reality import Effort, Healthy, delays_of
+from tests.bench.conditions import CONDITIONS
+from tests.bench.false_alarms import CLUSTER_N, FalseAlarms, count_false_alarms
+from tests.bench.played import Change, accumulate
+from tests.bench.shipped import Misfit, answers_to, exposure_n, shipped
 from tests.estimator_c.performance import FULL
 from tests.estimator_c.plants import FRONT, PERIOD_S, plants_of_any_speed
+
+pytestmark = pytest.mark.heavy
 
 SAMPLES, CHANGE = 500, Change("K", 1.2, 420)
 

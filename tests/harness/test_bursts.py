@@ -9,14 +9,12 @@ import pytest
 from scipy import stats
 
 from analogrig.judging.bursts import (
-    ConfidenceSequence,
     Design,
     bound_rate,
     dispersion,
     lower_count,
     upper_count,
 )
-from analogrig.judging.statistics import Decision
 
 
 @pytest.mark.parametrize(
@@ -100,50 +98,6 @@ def test_many_plays_are_merged_and_show_the_same_dispersion() -> None:
     assert dispersion([1, 0], [9, 9]).burst == dispersion([], []).burst == 1.0
 
 
-def test_confidence_sequence_keeps_its_coverage_at_all_times() -> None:
-    """Evaluate the bounds after every five trials, where bounds for a fixed length would fail far more often."""
-    rng = np.random.default_rng(11)
-    left = left_fixed = 0
-    for _ in range(40):
-        sequence = ConfidenceSequence(0.9, burst=1.0)
-        outside = outside_fixed = False
-        for events in rng.binomial(5, 0.1, 30).tolist():
-            low, high = sequence.add(5, events)
-            outside |= not low <= 0.1 <= high
-            fixed = (bound(sequence.events, 0.95) / sequence.trials for bound in (lower_count, upper_count))
-            outside_fixed |= not next(fixed) <= 0.1 <= next(fixed)
-        left += outside
-        left_fixed += outside_fixed
-    assert left <= 40 * 0.1 + 4.7 * math.sqrt(40 * 0.09)
-    assert left_fixed > 2 * left
-
-
-@pytest.mark.parametrize("burst", [1.0, 2.0, 5.0])
-def test_confidence_sequence_keeps_its_error_on_each_side_for_events_in_bursts(burst: float) -> None:
-    """1000 series of 300 trials with geometric bursts: 5 % on either side at 90 %; binomial, false failure 1e-6."""
-    rng, rate = np.random.default_rng(12), 0.2
-    bursts = rng.poisson(rate / burst, (1000, 300))
-    events = bursts + np.where(bursts > 0, rng.negative_binomial(np.maximum(bursts, 1), 1.0 / burst), 0)
-    wrong = dict.fromkeys(Decision, 0)
-    for series in events.cumsum(axis=1)[:, 9::10]:
-        looks = [ConfidenceSequence(0.9, burst, 10 * i + 10, int(n)).decision(rate) for i, n in enumerate(series)]
-        wrong[next((each for each in looks if each is not Decision.OPEN), Decision.OPEN)] += 1
-    assert max(wrong[Decision.BELOW], wrong[Decision.ABOVE]) <= stats.binom.isf(1e-6, 1000, 0.05)
-    assert wrong[Decision.BELOW] > 0
-
-
-@pytest.mark.parametrize("events", [0, 3, 400])
-def test_decision_is_on_which_side_of_the_bounds_the_rate_lies(events: int) -> None:
-    sequence = ConfidenceSequence(0.999, trials=100_000, events=events)
-    low, high = sequence.bounds
-    assert sequence.decision(1.001 * high) is Decision.BELOW
-    assert sequence.decision(0.999 * high) is Decision.OPEN
-    if low:
-        assert sequence.decision(1.001 * low) is Decision.OPEN
-        assert sequence.decision(0.999 * low) is Decision.ABOVE
-    assert ConfidenceSequence(0.999).bounds == (0.0, 1.0)
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -153,7 +107,7 @@ def test_decision_is_on_which_side_of_the_bounds_the_rate_lies(events: int) -> N
         (lambda: Design(0.0, 0.9), "rate must be between 0 and 1, not 0"),
         (lambda: bound_rate([0], [0], 0.9), "there must be at least one trial"),
         (lambda: bound_rate([2], [1], 0.9), "there cannot be 2 events in 1 trials"),
-        (lambda: ConfidenceSequence(0.9, math.nan), "burst must be 1 or more, not nan"),
+        (lambda: upper_count(0, 0.9, math.nan), "burst must be 1 or more, not nan"),
     ],
 )
 def test_values_out_of_range_are_refused(call: object, message: str) -> None:

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from analogrig.hardware import by_hand
-from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
-from analogrig.hardware.dating.two_filter import Signals
-from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import VirtualClock
 from analogrig.plant import Plant
 from analogrig.scenario import PotChange
+from analogrig_instruments import by_hand
+from analogrig_instruments.by_hand import HandChanges, PlannedChange, contradictions
+from analogrig_instruments.dating.two_filter import Signals
+from analogrig_instruments.instrument import Pots
 from tests.harness.dating_trials import FRONT, Clock, Several, play, scenario_of
 
 RATE_HZ = 20e3

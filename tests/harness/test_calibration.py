@@ -16,9 +16,14 @@ import pytest
 
 from analogrig import config
 from analogrig.cli import main
-from analogrig.cli.calibrate import _said
 from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.calibration.averages import (
+from analogrig.plant import Plant
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
+from analogrig.run import Channel
+from analogrig_emulator import CHANNELS, Card, Excitation, SuspensionComputer, acquired, probes_per_sample
+from analogrig_instruments.calibration.averages import (
     DISPLACEMENT,
     FORCE,
     SquareWaveRecording,
@@ -29,7 +34,7 @@ from analogrig.hardware.calibration.averages import (
     rounding_variance,
     scenarios,
 )
-from analogrig.hardware.calibration.fit import (
+from analogrig_instruments.calibration.fit import (
     Calibration,
     EmulatorModel,
     Pots,
@@ -37,12 +42,7 @@ from analogrig.hardware.calibration.fit import (
     _late_displacement,
     calibrate,
 )
-from analogrig.plant import Plant
-from analogrig.rigs.description import open_rig
-from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import Channel
-from analogrig_emulator import CHANNELS, Card, Excitation, SuspensionComputer, acquired, probes_per_sample
+from analogrig_instruments.commands.calibrate import _said
 from tests.harness.calibration_rigs import calibrate_rig, draw_rig, rms_lsb, thesis_profile, truth
 from tests.harness.plants import front
 

@@ -99,13 +99,15 @@ def test_what_the_configuration_says_for_other_interfaces_is_left_out(monkeypatc
     ("interface", "key"),
     [
         ("kvaser", "single_handle"),
+        ("kvaser", "device_name"),
         ("slcan", "btr"),
+        ("socketcan", "local_loopback"),
         ("vector", "app_name"),
         ("pcan", "nom_tseg1"),
         ("virtual", "protocol"),
     ],
 )
-def test_key_that_a_constructor_looks_up_is_known(interface: str, key: str) -> None:
+def test_key_of_an_interface_is_known(interface: str, key: str) -> None:
     """python-can's documentation has it, whether or not it is among the parameters."""
     assert complete_config({"interface": interface, key: 1})[key] == 1
 

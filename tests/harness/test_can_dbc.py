@@ -20,8 +20,7 @@ from analogrig.answers import Samples
 from analogrig.bench import Bench
 from analogrig.cli import main
 from analogrig.devices.can_dbc import CanDbcDevice
-from analogrig.devices.opening import open_dut
-from analogrig.devices.registry import describe
+from analogrig.devices.registry import describe, open_dut
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout, RecordingError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
@@ -170,7 +169,8 @@ def with_data(frame: can.Message, data: bytes) -> can.Message:
 
 
 def cut(frame: can.Message) -> tuple[can.Message, ...]:
-    return (with_data(frame, bytes(frame.data[:-1])),)
+    """The counter is in byte 1."""
+    return (with_data(frame, bytes(frame.data[:1])),)
 
 
 def recounted(frame: can.Message) -> tuple[can.Message, ...]:
@@ -370,8 +370,15 @@ def test_latched_fault_is_one_alarm(file: Path) -> None:
         return [*frames[:-1], with_data(frames[-1], bytes(data))]
 
     assert played(file, answering=answering).alarm_index.tolist() == [AT, AT + 1, AT + 2]
-    changed(file, ("[start]", 'alarm_is = "level"\n[start]'))
+    described = file.read_text()
+    for level in ("[start]", 'alarm_is = "level"\n[start]'), ("[start]", "alarm_is = [1, 7]\n[start]"):
+        changed(file, level)
+        assert played(file, answering=answering).alarm_index.tolist() == [AT]
+        file.write_text(described)
+    file.write_text(f'alarm_is = "level"\n{described}')
     assert played(file, answering=answering).alarm_index.tolist() == [AT]
+    file.write_text(f"alarm_is = [7]\n{described}")
+    assert played(file, answering=answering).alarm_index.tolist() == []
 
 
 def test_armed_and_missing_samples_travel(file: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-import signal
 import socket
 import threading
 from pathlib import Path
@@ -20,21 +19,15 @@ from analogrig.catalogue import Counter
 from analogrig.cli import main
 from analogrig.devices.can import CanDevice
 from analogrig.devices.device import Device
-from analogrig.devices.host import HostDevice
 from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.opening import open_dut, reopen_dut
-from analogrig.devices.registry import describe, from_table
-from analogrig.errors import ConfigurationError, DeviceError, LinkClosed, LinkError
+from analogrig.devices.registry import describe, from_table, open_dut, reopen_dut
+from analogrig.errors import ConfigurationError, DeviceError, LinkError
 from analogrig.judging.verdict import judge
-from analogrig.protocol.bus_load import load_of
-from analogrig.reporting.summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
-from tests.harness.fault_runs import DISPLACEMENT, ESTIMATOR, FORCE, N, reference
 from tests.harness.fed import catalogue, fed
-from tests.harness.firmware import needs_firmware
-from tests.harness.processes import children
+from tests.soak.fault_runs import DISPLACEMENT, ESTIMATOR, FORCE, N, reference
 
 # ---- names
 
@@ -79,10 +72,10 @@ def test_bus_is_named_with_what_python_can_is_to_be_told(name: str, expected: di
         ("can:virtual?device=bob", "device: must be one of 'none', 'inproc', 'host', not 'bob'"),
         ("can:virtual?device=host", "a host process needs SocketCAN, not virtual: use inproc"),
         ("can:virtual?data_bitrate=2000000", "data_bitrate is for CAN FD: set fd = true and bitrate as well"),
-        ("host?link=can", "link must be 'serial' or 'slcan', not 'can'"),
-        ("inproc?link=slcan", "link must be 'serial' or 'can', not 'slcan'"),
-        ("host?bitrate=1000000", "bitrate and fd are for a CAN bus: set link = 'slcan'"),
-        ("host?link=slcan&baud=9600", "baud is for a serial line, and link is 'slcan': set bitrate"),
+        ("host?link=can", "unknown key 'link'"),
+        ("inproc?link=slcan", "link: must be one of 'serial', 'can', not 'slcan'"),
+        ("inproc?bitrate=1000000", "bitrate and fd are for a CAN bus: set link = 'can'"),
+        ("inproc?link=can&baud=9600", "baud is for a serial line, and link is 'can': set bitrate"),
         ("host?foo=1", "unknown key 'foo'"),
         ("host:there", "a device of the kind host has no 'there'"),
         ("can:virtual?wire_faults=flip@to:1", "'flip@to:1' is not KIND@to:FRAME"),
@@ -156,13 +149,9 @@ def test_device_that_cannot_be_on_the_bus_of_the_configuration_is_refused() -> N
 
 
 @pytest.mark.usefixtures("_configured")
-def test_bit_rate_of_the_configuration_is_in_the_record_and_in_the_load() -> None:
-    """At most 135 bits a frame (Davis et al. 2007), nine of them for each of 20,000 samples/s."""
+def test_bit_rate_of_the_configuration_is_in_the_record() -> None:
     run = play(describe("can:"), scenario=dataclasses.replace(THESIS, samples=56, tweaks=()))
     assert run.conditions.line == {"bitrate": 250_000, "samples_per_message": 1, "window": 1}
-    load = load_of(run)
-    assert load is not None and load.utilisation == pytest.approx(9 * 135 / 250_000 * 20_000)
-    assert "  bus: 250000 bit/s: 97.2 times what it carries," in summary(run, judge(run))
 
 
 @pytest.mark.usefixtures("_configured")
@@ -170,12 +159,6 @@ def test_real_time_that_does_not_fit_the_bus_of_the_configuration_is_refused() -
     said = "need 97.2 times the capacity of 250000 bit/s"
     with open_rig("emulator") as rig, open_dut("can:") as dut, pytest.raises(ConfigurationError, match=said):
         Bench(rig, dut, real_time=1.0).play(THESIS, seed=1)
-
-
-@pytest.mark.usefixtures("_configured")
-def test_device_at_a_terminal_does_not_mind_the_configuration_of_other_buses() -> None:
-    with open_dut("host?link=slcan") as dut:
-        assert "bitrate" not in dut.line
 
 
 # ---- the same to the bit
@@ -211,8 +194,6 @@ def free_port() -> int:
         "can:virtual?fd=1&exchange=stream",
         "can:udp_multicast/239.74.163.2?device=inproc&port=PORT",
         "can:udp_multicast/239.74.163.2?device=inproc&port=PORT&fd=1&exchange=stream",
-        "host?link=slcan&fd=1&exchange=stream",
-        pytest.param("qemu-m4?link=slcan&fd=1&exchange=block", marks=needs_firmware),
     ],
 )
 def test_theta_is_that_of_a_serial_line(name: str) -> None:
@@ -231,21 +212,6 @@ def feed(dut: Device) -> None:
     replies = fed(dut, 0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
     assert np.array_equal(replies.theta, reference(N, ()).theta)
     dut.stop()
-
-
-@pytest.mark.parametrize("bitrate", [10_000, 1_000_000])
-def test_classic_frames_pass_an_slcan_adapter_of_any_bit_rate(bitrate: int) -> None:
-    with HostDevice(name="bob", link="slcan", bitrate=bitrate, estimator=ESTIMATOR).connect() as dut:
-        feed(dut)
-
-
-def test_slcan_device_that_dies_is_told_for_what_it_is() -> None:
-    with HostDevice(name="bob", link="slcan", estimator=ESTIMATOR).connect() as dut:
-        feed(dut)
-        (pid,) = children(dut._talk.link.bus.child.tether_pid)  # type: ignore[attr-defined]
-        os.kill(pid, signal.SIGKILL)
-        with pytest.raises(LinkClosed, match="^device bob: the device process ended with status -9"):
-            catalogue(dut).identity()
 
 
 # ---- what a bus can carry

@@ -10,12 +10,12 @@ import pytest
 from analogrig.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
 from analogrig.devices.can_nodes import MemoryBus
 from analogrig.devices.catalogue_device import CatalogueDevice
+from analogrig.devices.exchange import Conversation
 from analogrig.devices.inproc import InprocDevice
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
 from analogrig.links.can_link import CanLink
 from analogrig.links.line import CanLine
 from analogrig.links.wire import VirtualClock
-from analogrig.protocol.conversation import Conversation
 
 SAMPLE = Sample(7, 0, 513, 1000, 2000)
 ESTIMATE = Estimate(3, 1, 513, 0.5)

@@ -20,7 +20,7 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.catalogue import LAYOUTS, Command, Controlled, Hello, Key, Result, pack, unpack
 from analogrig.cli import main
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
@@ -137,29 +137,6 @@ def test_asammdf_decodes_a_measurement_with_our_dbc(tmp_path: Path, traffic: tup
     with asammdf.MDF(log) as raw, raw.extract_bus_logging({"CAN": [(str(DBC), 0)]}) as decoded:
         force = decoded.get("Force").samples
     np.testing.assert_array_equal(force, run.codes[:, 0])
-
-
-def test_asammdf_is_not_imported_before_a_measurement_is_written(tmp_path: Path) -> None:
-    """Importing pandas takes longer than a run."""
-    pytest.importorskip("asammdf", reason="asammdf is absent: pip install analogrig[mf4]")
-    told = """
-import sys
-from pathlib import Path
-from analogrig.links.python_can import can
-from analogrig.recordings import CanLog, CapturedFrames
-frame = can.Message(arbitration_id=0x18, is_extended_id=False, data=b"12345678", is_rx=False)
-def is_there():
-    return not {"asammdf", "pandas"}.isdisjoint(sys.modules)
-for suffix in ("log", "mf4"):
-    print(is_there())
-    log = CanLog(Path(sys.argv[1], f"can.{suffix}"))
-    log.begin()
-    log(frame)
-    log.close()
-with can.LogReader(log.path) as users:
-    print(*(bytes(each.data) for each in [*CapturedFrames(log.path), *users]), is_there())
-"""
-    assert ran("-c", told, str(tmp_path)).splitlines() == ["False", "False", "b'12345678' b'12345678' True"]
 
 
 # ------------------------------------------------------------------------------------------------------- what it was
@@ -438,11 +415,11 @@ def test_damaged_lines_are_skipped_and_counted(tmp_path: Path, traffic: tuple[Ru
     lines[5:5] = [
         "",
         "hello",
-        "(1.0) can0",
-        "(1.0) can0 018#0",
-        "(x) can0 018#00 R",
+        "(1.0) vcan0",
+        "(1.0) vcan0 018#0",
+        "(x) vcan0 018#00 R",
         "\x00\xff\x7f",
-        "(1.0) can0 GGG#00 T",
+        "(1.0) vcan0 GGG#00 T",
     ]
     log.write_text("\n".join(lines), encoding="latin-1")
     reader = CapturedFrames(log)
@@ -497,7 +474,7 @@ def test_runs_without_samples_take_no_memory(tmp_path: Path, traffic: tuple[Run,
         with log.open("a") as file:
             for i in range(starts):
                 started = pack(Controlled(i % 256, Command.START, 0, Result.APPLIED, i % 8))
-                file.write(f"({i}.0) can0 {started[0]:03X}#{started[1:].hex()}\n")
+                file.write(f"({i}.0) vcan0 {started[0]:03X}#{started[1:].hex()}\n")
         tracemalloc.start()
         with pytest.raises(RecordingError, match="holds no run of a device"):
             captured(log)
@@ -604,7 +581,6 @@ def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
     assert main(["run", "--dut", DEVICE, "--out", str(out)]) == 0
     first = capsys.readouterr().out
     (digest,) = [line for line in first.splitlines() if "theta hash" in line]
-    assert "bus: 1000000 bit/s: 24.3 times what it carries, in real time; at most 823.05 samples/s" in first
     assert {path.name for path in out.iterdir()} == {"can.log", "run.npz", "report.html", "verdict.json"}
     log = str(out / "can.log")
     for words in (["judge", log], ["judge", str(out / "run.npz")], ["replay", log, "--dut", "inproc"]):

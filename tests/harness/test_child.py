@@ -15,7 +15,7 @@ import pytest
 from analogrig.catalogue import CATALOGUE_HASH, Hello, Identify
 from analogrig.devices import child as child_module
 from analogrig.devices.child import TETHER, Child, ChildWire
-from analogrig.devices.host import host_wire
+from analogrig.devices.processes import host_wire
 from analogrig.errors import LinkClosed, LinkError
 from analogrig.links.link import FramedLink, Link
 from tests.harness.processes import LONG_S, children, ends
@@ -147,7 +147,7 @@ def test_of_a_program_that_never_stops_talking_the_last_words_are_kept() -> None
 @pytest.mark.parametrize("stopped", [False, True])
 def test_process_does_not_outlive_a_killed_parent(*, stopped: bool) -> None:
     parent = (
-        "import os, signal; from analogrig.devices.host import host_wire;"
+        "import os, signal; from analogrig.devices.processes import host_wire;"
         " from tests.harness.processes import children; wire = host_wire();"
         " (pid,) = children(wire.child.tether_pid); print(pid, flush=True);"
         f" {stopped} and os.kill(pid, signal.SIGSTOP); os.kill(os.getpid(), signal.SIGKILL)"

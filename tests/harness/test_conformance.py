@@ -120,6 +120,7 @@ def finding(fault: str) -> str:
     return f"{test}[faulty:{fault}{'-' if rest else ']'}{rest}"
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("_site")
 def test_suite_finds_every_fault(pytester: pytest.Pytester) -> None:
     wanted = [finding(name) for name, cls in FAULTS.items() if cls.found_by]

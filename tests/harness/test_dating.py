@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.hardware.dating.instants import (
+from analogrig.plant import Plant, SampledPlant
+from analogrig_emulator import COMPONENTS, Excitation, PotTurn, SuspensionComputer
+from analogrig_instruments.dating.instants import (
     Instant,
     NoInstant,
     TurnInstants,
@@ -21,7 +23,7 @@ from analogrig.hardware.dating.instants import (
     date_turn,
     interval,
 )
-from analogrig.hardware.dating.two_filter import (
+from analogrig_instruments.dating.two_filter import (
     BackwardFilter,
     EdgePlace,
     ForwardFilter,
@@ -30,8 +32,6 @@ from analogrig.hardware.dating.two_filter import (
     Signals,
     join,
 )
-from analogrig.plant import Plant, SampledPlant
-from analogrig_emulator import COMPONENTS, Excitation, PotTurn, SuspensionComputer
 from tests.harness.dating_trials import FRONT, Trial, play, scenario_of, still
 
 from .plants import front

@@ -15,15 +15,16 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.answers import Samples
-from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_bench
+from analogrig.bench import Bench
+from analogrig.campaigns.repeated import DIRECT_BLOCK_SAMPLES
+from analogrig.campaigns.together import can_be_direct, direct_bench, judge_all, models_of
 from analogrig.devices.estimator import Estimator
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import FIXED_LIBRARY, LIBRARY, WIDE_LIBRARY, estimator_library_for
-from analogrig.devices.opening import open_dut
-from analogrig.devices.registry import describe
+from analogrig.devices.registry import describe, open_dut
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging import information
-from analogrig.judging.verdict import judge, judge_all
+from analogrig.judging.verdict import judge
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
@@ -121,7 +122,7 @@ def test_rig_that_fails_within_a_play_ends_the_run_and_not_the_bench(monkeypatch
 
 def test_length_of_blocks_changes_no_code() -> None:
     rig, scenario = emulator("emulator-real"), Scenario.load("thesis")
-    parts = [[block.codes for block in rig.in_blocks(n).perform(scenario, 5).blocks] for n in (64, 5000)]
+    parts = [[block.codes for block in EmulatorRig(rig.described, n).perform(scenario, 5).blocks] for n in (64, 5000)]
     assert np.concatenate(parts[0]).tobytes() == np.concatenate(parts[1]).tobytes()
 
 
@@ -170,7 +171,7 @@ def test_runs_of_any_program_are_judged_together_by_the_courses_of_each_to_the_b
     runs = bench.play_all(scenario, range(3))
     assert [run.theta_hash() for run in runs] == [bench.play(scenario, seed).theta_hash() for seed in range(3)]
     assert judge_all(runs) == [judge(run) for run in runs]
-    for run, model in zip(runs, information.models_of(runs), strict=True):
+    for run, model in zip(runs, models_of(runs), strict=True):
         shared, alone = (information.change_information(run, each) for each in (model, None))
         assert len(shared) == len(scenario.tweaks)
         assert [each.tobytes() for each in shared] == [each.tobytes() for each in alone]
@@ -192,7 +193,8 @@ def test_runs_of_several_kinds_are_judged_each_by_its_own_conditions() -> None:
 
 
 def test_any_device_answers_whole_records_as_in_plays_of_their_own() -> None:
-    blocks = [block for seed in (1, 2) for block in emulator("emulator").in_blocks(500).perform(SHORT, seed).blocks]
+    rig = EmulatorRig(emulator("emulator").described, 500)
+    blocks = [block for seed in (1, 2) for block in rig.perform(SHORT, seed).blocks]
     records = [block.samples() for block in blocks]
     with open_dut("inproc", exchange="block") as line, describe("inproc").direct() as direct:
         for (ours, counted), (theirs, its) in zip(
@@ -266,7 +268,7 @@ def test_plays_take_their_memory_from_the_plays_before(variables: dict[str, str]
 
 _PAGES_OF_FIVE_BATCHES = """
 import dataclasses, resource
-from analogrig.bench import direct_bench
+from analogrig.campaigns.together import direct_bench
 from analogrig.devices.registry import describe
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario

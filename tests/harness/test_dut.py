@@ -7,6 +7,7 @@ import itertools
 import os
 import signal
 import subprocess
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -42,15 +43,13 @@ from analogrig.catalogue import (
 from analogrig.devices.can_nodes import MemoryBus
 from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.child import ChildWire
-from analogrig.devices.description import DeviceDescription
-from analogrig.devices.device import Device
+from analogrig.devices.device import Device, DeviceDescription
 from analogrig.devices.estimator import Estimator
-from analogrig.devices.host import HostDevice, host_wire
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
-from analogrig.devices.opening import open_dut, reopen_dut
-from analogrig.devices.registry import describe, from_table
-from analogrig.devices.serial import SerialDevice
+from analogrig.devices.port import SerialDevice
+from analogrig.devices.processes import HostDevice, host_wire
+from analogrig.devices.registry import describe, from_table, open_dut, reopen_dut
 from analogrig.errors import (
     CatalogueMismatch,
     ConfigurationError,
@@ -333,6 +332,7 @@ class FaultyLink:
         self.to_device: Fault = lambda message: [message]
         self.from_device: Fault = lambda message: [message]
         self._waiting: list[Message] = []
+        self.unread: deque[Message] = deque()
         self.counters: Mapping[str, int] = {"frames_dropped": 0}
 
     def write(self, sent: bytes) -> None:

@@ -20,7 +20,7 @@ import pytest
 
 from analogrig.cli import main
 from analogrig.config import locate
-from analogrig.devices.host import HOST_PROGRAM
+from analogrig.devices.processes import HOST_PROGRAM
 from analogrig.run import Run
 from tests.harness.firmware import CORES, needs_firmware
 from tests.harness.processes import LONG_S, descendants
@@ -134,6 +134,8 @@ def test_emulate_writes_volts_and_codes(tmp_path: Path) -> None:
     lines = (tmp_path / "signals.csv").read_text().splitlines()
     assert lines[0].split(",")[:3] == ["sample", "force_v", "displacement_v"]
     assert len(lines) == 1801 == out["samples"] + 1
+    assert lines[0].split(",")[-2:] == ["machine_s", "plant_s"]
+    assert [float(each) for each in lines[1001].split(",")[-2:]] == [0.05, 10.0]  # 20,000 samples/s, 200 times faster
     run_json("emulate", "--seed", "3", "--out", "signals.npz", cwd=tmp_path)
     with np.load(tmp_path / "signals.npz") as file:
         volts = np.array([line.split(",")[1:5] for line in lines[1:]], float)

@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from analogrig.bench import Bench, direct_bench
+from analogrig.bench import Bench
+from analogrig.campaigns.together import direct_bench
 from analogrig.catalogue import SteppedFlag
-from analogrig.devices.opening import open_dut
-from analogrig.devices.registry import describe
+from analogrig.devices.registry import describe, open_dut
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
-from analogrig.run import Run
+from analogrig.run import LOST, Run
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played, rate_below
 from analogrig_emulator import CHANNELS
@@ -41,12 +41,20 @@ def test_no_exposure_before_the_first_edge_and_in_the_warm_up() -> None:
     assert "its warm-up takes 600" in exposure(made(warm_up_n=600)).lack_of_evidence
 
 
+@pytest.mark.parametrize("flag", [LOST, SteppedFlag.MISSING, SteppedFlag.REFUSED])
+def test_warm_up_of_no_sample_is_no_reason(flag: int) -> None:
+    run = made(warm_up_n=0)
+    lost = dataclasses.replace(run, flags=np.full(600, flag, np.uint8))
+    assert "none of 600 samples: each was missing, refused or lost" in exposure(lost).lack_of_evidence
+
+
 def test_no_exposure_during_the_hold_off() -> None:
-    assert exposure(made(hold_off_n=30, alarms=(300, 310, 590))).armed == 550 - 39 - 9
+    assert exposure(made(hold_off_n=30, alarms=(300, 340, 590))).armed == 550 - 30 - 30 - 9
 
 
-def test_sample_with_an_alarm_is_armed() -> None:
-    assert exposure(made(warm_up_n=600, alarms=(20, 70))).armed == 2
+def test_sample_with_an_alarm_is_armed_unless_it_cannot_be() -> None:
+    assert exposure(made(edge_codes=1e6, alarms=(20, 70))).armed == 2
+    assert exposure(made(warm_up_n=600, alarms=(20, 70))).armed == 0
     assert exposure(made(trigger="none")).armed == 0
 
 

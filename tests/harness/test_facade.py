@@ -22,13 +22,19 @@ PUBLIC = """
 """.split()
 
 DEVICES = """
-    LOST UNARMED UNREPORTED AdaptedDescription Answers Capability Datasheet Device DeviceDescription DeviceRefused
-    LinkClosed ModelOrders RaisedAlarm ReportedDiagnosis ReportedMisfit Samples SteppedFlag Thing TimeLimitReached
+    LOST UNARMED UNREPORTED AdaptedDescription Answers Capability
+    Cause Change Datasheet Device DeviceDescription DeviceRefused
+    Estimator HostDevice LinkClosed ModelOrders RaisedAlarm ReportedDiagnosis
+    ReportedMisfit Samples SteppedFlag Thing TimeLimitReached trusted
 """.split()
+
 RIGS = """
-    CAPABILITIES Block Channel Hindsight Performance Rig RigClosed RigDescription RigRefused RigTimeout Segment
-    Thing
+    BLOCK_SAMPLES CAPABILITIES DEFAULT_RIG WRONG_SAMPLES Block CardDescription Channel
+    ComputerDescription EmulatorDescription EmulatorRig Hindsight MeasuredValues Performance
+    Rig RigClosed RigDescription RigRefused RigTimeout Segment
+    Stream Thing emulator_errors is_emulated
 """.split()
+
 
 NO_BEGINNING = {"What", "Whether", "Of", "As", "How", "Who", "Whatever", "Whoever", "That", "Those"}
 """First words of a docstring that cannot be read alone."""
@@ -111,6 +117,7 @@ def test_import_loads_nothing_heavy_and_an_error_neither() -> None:
     assert not loaded_after("from analogrig import Played, Finding, Play, Scenario") & {"hypothesis", "pytest"}
 
 
+@pytest.mark.heavy
 def test_types_of_the_public_names_are_known_to_a_type_checker(tmp_path: Any) -> None:
     user = tmp_path / "user.py"
     user.write_text(

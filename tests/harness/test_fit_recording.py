@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from analogrig.cli import main, terminal
 from analogrig.config import fixtures
-from analogrig.hardware.calibration.recorded import SETTLING_N, RecordedPlant, _determined
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import Excitation, Multiplier, RecordedExcitation, SuspensionComputer, load_patch
+from analogrig_instruments.calibration.recorded import SETTLING_N, RecordedPlant, _determined
 
 RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0, "rc-battery": 1.0}
 SAMPLES = 2000
@@ -172,7 +172,7 @@ def test_a_beginning_that_does_not_fit_names_the_cure(
     assert "--settle" not in capsys.readouterr().out
 
 
-def test_a_plant_that_changes_unknown_to_the_recording_is_a_caveat(
+def test_a_plant_that_changes_unknown_to_the_recording_has_no_twin(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     levels_v = np.where(np.arange(SAMPLES) % 100 < 50, 9.0, 1.0)
@@ -185,9 +185,14 @@ def test_a_plant_that_changes_unknown_to_the_recording_is_a_caveat(
     np.savez(tmp_path / "both.npz", u=u, y=y)
     command = ["import", str(tmp_path / "both.npz"), "--input", "u", "--output", "y", "--rate", "100"]
     assert main([*command, "--input-unit", "N", "--output-unit", "m", "--out", str(tmp_path / "r.npz")]) == 0
-    told = fit(tmp_path / "r.npz", "front", capsys, "--fix", "B", "--fix", "M")
+    capsys.readouterr()
+    out = tmp_path / "fitted.toml"
+    command = ["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "front", "--json", "--out", str(out)]
+    assert main([*command, "--fix", "B", "--fix", "M"]) == 1
+    told = json.loads(capsys.readouterr().out)
     (caveat,) = told["caveats"]
     assert "times the noise of the output: the plant changed" in caveat
+    assert told["file"] is None and not out.exists()
 
 
 def test_a_perfect_fit_of_an_output_that_nothing_moves_has_finite_errors() -> None:

@@ -1,8 +1,7 @@
-"""Lengths of frames against a construction bit by bit and published figures; load and latency of a bus."""
+"""Lengths of frames against a construction bit by bit and published figures."""
 
 from __future__ import annotations
 
-import math
 import random
 import re
 
@@ -11,8 +10,6 @@ import pytest
 from anycrc import Model
 
 from analogrig.links.frame_bits import frame_bits, longest_classic_bits, longest_fd_bits
-from analogrig.links.line import CanLine
-from analogrig.protocol.bus_load import PeriodicFrames, exchange_load, latency_s
 
 FD_LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]
 
@@ -135,59 +132,3 @@ def test_data_of_an_fd_frame_takes_less_time_at_a_higher_rate() -> None:
     assert fast == pytest.approx(bits.nominal / 500_000 + bits.data / 2_000_000)
     frame = can.Message(data=bytes(64), is_fd=True, bitrate_switch=True, is_extended_id=False)
     assert frame_bits(frame).time_s(500_000, 2_000_000) < fast
-
-
-def refuted() -> list[PeriodicFrames]:
-    """Table 1 of Davis et al. 2007: three messages of 7 bytes at 125 kbit/s."""
-    return [PeriodicFrames(1, 1e-3, 2.5e-3), PeriodicFrames(2, 1e-3, 3.5e-3), PeriodicFrames(3, 1e-3, 3.5e-3)]
-
-
-def test_latencies_are_those_of_the_revised_analysis() -> None:
-    """Davis et al. 2007, section 3.4: 2, 3 and 3.5 ms; the refuted analysis had 3 ms for the last one."""
-    latencies = [latency_s(refuted(), identifier, 8e-6) for identifier in (1, 2, 3)]
-    assert latencies == pytest.approx([2e-3, 3e-3, 3.5e-3])
-
-
-def test_latency_has_no_limit_on_a_bus_that_is_full() -> None:
-    full = [*refuted(), PeriodicFrames(0, 1e-3, 5e-3)]
-    assert latency_s(full, 3, 8e-6) is None
-    assert latency_s(full, 0, 8e-6) == pytest.approx(2e-3)
-
-
-def test_frames_queued_together_wait_for_each_other() -> None:
-    alone = [PeriodicFrames(5, 1e-3, 100e-3, frames=9)]
-    assert latency_s(alone, 5, 1e-6) == pytest.approx(9e-3)
-    with_others = [*alone, PeriodicFrames(1, 1e-3, 4e-3), PeriodicFrames(9, 2e-3, math.inf)]
-    assert latency_s(with_others, 5, 1e-6) == pytest.approx(15e-3)  # 2 that has begun, 9, and those of 0, 4, 8, 12 ms
-
-
-def test_what_an_exchange_needs_is_the_sum_of_its_frames() -> None:
-    """By hand: a sample, 7 estimates and the end, 9 frames of 8 bytes: 135 bits each."""
-    load = exchange_load(CanLine(1_000_000), in_blocks=False, parameters=6, report_interval_n=1, period_s=2e-3)
-    assert load.sample_s == pytest.approx(9 * 135e-6)
-    assert load.utilisation == pytest.approx(9 * 135e-6 / 2e-3)
-    # One that has begun, the sample, alarm, diagnosis and misfit, the next sample, 7 estimates, the end.
-    assert load.latency_s == pytest.approx((1 + 1 + 3 + 1 + 7 + 1) * 135e-6)
-    assert load.most_samples_per_s == pytest.approx(1 / 1215e-6)
-
-
-def test_an_exchange_that_does_not_fit_has_no_latency() -> None:
-    load = exchange_load(CanLine(1_000_000), in_blocks=False, parameters=6, report_interval_n=1, period_s=50e-6)
-    assert load.utilisation == pytest.approx(24.3)
-    assert load.latency_s is None
-
-
-def test_blocks_of_fd_with_rare_reports_fit_where_samples_do_not() -> None:
-    blocks, samples = (
-        exchange_load(
-            CanLine(1_000_000, 8_000_000 if in_blocks else None),
-            in_blocks=in_blocks,
-            parameters=6,
-            report_interval_n=64,
-            period_s=250e-6,
-        )
-        for in_blocks in (True, False)
-    )
-    assert blocks.utilisation < 1.0 < samples.utilisation
-    assert blocks.latency_s is not None
-    assert samples.latency_s is None

@@ -12,8 +12,8 @@ from playwright.sync_api import Browser
 
 from analogrig.cli import main
 from analogrig.judging.verdict import judge
-from analogrig.reporting import write_report
-from analogrig.reporting.measured import fits, measured_response, section, spectrum
+from analogrig.reporting import render, write_report
+from analogrig.reporting.measured import fits, measured, measured_response, spectrum
 from analogrig.run import OUTPUT, Run
 from tests.browser import Watched
 
@@ -85,7 +85,8 @@ def test_missing_samples_do_not_raise_the_spectra(whole: Run, gapped: Run) -> No
     assert np.isfinite(measured_response(found)).sum() == pytest.approx(
         np.isfinite(measured_response(expected)).sum(), abs=2
     )
-    assert "Straight lines bridge" in section(gapped) and "Straight lines bridge" not in section(whole)
+    assert "Straight lines bridge" in render(gapped, judge(gapped))
+    assert "Straight lines bridge" not in render(whole, judge(whole))
 
 
 def test_a_long_gap_ends_the_stretch_of_a_spectrum(tmp_path: Path) -> None:
@@ -93,7 +94,8 @@ def test_a_long_gap_ends_the_stretch_of_a_spectrum(tmp_path: Path) -> None:
     y[:2], y[500:517] = np.nan, np.nan
     found = spectrum(run := replayed(u, y, tmp_path))
     assert found and (found.start, found.end, found.bridged_n) == (517, SAMPLES, 0)
-    assert "those of samples 517 to 1499" in section(run)
+    figures = measured(run)
+    assert figures and "those of samples 517 to 1499" in figures.gaps[0]
 
 
 def test_a_response_is_measured_where_the_input_has_power(whole: Run) -> None:
@@ -132,4 +134,5 @@ def test_ticks_of_small_quantities_have_their_digits(browser: Browser, tmp_path:
     for axis in (2, 3):
         labels = watched.page.evaluate(f"uPlot.sync('run').plots[0].axes[{axis}]._values")
         assert len(set(labels)) == len(labels) > 2
-    assert 'text-anchor="end"' in section(run).rpartition(">1000<")[0].rpartition("<text")[2]
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 'text-anchor="end"' in page.partition("<svg")[2].rpartition(">1000<")[0].rpartition("<text")[2]

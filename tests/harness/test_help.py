@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.cli import _COMMANDS, _parser, main
-from analogrig.recordings.column_reader import FORMATS
+from analogrig.cli import main
+from analogrig.cli.command_line import _COMMANDS, make_parser
+from analogrig.entry_points import COMMANDS, of_group
+from analogrig_imports.column_reader import FORMATS
 
 QUICK = {
     "list",
@@ -24,7 +26,7 @@ QUICK = {
 
 
 def commands() -> dict[str, argparse.ArgumentParser]:
-    (choices,) = [each.choices for each in _parser()._actions if isinstance(each, argparse._SubParsersAction)]
+    (choices,) = [each.choices for each in make_parser()._actions if isinstance(each, argparse._SubParsersAction)]
     return dict(choices)
 
 
@@ -37,7 +39,7 @@ EXAMPLES = [example for command in commands().values() for example in examples(c
 
 
 def test_every_module_adds_its_command() -> None:
-    assert len(commands()) == len(_COMMANDS)
+    assert len(commands()) == len(_COMMANDS) + len(of_group(COMMANDS))
 
 
 @pytest.mark.parametrize("name", commands())
@@ -54,13 +56,13 @@ def without_redirection(example: str) -> list[str]:
     return words[: next((i for i, word in enumerate(words) if word.startswith(">")), len(words))]
 
 
-@pytest.mark.parametrize("example", [*EXAMPLES, *examples(_parser())])
+@pytest.mark.parametrize("example", [*EXAMPLES, *examples(make_parser())])
 def test_every_example_is_understood(example: str) -> None:
     if example.endswith("--help"):
         with pytest.raises(SystemExit, match="0"):
-            _parser().parse_args(without_redirection(example))
+            make_parser().parse_args(without_redirection(example))
         return
-    assert callable(_parser().parse_args(without_redirection(example)).command)
+    assert callable(make_parser().parse_args(without_redirection(example)).command)
 
 
 @pytest.mark.parametrize("example", sorted(QUICK))

@@ -101,7 +101,7 @@ def test_identity_survives_the_file_and_is_escaped_on_the_page(recorded_thesis: 
     assert Run.load(tmp_path / "run.npz").conditions.identity == SOMEBODY
     page = render(run, judge(run))
     assert SOMEBODY.command not in page
-    assert "analogrig run --dut &#x27;&lt;script&gt;&#x27;" in page
+    assert "analogrig run --dut &#39;&lt;script&gt;&#39;" in page
     assert "9.9, commit 0123456789ab+dirty, Python 3.99" in page
 
 

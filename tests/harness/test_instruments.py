@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from analogrig.errors import ConfigurationError, RecordStale, RigRefused
-from analogrig.hardware.instrument import DRIVERS, DialChange, InputRecord, Instrument, find_driver
-from analogrig.hardware.ni_daqmx import NiDaqmx
-from analogrig.hardware.red_pitaya import RedPitaya
-from analogrig.hardware.scpi_connection import ScpiConnection
-from analogrig.hardware.simulator.computer import Amplifier, Booster, Wiring
-from analogrig.hardware.simulator.inputs import InputFaults
-from analogrig.hardware.simulator.records import AcquisitionFaults
-from analogrig.hardware.simulator.scpi import Interpreter
-from analogrig.hardware.simulator.served import InstrumentDescription, ServedRedPitaya
 from analogrig_emulator import Excitation, SuspensionComputer, preset
+from analogrig_instruments.instrument import DRIVERS, DialChange, InputRecord, Instrument, find_driver
+from analogrig_instruments.ni_daqmx import NiDaqmx
+from analogrig_instruments.red_pitaya import RedPitaya
+from analogrig_instruments.scpi_connection import ScpiConnection
+from analogrig_instruments.simulator.computer import Amplifier, Booster, Wiring
+from analogrig_instruments.simulator.inputs import InputFaults
+from analogrig_instruments.simulator.records import AcquisitionFaults
+from analogrig_instruments.simulator.scpi import Interpreter
+from analogrig_instruments.simulator.served import InstrumentDescription, ServedRedPitaya
 from tests.harness.ni_stand_in import Card, library
 
 SAMPLES = 400
@@ -189,7 +189,7 @@ def test_each_driver_checks_its_own_addresses(address: str, monkeypatch: pytest.
         def place(cls, address: str) -> str:
             return address if address.startswith(("ip:", "usb:")) else ""
 
-    monkeypatch.setattr("analogrig.hardware.ni_daqmx.NiDaqmx", Adalm2000)
+    monkeypatch.setattr("analogrig_instruments.ni_daqmx.NiDaqmx", Adalm2000)
     assert find_driver(f"nidaqmx://{address}") == (Adalm2000, address)
 
 

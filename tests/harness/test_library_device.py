@@ -17,14 +17,13 @@ import pytest
 
 from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
 from analogrig.answers import Answers, Samples
-from analogrig.bench import direct_bench
+from analogrig.campaigns.together import direct_bench
 from analogrig.catalogue import SteppedFlag
 from analogrig.cli import main
 from analogrig.datasheet import Datasheet
 from analogrig.devices import registry
 from analogrig.devices.device import Device
 from analogrig.devices.estimator_library import EstimatorLibrary, EstimatorLibraryDevice
-from analogrig.devices.library_host import ChildHost
 from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused, TimeLimitReached
 from analogrig.rigs.emulator import is_emulated
 from tests.harness.library_builds import FAULTY, OWN, build, build_est
@@ -32,7 +31,6 @@ from tests.harness.processes import children, ends
 
 HANG_S = 0.2
 N = 1000
-WHERE = pytest.mark.parametrize("in_process", [False, True], ids=["child", "in process"])
 
 
 class Fault(IntEnum):
@@ -88,13 +86,9 @@ def opened(faulty: Path) -> Iterator[Callable[..., EstimatorLibraryDevice]]:
     """Opens the faulty library with a fault at a sample."""
     devices: list[Device] = []
 
-    def open_faulty(
-        fault: Fault = Fault.NONE, at: int = 0, *, in_process: bool = False, timeout_s: float = 60.0
-    ) -> EstimatorLibraryDevice:
+    def open_faulty(fault: Fault = Fault.NONE, at: int = 0, *, timeout_s: float = 60.0) -> EstimatorLibraryDevice:
         settings = {"fault": int(fault), "at": at}
-        description = EstimatorLibrary(
-            name="bob", library=str(faulty), in_process=in_process, timeout_s=timeout_s, settings=settings
-        )
+        description = EstimatorLibrary(name="bob", library=str(faulty), timeout_s=timeout_s, settings=settings)
         devices.append(description.connect())
         return cast(EstimatorLibraryDevice, devices[-1])
 
@@ -132,7 +126,6 @@ def played(device: Device, *blocks: Samples) -> tuple[list[int], bytes]:
 def pids(device: EstimatorLibraryDevice) -> tuple[int, int]:
     """The tether and the child."""
     host = device._host
-    assert isinstance(host, ChildHost)
     (pid,) = children(host._child.tether_pid)
     return host._child.tether_pid, pid
 
@@ -168,9 +161,8 @@ def test_header_compiles_without_a_warning(compiler: str, macro: str, tmp_path: 
         assert device.datasheet == Datasheet(theta_n=1, armed=True)
 
 
-@WHERE
-def test_our_estimator_has_the_estimates_and_alarms_of_our_device(est: Path, *, in_process: bool) -> None:
-    with EstimatorLibrary(name="est", library=str(est), in_process=in_process).connect() as device:
+def test_our_estimator_has_the_estimates_and_alarms_of_our_device(est: Path) -> None:
+    with EstimatorLibrary(name="est", library=str(est)).connect() as device:
         run = run_of(device)
     with open_dut("inproc") as ours:
         expected = run_of(ours)
@@ -181,9 +173,8 @@ def test_our_estimator_has_the_estimates_and_alarms_of_our_device(est: Path, *, 
     assert np.array_equal(run.statistic, expected.statistic)
 
 
-@WHERE
-def test_any_blocks_have_the_same_answers(opened: Callable[..., EstimatorLibraryDevice], *, in_process: bool) -> None:
-    device, whole = opened(in_process=in_process), samples(40_000)
+def test_any_blocks_have_the_same_answers(opened: Callable[..., EstimatorLibraryDevice]) -> None:
+    device, whole = opened(), samples(40_000)
     expected = played(device, whole)
     assert expected[0] == list(range(99, 40_000, 100))
     for n in (1000, 16_384, 16_385, 33_000):
@@ -192,15 +183,8 @@ def test_any_blocks_have_the_same_answers(opened: Callable[..., EstimatorLibrary
     assert played(device, *cut(short, 1)) == played(device, short)
 
 
-def test_child_and_this_process_have_the_same_answers(opened: Callable[..., EstimatorLibraryDevice]) -> None:
-    assert played(opened(), samples()) == played(opened(in_process=True), samples())
-
-
-@WHERE
-def test_missing_samples_repeat_the_last_valid_one(
-    opened: Callable[..., EstimatorLibraryDevice], *, in_process: bool
-) -> None:
-    device = opened(in_process=in_process)
+def test_missing_samples_repeat_the_last_valid_one(opened: Callable[..., EstimatorLibraryDevice]) -> None:
+    device = opened()
     device.start()
     valid = np.array([0, 1, 0, 0, 1, 0], np.bool_)
     y = np.arange(10, 16, dtype=np.uint16)
@@ -215,7 +199,7 @@ def test_skipped_samples_are_missing_ones(opened: Callable[..., EstimatorLibrary
     device = opened()
     device.start()
     first, second = device.play([samples(90), samples(60, first=20_140)])
-    assert [alarm.index for alarm in second.alarms] == [*range(99, 20_200, 100)]
+    assert [alarm.index for alarm in second.alarms] == [20_199]  # none in a skipped sample
     assert first.theta is not None and second.theta is not None
     assert len(second) == len(second.theta) == 60
     assert second.theta[0, 0] == first.theta[-1, 0] + (20_140 % 7 != 6)
@@ -223,11 +207,8 @@ def test_skipped_samples_are_missing_ones(opened: Callable[..., EstimatorLibrary
         list(device.play([samples(1, first=20_199)]))
 
 
-@WHERE
-def test_two_devices_side_by_side_do_not_disturb_each_other(
-    opened: Callable[..., EstimatorLibraryDevice], *, in_process: bool
-) -> None:
-    one, other = opened(in_process=in_process), opened(in_process=in_process)
+def test_two_devices_side_by_side_do_not_disturb_each_other(opened: Callable[..., EstimatorLibraryDevice]) -> None:
+    one, other = opened(), opened()
     alone = [played(one, samples(seed=seed)) for seed in (1, 2)]
     one.start()
     other.start()
@@ -252,20 +233,17 @@ def test_recorded_device_opens_again(opened: Callable[..., EstimatorLibraryDevic
     assert table["identity"] == {"firmware": "faulty 1.0"}
     description = registry.recorded(table)
     assert description == dataclasses.replace(opened()._description, datasheet=opened().datasheet)
-    assert registry.describe("library:./a.so?in_process=1&ceiling=3") == EstimatorLibrary(
-        name="library:./a.so?in_process=1&ceiling=3",
+    assert registry.describe("library:./a.so?ceiling=3") == EstimatorLibrary(
+        name="library:./a.so?ceiling=3",
         library=str(Path("a.so").absolute()),
-        in_process=True,
         settings={"ceiling": 3},
     )
 
 
-@WHERE
-def test_own_estimator_is_judged_with_its_masses_and_dampings(own: Path, *, in_process: bool) -> None:
+def test_own_estimator_is_judged_with_its_masses_and_dampings(own: Path) -> None:
     description = EstimatorLibrary(
         name="own",
         library=str(own),
-        in_process=in_process,
         datasheet=Datasheet.recorded({"datasheet": {"model": {"na": 2, "nb": 3, "offset": True}}}),
     )
     with description.connect() as device:
@@ -278,7 +256,6 @@ def test_own_estimator_is_judged_with_its_masses_and_dampings(own: Path, *, in_p
 # ---- settings
 
 
-@WHERE
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -289,9 +266,9 @@ def test_own_estimator_is_judged_with_its_masses_and_dampings(own: Path, *, in_p
     ],
 )
 def test_refused_setting_is_named(
-    opened: Callable[..., EstimatorLibraryDevice], settings: dict[str, float], message: str, *, in_process: bool
+    opened: Callable[..., EstimatorLibraryDevice], settings: dict[str, float], message: str
 ) -> None:
-    device = opened(in_process=in_process)
+    device = opened()
     with pytest.raises(DeviceRefused, match=f"^device bob: {message}$"):
         device.configure(**settings)
     device.configure()
@@ -373,7 +350,6 @@ def test_output_of_the_library_does_no_harm(
     assert capfd.readouterr() == ("", "")
 
 
-@WHERE
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
@@ -382,24 +358,23 @@ def test_output_of_the_library_does_no_harm(
     ],
 )
 def test_broken_record_is_told_with_its_sample(
-    opened: Callable[..., EstimatorLibraryDevice], fault: Fault, message: str, *, in_process: bool
+    opened: Callable[..., EstimatorLibraryDevice], fault: Fault, message: str
 ) -> None:
     for at in (0, 150, N - 1):
-        device = opened(fault, at, in_process=in_process)
+        device = opened(fault, at)
         device.start()
         with pytest.raises(DeviceError, match=f"^device bob: sample {at}: analogrig_step {message}"):
             list(device.play(cut(samples(), 100)))
 
 
-@WHERE
 @pytest.mark.parametrize(
     ("fault", "what"),
     [(Fault.NEXT_BYTE, "its state, which has state_bytes = 24"), (Fault.EXTRA, "the last of 100 records")],
 )
 def test_write_behind_state_or_records_is_told_with_its_block(
-    opened: Callable[..., EstimatorLibraryDevice], fault: Fault, what: str, *, in_process: bool
+    opened: Callable[..., EstimatorLibraryDevice], fault: Fault, what: str
 ) -> None:
-    device = opened(fault, 150, in_process=in_process)
+    device = opened(fault, 150)
     device.start()
     answers = device.play(cut(samples(), 100))
     assert len(next(answers)) == 100
@@ -427,23 +402,28 @@ def test_crash_makes_the_run_inconclusive_and_the_next_one_is_whole(faulty: Path
         assert run_of(device).samples == 1800
 
 
-@WHERE
-def test_non_finite_answer_is_told_with_its_sample(
-    opened: Callable[..., EstimatorLibraryDevice], *, in_process: bool
-) -> None:
-    device = opened(Fault.NOT_A_NUMBER, 199, in_process=in_process)
+def test_non_finite_answer_is_told_with_its_sample(opened: Callable[..., EstimatorLibraryDevice]) -> None:
+    device = opened(Fault.NOT_A_NUMBER, 199)
     device.start()
     with pytest.raises(DeviceError, match=r"^device bob: sample 199: theta is non-finite: \[ +nan 1?\d+\.\]$"):
         list(device.play(cut(samples(), 64)))
+    device.start()
+    whole = samples()
+    without = Samples(0, whole.u, whole.y, np.arange(len(whole)) != 199)
+    with pytest.raises(DeviceError, match=r"\]; the sample is missing: report the last value, or 0$"):
+        list(device.play([without]))
 
 
 @pytest.mark.parametrize(
     ("settings", "error"),
     [
-        (f"fault={Fault.EXIT_0:d}&at=1000&in_process=true", "{library}: called exit() in this process: run it in"),
+        (
+            f"fault={Fault.EXIT_0:d}&at=1000",
+            "device {name}: sample 1000: analogrig_step: the process of the library ended with",
+        ),
         (f"fault={Fault.INIT:d}", "device {name}: analogrig_init: the process of the library ended with status -6"),
     ],
-    ids=["exit(0) in process", "crash in analogrig_init"],
+    ids=["exit(0)", "crash in analogrig_init"],
 )
 def test_command_is_inconclusive_after_a_crash(faulty: Path, tmp_path: Path, settings: str, error: str) -> None:
     name = f"library:{faulty}?{settings}"
@@ -456,6 +436,7 @@ def test_command_is_inconclusive_after_a_crash(faulty: Path, tmp_path: Path, set
 
 def test_killed_child_is_told_and_recovered(opened: Callable[..., EstimatorLibraryDevice]) -> None:
     device = opened()
+    played(device, samples())
     os.kill(pids(device)[1], signal.SIGKILL)
     with pytest.raises(DeviceError, match=r"^device bob: analogrig_init: .* ended with status -9 \(SIGKILL\)$"):
         device.start()
@@ -483,7 +464,7 @@ def test_child_does_not_outlive_a_killed_parent(faulty: Path) -> None:
     out = subprocess.run([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, check=False)
     assert out.returncode == -signal.SIGKILL
     started = [int(pid) for pid in out.stdout.split()]
-    assert len(started) == 2
+    assert len(started) == 3, "the tether, the process that loaded the library, and that of the record"
     assert all(map(ends, started))
 
 
@@ -535,7 +516,6 @@ def absent(folder: Path) -> Path:
     return folder / "absent.so"
 
 
-@WHERE
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -550,9 +530,9 @@ def absent(folder: Path) -> Path:
     ],
 )
 def test_file_that_is_no_such_library_is_refused_in_one_line(
-    make: Callable[[Path], Path], message: str, tmp_path: Path, *, in_process: bool
+    make: Callable[[Path], Path], message: str, tmp_path: Path
 ) -> None:
-    description = EstimatorLibrary(name="bob", library=str(make(tmp_path)), in_process=in_process)
+    description = EstimatorLibrary(name="bob", library=str(make(tmp_path)))
     with pytest.raises(ConfigurationError, match=f"^device bob: .*{message}") as raised:
         description.connect()
     assert "\n" not in str(raised.value)
@@ -570,7 +550,7 @@ def test_model_that_contradicts_the_library_is_refused(faulty: Path) -> None:
         EstimatorLibrary(name="bob", library=str(faulty), datasheet=stated).connect()
 
 
-@pytest.mark.parametrize("name", ["library", "library:", "library:?in_process=true"])
+@pytest.mark.parametrize("name", ["library", "library:", "library:?ceiling=3"])
 def test_name_without_a_library_is_refused(name: str) -> None:
     with pytest.raises(ConfigurationError, match="names no library: use library:./my_estimator.so"):
         registry.describe(name)
@@ -588,23 +568,6 @@ def test_library_that_a_file_names_is_loaded_only_if_allowed(
     assert main([*command, "--allow", str(tmp_path / "mine.so")]) == 1
 
 
-# ---- this process
-
-
-def test_library_that_turns_off_denormals_does_so_for_itself_only(tmp_path: Path) -> None:
-    """A library as -ffast-math builds it, in a process of its own, whose failure spoils no other test."""
-    library = build(tmp_path / "flush.so", FAULTY, flags=("-DFLUSH",))
-    script = (
-        "import ctypes, numpy as np; from analogrig.devices.registry import describe;"
-        " from tests.harness.test_library_device import played, samples;"
-        " has_denormals = lambda: np.float32(1e-38) * np.float32(0.1) > 0 and np.float64(1e-308) * 0.1 > 0;"
-        f" device = describe('library:{library}?in_process=true').connect(); print(has_denormals());"
-        f" played(device, samples()); print(has_denormals()); ctypes.CDLL('{library}').flush(); print(has_denormals())"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "True", "False"]
-
-
 # ---- the commands
 
 
@@ -617,7 +580,7 @@ def test_campaign_and_certificate_of_a_library(own: Path, tmp_path: Path, capsys
     command = ["campaign", str(plan), "--allow", str(own), "--workers", "2", "--out", str(tmp_path / "campaign")]
     assert main(command) == 1
     assert "campaign plan: 1 cell, 2 trials, 3200 samples: FAILED" in capsys.readouterr().out
-    allowed = ["--far", "1e-2", "--confidence", "0.9", "--allowed", "10"]
+    allowed = ["--far", "1e-2", "--confidence", "0.9", "--bounds", "bursts", "--allowed", "10"]
     command = ["certify", *allowed, "--dut", f"library:{own}", "--workers", "2"]
     assert main(command) == 0
     assert "CERTIFIED\n  0 alarms in " in capsys.readouterr().out
@@ -640,7 +603,7 @@ def test_sample_that_a_library_refuses_has_the_flag(tmp_path: Path) -> None:
     source.write_text(REFUSING)
     library = build(tmp_path / "refusing.so", source)
     y, valid = np.array([1, 3000, 3000, 1], np.uint16), np.array([True, True, False, True])
-    with EstimatorLibrary(name="bob", library=str(library), in_process=True).connect() as device:
+    with EstimatorLibrary(name="bob", library=str(library)).connect() as device:
         device.start()
         (answers,) = device.play([Samples(0, y, y, valid)])
     assert answers.flags.tolist() == [0, SteppedFlag.REFUSED, SteppedFlag.MISSING, 0]

@@ -18,21 +18,18 @@ import pytest
 from analogrig.answers import Answers, Samples
 from analogrig.bench import Bench
 from analogrig.config import read_toml
-from analogrig.devices.lines import LinesDevice
-from analogrig.devices.port_description import PortDescription
-from analogrig.devices.program import ProgramDevice
-from analogrig.devices.registry import from_table, recorded, trusted
-from analogrig.devices.serial import SerialDevice
-from analogrig.devices.template_description import TemplateDescription
-from analogrig.devices.templates import Reader, Writer
+from analogrig.devices.lines import LinesDevice, ProgramDevice
+from analogrig.devices.port import SerialDevice
+from analogrig.devices.registry import describe, from_table, recorded, trusted
+from analogrig.devices.templates import Reader, Writer, checksum_of
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
 from analogrig.rigs.description import open_rig
 from analogrig.run import Channel
 from analogrig.scenario import Scenario
 from analogrig.trust import Trust
-from tests.harness import line_faults
-from tests.harness.line_faults import COMMON, EXPECTED, FLOODS, PROTOCOLS, N, Scripted, cases, check_clean, outcome
 from tests.harness.processes import LONG_S
+from tests.soak import line_faults
+from tests.soak.line_faults import COMMON, EXPECTED, FLOODS, PROTOCOLS, N, Scripted, cases, check_clean, outcome
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "harness" / "examples" / "program"
@@ -119,13 +116,15 @@ def test_silent_firmware_is_told_with_the_speed_of_the_line() -> None:
         dut.start()
         with pytest.raises(LinkTimeout) as raised:
             list(dut.play([Samples(0, nothing, nothing, np.ones(4, np.bool_))]))
-    assert str(raised.value) == "device bob: no answer to sample 0 within 0.05 s; the line was opened at 9600 baud"
+    assert str(raised.value) == (
+        "device bob: no answer to sample 0 within 0.05 s; no byte came; the line was opened at 9600 baud"
+    )
     os.close(ours)
     os.close(theirs)
 
 
 @pytest.mark.parametrize("kind", [LinesDevice, SerialDevice])
-def test_server_that_is_not_there_is_told_with_the_cure(kind: type[PortDescription]) -> None:
+def test_server_that_is_not_there_is_told_with_the_cure(kind: Any) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         url = f"socket://127.0.0.1:{taken.getsockname()[1]}"
@@ -155,12 +154,12 @@ MINIMAL: dict[str, Any] = {"name": "bob", "url": "port"}
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"send": "{u:d},{y:d}"}, r"send: must end with \\n"),
-        ({"send": "{u:q}\n"}, r"send: the type of {u:q} must be one of d, x, g, a, f32"),
+        ({"send": "{u:d},{y:d}"}, r"send: must end with \\n or \\r"),
+        ({"send": "{u:q}\n"}, r"send: the type of {u:q} must be one of d, x, g, a, f32, b"),
         ({"send": "{u}\n"}, r"send: '{' is neither {NAME:TYPE} nor two braces"),
         ({"send": "{v:d}\n"}, "send: has no field v"),
         ({"send": "{u:d},{u:d}\n"}, "send: the field u is there twice"),
-        ({"send": "{u:d}{checksum:x}\n"}, "send: has a field checksum: set checksum to one of xor, crc16, crc32"),
+        ({"send": "{u:d}{checksum:x}\n"}, "send: has a field checksum: set checksum, such as to CRC-16/MODBUS"),
         ({"send": "{checksum:x}{u:d}\n", "checksum": "xor"}, "send: no field may follow checksum"),
         ({"receive": "{a:g}{b:g}\n"}, "receive: nothing separates a from b"),
         ({"receive": "{a:g}\n{b:g}\n"}, "receive: must be one line"),
@@ -230,18 +229,17 @@ def test_time_to_read_a_line_is_linear_in_its_length() -> None:
 
 def test_checksums_are_those_of_their_standards() -> None:
     for name, check in (("xor", "31"), ("crc16", "29b1"), ("crc32", "cbf43926")):
-        writer = TemplateDescription._checksum(LinesDevice(**MINIMAL, checksum=name))  # type: ignore[arg-type]
-        assert writer is not None
-        assert f"{writer.compute(b'123456789'):0{writer.digits}x}" == check
+        checksum = checksum_of(name)
+        assert f"{checksum.compute(b'123456789'):0{checksum.digits}x}" == check
 
 
 def test_lines_are_written_by_their_template() -> None:
     writer = Writer("send", '{{"u":{u:d},"y":{y:a}}} 5% {index:x}\n', ("u", "y", "index"))
-    assert writer.lines([[1, 2], [0.5, 0.1], [15, 16]], 2) == [
+    assert writer.contents([np.array([1, 2]), np.array([0.5, 0.1]), np.array([15, 16])], 2) == [
         b'{"u":1,"y":0x1.0000000000000p-1} 5% f\n',
         b'{"u":2,"y":0x1.999999999999ap-4} 5% 10\n',
     ]
-    assert Writer("missing", "-\n", ()).lines([], 2) == [b"-\n", b"-\n"]
+    assert Writer("missing", "-\n", ()).contents([], 2) == [b"-\n", b"-\n"]
 
 
 # -------------------------------------------------------------------------------------------------------- descriptions
@@ -310,3 +308,112 @@ def test_model_in_volts_is_converted_to_codes() -> None:
         in_volts = 0.5 * y.volts(np.array([y_code]))[0] + 0.25 * u.volts(np.array([u_code]))[0] + 3
         assert y.volts(np.array([0]))[0] + y.lsb_v * (-a1 * y_code + b0 * u_code + d) == pytest.approx(in_volts)
     assert answers.innovation.tolist() == pytest.approx([10.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        ("serial:/dev/ttyX?exchange=stream", {"url": "/dev/ttyX", "exchange": "stream"}),
+        ("serial:/dev/ttyX?exchange=block&baud=9600", {"url": "/dev/ttyX", "exchange": "block", "baud": 9600}),
+        ("serial:/dev/ttyX?window=8&timeout_s=2", {"url": "/dev/ttyX", "window": 8, "timeout_s": 2}),
+        ("serial:/dev/ttyX?computes=own&most_lost_n=3", {"url": "/dev/ttyX", "computes": "own", "most_lost_n": 3}),
+        ("serial:/dev/ttyX?report_interval_n=10", {"url": "/dev/ttyX", "report_interval_n": 10}),
+        ("serial:/dev/ttyX?wire_faults=flip@0.1", {"url": "/dev/ttyX", "wire_faults": "flip@0.1"}),
+        ("serial:/dev/ttyX?alarm_is=level", {"url": "/dev/ttyX", "alarm_is": "level"}),
+        ("serial:socket://h:1?exchange=stream", {"url": "socket://h:1", "exchange": "stream"}),
+        ("serial:socket://h:1?logging=debug", {"url": "socket://h:1?logging=debug", "exchange": "sample"}),
+        (
+            "serial:rfc2217://h:1?ign_set_control&exchange=stream&timeout=3",
+            {"url": "rfc2217://h:1?ign_set_control&timeout=3", "exchange": "stream"},
+        ),
+        ("lines:spy:///dev/ttyX?file=log&prompt=%3E", {"url": "spy:///dev/ttyX?file=log", "prompt": ">"}),
+        ("frames:socket://h:1?framing=slip&baud=9600", {"url": "socket://h:1", "framing": "slip", "baud": 9600}),
+        ("lines:/dev/ttyX?send=%7Bu%3Ad%7D%0A", {"url": "/dev/ttyX", "send": "{u:d}\n"}),
+    ],
+)
+def test_name_of_a_port_takes_fields_of_the_device_and_parameters_of_the_url(name: str, fields: dict[str, Any]) -> None:
+    described = describe(name)
+    assert {key: getattr(described, key) for key in fields} == fields
+    assert described.name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("serial:/dev/ttyX?exchnage=stream", "unknown key 'exchnage' (known: name, description"),
+        ("serial:socket://h:1?exchnage=stream", "unknown key 'exchnage': did you mean 'exchange'?"),
+        ("serial:/dev/ttyX?exchange=streams", "exchange: must be one of 'sample', 'block', 'stream', not 'streams'"),
+        ("serial:/dev/ttyX?exchange", "'exchange' is not KEY=VALUE"),
+        ("serial:?exchange=stream", "no port: use serial:/dev/ttyACM0"),
+        ("serial:", "no port: use serial:/dev/ttyACM0"),
+        ("frames:", "no port: use frames:/dev/ttyACM0"),
+        ("serial:/dev/ttyX?window=0", "window must be 1 to 255, not 0"),
+        ("frames:/dev/ttyX?framing=hdlc", "framing: must be one of 'lines', 'cobs', 'slip'"),
+    ],
+)
+def test_wrong_name_of_a_port_is_one_line_with_the_key(name: str, told: str) -> None:
+    with pytest.raises(ConfigurationError) as raised:
+        describe(name)
+    assert told in str(raised.value)
+
+
+FRAMES = {"kind": "frames", "name": "bob", "url": "port"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"framing": "length", "delimiter": "0d"}, "delimiter: for framing = 'delimiter', not 'length'"),
+        ({"header": "aa"}, "header: for framing = 'length' or 'delimiter' or 'none', not 'cobs'"),
+        ({"framing": "delimiter"}, "delimiter: framing = 'delimiter' needs one, such as '0d'"),
+        ({"framing": "none", "header": "a"}, "header: bytes are pairs of hexadecimal digits, such as 'aa 55', not 'a'"),
+        ({"framing": "lines"}, "framing: binary records may contain line ends"),
+        ({"kind": "lines", "framing": "none"}, "framing: text needs a framing: lines, cobs"),
+        ({"prompt": ">"}, "prompt: only a device that sends lines of text has one"),
+        ({"checksum": "CRC-16"}, "checksum: CRC-16 is the name of several: CRC-16/ARC"),
+        ({"checksum": "CRC-9/NONE", "receive": "{alarm:u8}{checksum:u16}"}, "checksum: unknown 'CRC-9/NONE'"),
+        ({"receive": "{alarm:u8}{checksum:u16}"}, "receive: has a field checksum: set checksum, such as to CRC-16"),
+        (
+            {"checksum": "crc32", "receive": "{alarm:u8}{checksum:u16}"},
+            "receive: the checksum has 32 bits: use the type u32 or u32be",
+        ),
+        ({"checksum": "xor", "receive": "{checksum:u8}{alarm:u8}"}, "receive: nothing may follow checksum"),
+        ({"receive": "{alarm:f32}"}, "receive: alarm must be a whole number, not of the type f32"),
+        ({"receive": "xyz{alarm:u8}"}, "receive: bytes are pairs of hexadecimal digits"),
+        ({"receive": "0a"}, "receive: a record needs fields"),
+        ({"send": "{u:u16}{w:u16}"}, "send: has no field w"),
+        ({"units": "volts"}, "send: volts need the type f32 or f64"),
+        ({"reset": "R"}, "reset: bytes are pairs of hexadecimal digits"),
+        ({"alarm_is": []}, 'alarm_is must be "event", "level", or an array of the states'),
+        (
+            {"send": "{index:u8}{u:u16}", "receive": "{index:u8}{alarm:u8}", "echo": "index", "window": 256},
+            "window must be less than 256, the range of the index, not 256",
+        ),
+    ],
+)
+def test_wrong_frame_is_refused_with_its_key(changes: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigurationError) as raised:
+        from_table({**FRAMES, **changes}, "bob.toml")
+    assert told in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "check"),
+    [
+        ("CRC-16/MODBUS", 0x4B37),
+        ("CRC-16/ARC", 0xBB3D),
+        ("crc-16/xmodem", 0x31C3),
+        ("CRC-16/CCITT-FALSE", 0x29B1),
+        ("CRC16-KERMIT", 0x2189),
+        ("CRC-16/X-25", 0x906E),
+        ("CRC-8", 0xF4),
+        ("CRC-8/MAXIM", 0xA1),
+        ("CRC-8/SAE-J1850", 0x4B),
+        ("CRC_8/AUTOSAR", 0xDF),
+        ("CRC-32", 0xCBF43926),
+        ("CRC-32/MPEG-2", 0x0376E6E7),
+        ("CRC-32C", 0xE3069283),
+    ],
+)
+def test_crc_has_the_check_value_of_the_catalogue_of_crcs(name: str, check: int) -> None:
+    assert checksum_of(name).compute(b"123456789") == check

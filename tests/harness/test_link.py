@@ -24,8 +24,8 @@ from analogrig.catalogue import (
     Stepped,
     pack,
 )
-from analogrig.devices.host import HOST_PROGRAM
 from analogrig.devices.library import MemoryWire
+from analogrig.devices.processes import HOST_PROGRAM
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.links import frame
 from analogrig.links.link import FramedLink
@@ -94,6 +94,27 @@ def test_message_that_comes_in_halves_is_waited_for(link: FramedLink, terminal: 
     assert link.receive(0.0) is None
     os.write(terminal.far, whole[9:])
     assert link.receive(LONG_S) == message
+
+
+@pytest.mark.parametrize(
+    ("received", "told"),
+    [
+        (b"", "no byte came"),
+        (b"x", "1 byte came without a valid frame: another speed, or another protocol"),
+        (b"hello\r\n" * 9, "63 bytes came without a valid frame"),
+        (b"\0\0\0", "3 bytes came without a valid frame"),
+        (frame.encode(pack(Hello(1, 6, 0, 2)), 7)[:-3] + b"\0", "bytes came without a valid frame"),
+        (b"noise" + frame.encode(pack(Hello(1, 6, 0, 2))), ""),
+    ],
+)
+def test_silence_is_told_from_bytes_without_a_frame(
+    link: FramedLink, terminal: Terminal, received: bytes, told: str
+) -> None:
+    os.write(terminal.far, received)
+    while link.receive(0.01) is None and link._received_n < len(received):
+        pass
+    assert told in link.trouble
+    assert bool(told) == bool(link.trouble)
 
 
 def test_time_is_over_though_the_line_babbles(terminal: Terminal) -> None:

@@ -17,7 +17,7 @@ import serial
 from analogrig.bench import Bench
 from analogrig.catalogue import Hello, Identify, pack, unpack_any
 from analogrig.devices.device import Device
-from analogrig.devices.host import HOST_PROGRAM
+from analogrig.devices.processes import HOST_PROGRAM
 from analogrig.devices.registry import describe, from_table
 from analogrig.errors import LinkTimeout
 from analogrig.links.frame import FrameDecoder, encode
@@ -148,8 +148,11 @@ def test_client_waits_for_the_one_before_it_and_finds_a_device_that_has_just_boo
 
 def test_client_that_is_not_served_is_told_why(listener: Listener) -> None:
     table = {"name": "bob", "kind": "serial", "url": listener.url, "timeout_s": 0.2}
-    with listener.client(), pytest.raises(LinkTimeout, match="no Hello .*; the port may be serving another client$"):
-        from_table(table, "bob").connect()
+    with listener.client() as served:
+        served.sendall(QUESTION)
+        assert len(answers(served, 1)) == 1
+        with pytest.raises(LinkTimeout, match="no Hello .*; the port may be serving another client$"):
+            from_table(table, "bob").connect()
 
 
 @pytest.mark.parametrize("begun", [b"", QUESTION[:4], 1000 * QUESTION], ids=["silent", "half", "unread"])

@@ -12,7 +12,7 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.catalogue import Cause
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import CURES, NONLINEAR_CURE, MisfitPeriod, as_json, judge, misfit_periods
 from analogrig.recordings import CanLog, import_run

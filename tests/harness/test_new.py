@@ -34,7 +34,9 @@ def make(programs: Path, repository: Path, *words: str, status: int = 0) -> str:
     return run("make", *words, f"PYTHON={programs / 'python'}", cwd=repository, status=status)
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(
+    scope="module", params=[pytest.param(kind, marks=() if kind == "c" else pytest.mark.heavy) for kind in KINDS]
+)
 def repository(
     request: pytest.FixtureRequest, users_environment: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
@@ -59,6 +61,7 @@ def test_every_file_is_written_and_none_twice(repository: Path) -> None:
     assert [name for name in named if not (repository / name).exists()] == []
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("repository", ["c"], indirect=True)
 @pytest.mark.parametrize("broken", BREAKS if ALL else ["stale regressor"])
 def test_broken_estimator_fails_with_a_counterexample_that_replays(

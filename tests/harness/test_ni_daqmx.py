@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from analogrig.errors import ConfigurationError, RecordIncomplete, RigClosed, RigError, RigRefused, RigTimeout
-from analogrig.hardware.ni_daqmx import LEVELS_PER_SAMPLE, NiDaqmx, levels_v
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
+from analogrig_instruments.ni_daqmx import LEVELS_PER_SAMPLE, NiDaqmx, levels_v
 from tests.harness.allowed import open_allowed
 from tests.harness.ni_stand_in import Card, DaqError, Error, library
 
@@ -120,7 +120,7 @@ def test_code_beyond_the_resolution_is_an_error(card: Card, monkeypatch: pytest.
     instrument = NiDaqmx(library(card), "Dev1", 1.0)
     instrument.set_inputs([(0, "10V"), (1, "10V")])
     instrument.set_excitation(SCENARIO.excitation)
-    monkeypatch.setattr("analogrig.hardware.ni_daqmx._bits", lambda _: 12)
+    monkeypatch.setattr("analogrig_instruments.ni_daqmx._bits", lambda _: 12)
     with pytest.raises(RigError, match=r"instrument Dev1: returned the code \d+, which exceeds its 12 bits"):
         instrument.record(100)
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.bench import Bench, can_be_direct, direct_bench
+from analogrig.bench import Bench
+from analogrig.campaigns.together import can_be_direct, direct_bench
 from analogrig.cli import main
 from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.opening import open_dut, reopen_dut
-from analogrig.devices.registry import describe
+from analogrig.devices.registry import describe, open_dut, reopen_dut
 from analogrig.errors import ConfigurationError, DeviceRefused
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge

@@ -10,7 +10,7 @@ import pytest
 
 from analogrig import cli
 from analogrig.bench import Bench
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import as_json, judge
 from analogrig.reporting import render

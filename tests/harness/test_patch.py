@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from analogrig.cli import main
@@ -89,8 +90,8 @@ def test_file_that_is_read_is_not_overwritten(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_program_that_no_run_could_play_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A chain of 17 first-order lags has 68 states: integrators, inverters, and a pole in each amplifier of both."""
-    lags = range(1, 18)
+    """A chain of 25 first-order lags has 100 states: integrators, inverters, and a pole in each amplifier of both."""
+    lags = range(1, 26)
     path = tmp_path / "chain.toml"
     path.write_text(
         'name = "chain"\ndescription = "lags"\nspeed = 10\nchannels = ["u", "x1"]\nequations = """\n'
@@ -101,7 +102,7 @@ def test_program_that_no_run_could_play_is_refused(tmp_path: Path, capsys: pytes
     )
     assert main(["patch", str(path)]) == 2
     captured = capsys.readouterr()
-    assert captured.err == f"analogrig: {path}: the circuit has 68 states; the engine takes at most 64\n"
+    assert captured.err == f"analogrig: {path}: the circuit has 100 states; the engine takes at most 96\n"
     assert not captured.out
 
 
@@ -118,6 +119,62 @@ def test_a_speed_at_which_the_plant_hardly_moves_or_settles_at_once_is_noted(
     assert main(["patch", str(tmp_path / "motor.toml")]) == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: the plant settles in")]
     assert len(notes) == told and all("write speed = 8.8 for 100" in line for line in notes)
+
+
+@pytest.mark.parametrize(
+    ("program", "named"),
+    [
+        ("dc-motor", ["k = 0.1", "J = 5e-05"]),
+        ("silverbox", ["square = 1"]),
+        ("rc-battery", ["R2 = 0.008"]),
+        ("duffing", []),
+    ],
+)
+def test_values_that_not_every_draw_of_real_parts_reaches_are_noted(
+    program: str, named: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["patch", program]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if "emulator-real may refuse it" in line]
+    assert [note.partition("note: ")[2].partition(" turns pot")[0] for note in notes] == named
+
+
+FLOW = """name = "flow"
+channels = ["u", "x", "z"]
+speed = 800
+period_s = 20.0
+equations = '''
+x' = -y - z + u
+y' = x + 0.15*y
+z' = {constant} + z*(x - 5)
+'''
+[inputs]
+u = {{ full = 1.5, trial = [-0.75, 1.5] }}
+[states]
+x = {{}}
+y = {{}}
+z = {{}}
+"""
+
+
+@pytest.mark.parametrize(("constant", "status"), [(0.2, 2), (0.1, 2), (2.0, 0), (3.0, 0)])
+def test_a_flow_that_offsets_drive_to_infinity_is_refused(
+    constant: float, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A negative z grows without end: offsets of real parts exceed a small constant, not a large one."""
+    file = tmp_path / "flow.toml"
+    file.write_text(FLOW.format(constant=constant))
+    assert main(["patch", str(file)]) == status
+    shown = capsys.readouterr()
+    assert ("real parts drive the program to infinity" in shown.err) == (status == 2)
+    assert "note: a run on emulator-real overloads" not in shown.out
+
+
+@pytest.mark.parametrize("program", ["duffing", "pendulum", "van-der-pol", "two-tanks", "bump-stop", "silverbox"])
+def test_no_machine_of_real_parts_is_overloaded_by_a_shipped_program(
+    program: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["patch", program]) == 0
+    assert "emulator-real overloads" not in capsys.readouterr().out
 
 
 def test_the_deck_is_named_with_the_command_that_runs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -174,3 +231,68 @@ def test_a_parameter_without_a_pot_is_no_unknown_one(tmp_path: Path, capsys: pyt
     scenario.write_text('program = "two-tanks"\nsamples = 60\nset = { g = 16.2 }\n[excitation]\nhigh_v = 8.0\n')
     assert main(["run", "--scenario", str(scenario), "--dut", "inproc", "--out", str(tmp_path / "run")]) == 2
     assert "program two-tanks: g is on no pot (pot = false), so a scenario cannot set it" in capsys.readouterr().err
+
+
+def test_model_of_a_linear_program_is_printed_sampled(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["patch", "dc-motor", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    model, period_s = found["model"], found["sample_period_s"] * found["time_scale"]
+    assert (model["states"], found["amplifier_offset_v"]) == (["i", "omega"], 0.003)
+    assert model["A"] == [pytest.approx([-1.2 / 4e-3, -0.08 / 4e-3]), pytest.approx([0.08 / 8e-5, -2e-4 / 8e-5])]
+    assert (model["B"], model["C"]) == (pytest.approx([1 / 4e-3, 0.0]), [0.0, 1.0])
+    state, steps = np.zeros(2), 10_000  # Euler, whose error is of first order in the step
+    for _ in range(steps):
+        state = state + period_s / steps * (np.array(model["A"]) @ state + model["B"])
+    assert model["G"] == pytest.approx(state.tolist(), rel=1e-4)
+    rest = np.linalg.solve(np.array(model["A"]), -np.array(model["B"]))  # stays under a held input of 1
+    assert np.array(model["F"]) @ rest + model["G"] == pytest.approx(rest)
+
+
+@pytest.mark.parametrize(
+    ("program", "lines", "has_matrices"),
+    [
+        ("dc-motor", ["i' = (u - R*i - k*omega) / L", "J = 8e-05 kg m^2"], True),
+        ("front", ["velocity' = net_force / M", "K = 24500 N/m", "x = (displacement, velocity), u = force"], True),
+        ("two-mass", ["K2"], True),
+        ("shock", ["K = "], True),
+        ("pendulum", ["'"], False),
+        ("two-tanks", ["level1' = (inflow - flow1) / A1", "g = 98.1 dm/s^2"], False),
+        ("van-der-pol", ["'"], False),
+        ("duffing", ["'"], False),
+        ("bump-stop", ["K = "], False),
+        ("rc-battery", ["voltage = slope*charge", "capacity = 3600 A s"], False),  # its input reaches y at once
+    ],
+)
+def test_sheet_states_the_model(
+    program: str, lines: list[str], *, has_matrices: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["patch", program]) == 0
+    model = capsys.readouterr().out.partition("Model, in units and seconds of the plant\n")[2].partition("\n\n")[0]
+    assert [line for line in lines if line not in model] == []
+    assert ("  F = { { " in model) == has_matrices
+
+
+@pytest.mark.parametrize(
+    ("program", "lines"),
+    [
+        (
+            "front",
+            [
+                "5e-05 s of the machine, 0.01 s of the plant",
+                "force: -1 V + code * 0.00292969 V",
+                "1 V is 294 N; noise 1 LSB rms",
+            ],
+        ),
+        ("dc-motor", ["5e-05 s of the machine, 0.0005 s of the plant", "u: -12.5 V + code * 0.00610352 V"]),
+    ],
+)
+def test_sheet_states_the_sample_period_and_the_codes(
+    program: str, lines: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["patch", program]) == 0
+    told = capsys.readouterr().out
+    assert [line for line in lines if line not in told] == []
+    assert main(["patch", program, "--rig", "emulator-slow"]) == 0
+    assert "samples of the rig emulator-slow: 0.001 s of the machine" in capsys.readouterr().out
+    assert main(["patch", program, "--rig", "no-such-rig"]) == 2
+    assert "no rig is called 'no-such-rig'" in capsys.readouterr().err

@@ -47,7 +47,7 @@ def test_reference_that_is_no_number_allows_any_estimate() -> None:
 @pytest.mark.parametrize("within", [math.nan, math.inf])
 def test_limit_that_is_no_finite_number_is_refused(within: float) -> None:
     played = Played(made_run(np.zeros(400), [(0, FRONT)]))
-    with pytest.raises(ValueError, match="estimates: a limit must be a finite number"):
+    with pytest.raises(ValueError, match="estimates: within: must be a number within"):
         played.estimates(within)
 
 
@@ -56,7 +56,10 @@ def test_rate_counts_the_same_play_once_and_says_how_many_samples_it_takes() -> 
     again = Played(made_run(np.zeros(1000), [(0, FRONT)]))
     finding = rate_below(1e-5, [once, again], confidence=0.999)
     assert finding.why.startswith(rate_below(1e-5, [once], confidence=0.999).why)
-    assert finding.why.endswith("; to show 1e-05 with so many alarms takes 3453878 samples")
+    assert "for any dependence within a play, and at most 1000 alarms in each; " in finding.why
+    assert "with so many alarms takes 784532 plays like these, or the hold-off of the device" in finding.why
+    bursts = rate_below(1e-5, [once], confidence=0.999, burst=5.0)
+    assert bursts.why.endswith("; to show 1e-05 with so many alarms takes 3453878 samples")
     alone = rate_below(1e-5, [once], confidence=0.999, burst=1.0)
     assert alone.why.endswith("; to show 1e-05 with so many alarms takes 690776 samples")
 

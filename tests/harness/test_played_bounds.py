@@ -11,9 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.bench import Bench, direct_bench
+from analogrig.bench import Bench
+from analogrig.campaigns.together import direct_bench
 from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.judging import information
 from analogrig.judging.courses import first_at_level
 from analogrig.judging.verdict import BOUNDS, judge

@@ -18,8 +18,8 @@ import pytest
 
 from analogrig import config
 from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.instrument import Pots
-from analogrig.hardware.pots import OperatorPots, PotsDescription
+from analogrig_instruments.instrument import Pots
+from analogrig_instruments.pots import OperatorPots, PotsDescription
 from tests.harness.processes import LONG_S, ends
 
 DIALS = {"K": 0.6380, "B": 0.8152}

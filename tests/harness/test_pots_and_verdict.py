@@ -14,16 +14,16 @@ import pytest
 
 from analogrig import config
 from analogrig.bench import Bench
-from analogrig.devices.opening import open_dut
-from analogrig.hardware.instrument import InputRecord, Instrument
-from analogrig.hardware.ni_daqmx import NiDaqmx
-from analogrig.hardware.real import RealRig
-from analogrig.hardware.wiring import RealDescription
+from analogrig.devices.registry import open_dut
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
 from analogrig.scenario import PotChange as Asked
 from analogrig.scenario import Scenario
 from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
+from analogrig_instruments.instrument import InputRecord, Instrument
+from analogrig_instruments.ni_daqmx import NiDaqmx
+from analogrig_instruments.real import RealRig
+from analogrig_instruments.wiring import RealDescription
 from tests.harness.allowed import open_allowed
 from tests.served.serving import serving
 

@@ -14,7 +14,7 @@ import pytest
 from analogrig import cli, config
 from analogrig.bench import Bench
 from analogrig.datasheet import ModelOrders
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging import information
 from analogrig.judging.verdict import BOUNDS, ESTIMATES, as_json, judge

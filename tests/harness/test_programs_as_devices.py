@@ -20,7 +20,7 @@ from analogrig.bench import Bench
 from analogrig.catalogue import SteppedFlag
 from analogrig.devices import child
 from analogrig.devices.device import Device
-from analogrig.devices.program import ProgramDevice
+from analogrig.devices.lines import ProgramDevice
 from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError, LinkError, LinkTimeout
 from analogrig.rigs.description import open_rig

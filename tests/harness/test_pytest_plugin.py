@@ -19,8 +19,8 @@ import analogrig.reporting  # these two for the runs in this process, which forg
 import analogrig.testing.properties.experiments  # noqa: F401
 from analogrig import cli, config
 from analogrig.bench import Bench
-from analogrig.devices.host import host_child
-from analogrig.devices.opening import open_dut
+from analogrig.devices.processes import host_child
+from analogrig.devices.registry import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario, Statement
@@ -493,6 +493,47 @@ def board() -> Iterator[str]:
 
 
 # ------------------------------------------------------------------------------------------------ folder of what failed
+
+
+WRONG_NUMBERS = """\
+import pytest
+from analogrig import rate_below, with_some_seed
+
+def play(hil_play, **options):
+    return hil_play("short.toml", **options)
+
+@pytest.mark.parametrize("within", [1e308, "4", float("nan"), float("inf"), -1, True])
+def test_limit(hil_play, within):
+    played = play(hil_play)
+    assert played.detects(within=within)
+
+@pytest.mark.parametrize("seed", ["4", -1, 1e308, True])
+def test_seed(hil_play, seed):
+    assert play(hil_play, seed=seed).passes()
+
+def test_rate(hil_play):
+    assert rate_below(1e-3, [play(hil_play)], confidence=99)
+
+def test_tries(hil_play):
+    assert with_some_seed(hil_play, "short.toml", 1, lambda played: played.passes(), tries=0)
+"""
+
+
+def test_wrong_numbers_in_a_test_are_one_line_each(user: pytest.Pytester) -> None:
+    place = user.makepyfile(WRONG_NUMBERS)
+    result = run(user, "--hil-dut", "inproc")
+    result.assert_outcomes(failed=12)
+    text = result.stdout.str()
+    assert "Traceback" not in text and "Error" not in text.partition("short test summary")[0]
+    for line in (
+        f"{place.name}:10: detects: within: must be a number within +-1e+30, not 1e+308",
+        f"{place.name}:10: detects: within: must be a number within +-1e+30, not '4'",
+        f"{place.name}:10: detects: within: must be 0 or more, not -1",
+        "seed must be a whole number from 0 to 2^63 - 1, not '4'",
+        f"{place.name}:17: rate_below: confidence: must be between 0 and 1, both excluded, not 99",
+        f"{place.name}:20: with_some_seed: tries: must be 1 to 1000, not 0",
+    ):
+        assert line in result.outlines
 
 
 DETECTS_SOON = PLAYS.format(assertion="assert played.detects(within={within})")

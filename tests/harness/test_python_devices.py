@@ -1,7 +1,8 @@
-"""Devices of the kind ``python``: answers, settings and errors of an object in this process."""
+"""Devices of the kind ``python``: answers, settings and errors of an object."""
 
 from __future__ import annotations
 
+import hashlib
 import re
 import sys
 import textwrap
@@ -12,15 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
+from analogrig.answers import Answers, Samples
 from analogrig.bench import Bench
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.cli import main
 from analogrig.datasheet import Datasheet, ModelOrders
-from analogrig.devices.description import DeviceDescription
-from analogrig.devices.device import Device
-from analogrig.devices.opening import open_dut, reopen_dut
+from analogrig.devices.device import Device, DeviceDescription
 from analogrig.devices.python import PythonDescription
+from analogrig.devices.registry import open_dut, reopen_dut
 from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused, TimeLimitReached
 from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
@@ -58,7 +58,8 @@ def samples(n: int, first: int = 0, missing: Sequence[int] = ()) -> Samples:
 
 
 def made(factory: str, **settings: Any) -> Device:
-    return PythonDescription(name="it", factory=f"{ESTIMATORS}:{factory}", settings=settings).connect()
+    """Device in this process, which takes a hundredth of the time of a child."""
+    return PythonDescription(name="it", factory=f"{ESTIMATORS}:{factory}", settings=settings, in_process=True).connect()
 
 
 def answered(device: Device, *blocks: Samples) -> list[Answers]:
@@ -82,12 +83,12 @@ def test_every_quantity_arrives_at_its_sample() -> None:
     assert first.theta.tolist() == [[0, 0], [1, -1], [1, -1], [3, -3]], "a missing sample repeats the estimate"
     assert first.innovation.tolist() == first.statistic.tolist() == [0, 1, 2, 3]
     assert first.flags.tolist() == [UNARMED, UNARMED, UNARMED | SteppedFlag.MISSING, 0]
-    assert first.alarms == (RaisedAlarm(0, statistic=0.0), RaisedAlarm(3, statistic=3.0))
-    assert first.diagnoses[1] == ReportedDiagnosis(3, Change.MASS, 3, 0.5)
-    assert first.misfits[1] == ReportedMisfit(3, Cause.HUM, 0.25)
+    assert first.alarms.tolist() == [(0, 0, 0.0), (3, 0, 3.0)]
+    assert first.diagnoses.tolist()[1] == (3, Change.MASS, 3, 0.5)
+    assert first.misfits.tolist()[1] == (3, Cause.HUM, 0.25, 0.0)
     assert second.theta is not None
     assert second.theta.tolist() == [[4, -4], [5, -5]]
-    assert (len(second), second.alarms) == (2, ())
+    assert (len(second), len(second.alarms)) == (2, 0)
 
 
 def test_sample_without_an_estimate_is_unreported() -> None:
@@ -113,7 +114,7 @@ def test_quantity_that_is_not_reported_is_absent() -> None:
     assert answers.theta is answers.innovation is answers.statistic is None
 
 
-def test_record_begins_anew_with_reset_or_with_a_new_object(folder: Path) -> None:
+def test_each_record_has_a_new_object(folder: Path) -> None:
     name = module(
         folder,
         """
@@ -124,15 +125,11 @@ def test_record_begins_anew_with_reset_or_with_a_new_object(folder: Path) -> Non
             def step(self, u, y, valid):
                 self.n += 1
                 return self.n == 2
-        class Reset(New):
-            def reset(self): self.n = 0
         """,
     )
-    for factory, objects in (("New", 3), ("Reset", 1)):
-        device = open_dut(f"python:{name}:{factory}")
-        before = len(sys.modules[name].made)
-        assert [[a.index for a in answered(device, samples(4))[0].alarms] for _ in range(3)] == [[1]] * 3
-        assert len(sys.modules[name].made) - before == objects - 1
+    device = open_dut(f"python:{name}:New?in_process=true")
+    assert [[a.index for a in answered(device, samples(4))[0].alarms] for _ in range(3)] == [[1]] * 3
+    assert len(sys.modules[name].made) == 3, "the one of the handshake is that of the first record"
 
 
 def test_data_sheet_of_the_object_replaces_what_the_file_states() -> None:
@@ -144,8 +141,10 @@ def test_data_sheet_of_the_object_replaces_what_the_file_states() -> None:
     device = PythonDescription(
         name="it", factory=f"{ESTIMATORS}:Answering", settings=settings, datasheet=stated
     ).connect()
-    assert device.datasheet == Datasheet(theta_n=3, model=ModelOrders(2, 1), hold_off_n=60, cannot_tell=("a hang",))
-    assert Datasheet.recorded(device.description()) == device.datasheet
+    with device:
+        sheet = Datasheet(theta_n=3, model=ModelOrders(2, 1), hold_off_n=60, cannot_tell=("a hang",))
+        assert device.datasheet == sheet
+        assert Datasheet.recorded(device.description()) == device.datasheet
 
 
 def test_settings_come_from_file_and_command_line_and_are_recorded(folder: Path) -> None:
@@ -160,19 +159,19 @@ def test_settings_come_from_file_and_command_line_and_are_recorded(folder: Path)
     (folder / "it.toml").write_text(
         f'kind = "python"\nfactory = "{name}:It"\nsettings = {{ threshold = 4, kind = "3d" }}'
     )
-    for device in (
+    for opened in (
         open_dut(f"python:{name}:It?threshold=4&kind=3d"),
         open_dut("it.toml", allow=f"python:{name}:It"),
     ):
-        assert len(answered(device, samples(1))[0].alarms) == 1
-        again = reopen_dut(device.description(), "run.npz", allow=[f"python:{name}:It"])
-        assert again.description() == device.description()
-        assert len(answered(again, samples(1))[0].alarms) == 1
-        device.configure(threshold=5)
-        assert len(answered(device, samples(1))[0].alarms) == 0
-        with pytest.raises(DeviceRefused, match="has no setting thershold; it has threshold, kind"):
-            device.configure(threshold=4, thershold=4)
-        assert len(answered(device, samples(1))[0].alarms) == 0, "all or none"
+        with opened as device, reopen_dut(device.description(), "run.npz", allow=[f"python:{name}:It"]) as again:
+            assert len(answered(device, samples(1))[0].alarms) == 1
+            assert again.description() == device.description()
+            assert len(answered(again, samples(1))[0].alarms) == 1
+            device.configure(threshold=5)
+            assert len(answered(device, samples(1))[0].alarms) == 0
+            with pytest.raises(DeviceRefused, match="has no setting thershold; it has threshold, kind"):
+                device.configure(threshold=4, thershold=4)
+            assert len(answered(device, samples(1))[0].alarms) == 0, "all or none"
 
 
 def test_file_may_not_import_a_module_of_itself(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -274,19 +273,6 @@ def test_odd_failure_of_the_object_is_one_line(
     assert f"device python:{name}:It: {error.format(name=name, file=folder / f'{name}.py')}" in line
 
 
-def test_ctrl_c_is_no_failure_of_the_object(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    name = module(
-        folder,
-        """
-        import os, signal
-        class It:
-            def step(self, u, y, valid): os.kill(os.getpid(), signal.SIGINT)
-        """,
-    )
-    assert main(["run", "--dut", f"python:{name}:It"]) == 130
-    assert "interrupted by SIGINT" in capsys.readouterr().err
-
-
 WRONG_ANSWERS: dict[str, tuple[object, object, str]] = {
     "text": ("no", None, r"must return True, False or an object with such an alarm, not 'no' \(str\)"),
     "nothing": (None, None, r"not None \(NoneType\)"),
@@ -359,14 +345,17 @@ def test_time_limit_ends_the_play_after_the_answers_in_time() -> None:
 
 def test_file_of_the_module_is_recorded_as_it_was_imported(folder: Path) -> None:
     name = module(folder, "class It:\n    def step(self, u, y, valid): return False\n")
-    (before,) = open_dut(f"python:{name}:It").files()
-    (folder / f"{name}.py").write_text("")
-    (after,) = open_dut(f"python:{name}:It").files()
-    assert before == after
-    assert Path(before.path).name == f"{name}.py" and len(before.sha256) == 64
+    with open_dut(f"python:{name}:It") as device:
+        (folder / f"{name}.py").write_text("")
+        (file,) = device.files()
+    assert Path(file.path).name == f"{name}.py"
+    assert file.sha256 == hashlib.sha256(b"class It:\n    def step(self, u, y, valid): return False\n").hexdigest()
 
 
-def test_device_runs_in_this_process_in_blocks() -> None:
-    description: DeviceDescription = PythonDescription(name="it", factory=f"{ESTIMATORS}:Core")
-    assert description.capabilities == {"blocks", "configure", "in-process"}
+@pytest.mark.parametrize("in_process", [False, True])
+def test_device_takes_blocks(*, in_process: bool) -> None:
+    description: DeviceDescription = PythonDescription(name="it", factory=f"{ESTIMATORS}:Core", in_process=in_process)
+    here = {"in-process"} if in_process else set()
+    assert description.capabilities == {"blocks", "configure", *here}
+    assert description.known_datasheet().cannot_tell == (("a state left from before the record",) if in_process else ())
     assert description.only_one == "" and description.program is None

@@ -17,13 +17,10 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.config import names
-from analogrig.devices.description import DeviceDescription
-from analogrig.devices.device import Device
-from analogrig.devices.host import HostDevice
+from analogrig.devices.device import Device, DeviceDescription
 from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.opening import reopen_dut
-from analogrig.devices.qemu import QemuDevice, QemuF405, QemuM4
-from analogrig.devices.registry import KINDS, describe, from_table
+from analogrig.devices.processes import HostDevice, QemuDevice, QemuF405, QemuM4
+from analogrig.devices.registry import KINDS, describe, from_table, reopen_dut
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
@@ -94,7 +91,7 @@ def test_every_scenario_gives_the_same_bits_on_every_device(
     assert run.alarm_index.tolist() == expected.alarm_index.tolist()
 
 
-@pytest.mark.parametrize("options", ["exchange=sample", "exchange=stream", "link=slcan"])
+@pytest.mark.parametrize("options", ["exchange=sample", "exchange=stream"])
 def test_stm32_gives_the_same_bits(options: str) -> None:
     """The port is the same as that of the other boards, but for the registers of its UARTs."""
     scenario = shortened("thesis")

@@ -10,10 +10,10 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.catalogue import BLOCK_SAMPLES, Sample
 from analogrig.devices.catalogue_device import CatalogueDevice
-from analogrig.devices.description import DeviceDescription
-from analogrig.devices.host import HostDevice
+from analogrig.devices.device import DeviceDescription
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
+from analogrig.devices.processes import HostDevice
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge
 from analogrig.links.line import SerialLine

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.judging.verdict import judge
 from analogrig.plant import Segment
 from analogrig.rigs.description import open_rig

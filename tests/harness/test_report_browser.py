@@ -13,9 +13,9 @@ from analogrig.judging.verdict import Verdict, judge
 from analogrig.reporting import write_report
 from analogrig.run import Run
 from tests.browser import Watched
-from tests.harness.long_runs import long_run
 from tests.harness.reported import NOTICED, empty_run, reported_run, reported_verdict
 from tests.harness.runs import with_fault
+from tests.soak.long_runs import long_run
 
 PLOTS = 7
 FORCE, MASS, STIFFNESS, INNOVATION, STATISTIC = 0, 2, 4, 5, 6

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 from analogrig.bench import Bench
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.judging.response import StepResponse, step_responses
 from analogrig.judging.verdict import judge
 from analogrig.reporting import summary

@@ -12,13 +12,13 @@ from scipy import stats
 
 from analogrig.bench import Bench
 from analogrig.cli import main
-from analogrig.devices.opening import open_dut
-from analogrig.hardware.rig_comparison import RigComparison, compare_rigs, signal_difference
+from analogrig.devices.registry import open_dut
 from analogrig.judging.statistics import mean_interval
 from analogrig.rigs.emulator import CardDescription, EmulatorDescription, EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import CHANNELS
+from analogrig_instruments.rig_comparison import RigComparison, compare_rigs, signal_difference
 from tests.harness.runs import made_run
 
 from .plants import front

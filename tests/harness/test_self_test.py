@@ -17,13 +17,13 @@ from scipy.stats import chi2
 
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RigError, SelfTestError
-from analogrig.hardware.self_test import Check, Findings, self_test
-from analogrig.hardware.square_wave import EdgeTimes, Response, SquareWave, step_response
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.scenario import Scenario
 from analogrig_emulator import CHANNELS
+from analogrig_instruments.self_test import Check, Findings, self_test
+from analogrig_instruments.square_wave import EdgeTimes, Response, SquareWave, step_response
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))

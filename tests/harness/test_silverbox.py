@@ -11,19 +11,14 @@ import pytest
 
 from analogrig.cli import main
 from analogrig.config import fixtures
-from analogrig.hardware.calibration.recorded import RecordedPlant, fit_program
 from analogrig.judging.verdict import judge
 from analogrig.reporting.measured import mode_of
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig_emulator import load_patch
-from tests.benchmarks import bench_silverbox, silverbox
+from analogrig_instruments.calibration.recorded import RecordedPlant, fit_program
+from tests.bench import bench_silverbox, silverbox
 
 EXAMPLES = Path(__file__).parents[2] / "harness" / "examples"
-
-try:
-    silverbox.find_file()
-except FileNotFoundError as absent:
-    pytest.skip(str(absent), allow_module_level=True)
 
 
 def test_the_estimate_is_that_of_batch_least_squares() -> None:

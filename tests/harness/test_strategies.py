@@ -12,8 +12,11 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 
 from analogrig import config
-from analogrig.bench import Bench, direct_bench
+from analogrig.bench import Bench
+from analogrig.campaigns.together import direct_bench
 from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.registry import open_dut
+from analogrig.errors import AnalogrigError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import judge
@@ -130,14 +133,14 @@ FALLS = Scenario(1000, HALF, tweaks=(PotChange(600, {"K": 18000.0}),))
 
 
 def test_change_of_nothing_that_shows_is_not_detectable() -> None:
-    assert detectable(FALLS, 1e5)
+    assert detectable(FALLS, 1e5, rig="emulator")
     still = dataclasses.replace(HALF, low_v=0.0, high_v=0.0)
-    assert not detectable(dataclasses.replace(FALLS, excitation=still), 1e5)
-    assert not detectable(dataclasses.replace(FALLS, samples=602), 1e300)
+    assert not detectable(dataclasses.replace(FALLS, excitation=still), 1e5, rig="emulator")
+    assert not detectable(dataclasses.replace(FALLS, samples=602), 1e300, rig="emulator")
 
 
 def test_predicted_bound_is_that_of_the_run(bench: Bench) -> None:
-    (predicted,) = predicted_bounds(FALLS, 1e5)
+    (predicted,) = predicted_bounds(FALLS, 1e5, rig="emulator")
     (tweak,) = judge(bench.play(FALLS, 1)).tweaks
     assert predicted is not None and tweak.bound_n is not None
     assert abs(predicted - tweak.bound_n) <= 1
@@ -167,3 +170,26 @@ def test_estimate_follows_itself_within_a_tube_and_not_what_comes_later(bench: B
 def test_alarms_without_a_change_are_counted() -> None:
     finding = Played(made_run(np.zeros(100), [(0, front())], alarms=[7, 50])).stays_quiet()
     assert not finding and finding.why == "2 false alarms in 100 samples: 7, 50"
+
+
+def test_prediction_takes_the_card_of_the_rig_and_the_program_of_the_scenario() -> None:
+    """The channels of dc-motor have 25 V on 12 bits, those of front 10 or 20 V."""
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        for name in ("dc-motor", "pendulum", "rc-battery"):
+            scenario = dataclasses.replace(Scenario.load(name), random_phase=False)
+            verdict = judge(Bench(rig, dut).play(scenario, 1))
+            predicted = predicted_bounds(scenario, verdict.arl0, rig=rig)
+            for expected, tweak in zip(predicted, verdict.tweaks, strict=True):
+                assert (expected is None) == (tweak.bound_n is None)
+                assert expected is None or abs(expected - (tweak.bound_n or 0)) <= 1
+
+
+@pytest.mark.parametrize("rig", ["recording:fixtures/recordings/simulated.npz", "red-pitaya"])
+def test_prediction_needs_an_emulated_rig(rig: str) -> None:
+    with pytest.raises(AnalogrigError):
+        detectable(FALLS, 1e5, rig=rig)
+
+
+def test_prediction_has_no_default_rig() -> None:
+    with pytest.raises(TypeError, match="rig"):
+        detectable(FALLS, 1e5)  # type: ignore[call-arg]

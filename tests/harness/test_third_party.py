@@ -11,13 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import DeviceDescription
 from analogrig.devices.registry import KINDS
 from analogrig.kinds import Kinds
 from analogrig.run import Run
 
-PAGE = Path(__file__).parents[2] / "harness/docs/howto/add-a-kind-of-device.md"
-RIG = Path(__file__).with_name("third_party.py")
+ROOT = Path(__file__).parents[2]
+PAGES = {
+    page: ROOT / f"harness/docs/howto/{page}.md"
+    for page in ("add-a-kind-of-device", "add-a-rig", "add-an-instrument", "add-a-command")
+}
 SCENARIO = """\
 samples = 400
 rig = "flat"
@@ -45,7 +48,7 @@ BROKEN = {
         "jump": ("broken_kinds_fail:It", "cannot be imported"),
     },
     "rigs": {
-        "emulator": ("third_party:FlatDescription", "cannot replace a kind that there is"),
+        "emulator": ("my_rigs:FlatDescription", "cannot replace a kind that there is"),
         "gone": ("no_such_module:It", "No module named 'no_such_module'"),
     },
 }
@@ -63,16 +66,22 @@ def install(site: Path, package: str, **groups: dict[str, str]) -> None:
     (info / "entry_points.txt").write_text(text)
 
 
+def files_of(page: str) -> dict[str, str]:
+    """Files that a page shows, by name: the first line of each block has it as a comment."""
+    text = PAGES[page].read_text(encoding="utf-8")
+    return dict(re.findall(r"^```\w+\n# ([\w.]+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL))
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the installed package of the page, and a rig."""
+    """Folder with the packages of the pages as pip installs them."""
     folder = tmp_path_factory.mktemp("site")
-    (source,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    (folder / "my_kinds.py").write_text(source)
-    (folder / "third_party.py").write_text(RIG.read_text(encoding="utf-8"))
-    install(
-        folder, "my_kinds", devices={"jump": "my_kinds:JumpDescription"}, rigs={"flat": "third_party:FlatDescription"}
-    )
+    packages = [tmp_path_factory.mktemp(page) for page in PAGES]
+    for package, page in zip(packages, PAGES, strict=True):
+        for name, text in files_of(page).items():
+            (package / name).write_text(text)
+    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation")
+    subprocess.run([*pip, "--target", folder, *packages], check=True)
     return folder
 
 
@@ -139,7 +148,7 @@ def test_broken_packages_are_listed_and_break_nothing_else(site: Path, folder: P
         rows = [(row["name"], row["description"]) for row in listed[group]]
         for kind, (_, text) in kinds.items():
             assert any(name == kind and text in shown for name, shown in rows), (kind, rows)
-    assert "host[?link=slcan]" in {row["name"] for row in listed["devices"]}
+    assert "host[?baud=...]" in {row["name"] for row in listed["devices"]}
     played = run(both, folder, "analogrig.cli", "run", "--dut", "inproc", "--out", "out")
     assert (played.returncode, played.stderr) == (0, "")
     failed = run(both, folder, "analogrig.cli", "run", "--dut", "failing")
@@ -182,3 +191,57 @@ def test_package_that_states_its_entry_points_wrongly_harms_no_other(
         monkeypatch.syspath_prepend(tmp_path / name)
     kinds = Kinds(DeviceDescription, "analogrig.devices", {})
     assert "fine" in list(kinds)
+
+
+def test_command_of_another_package_is_listed_and_runs(site: Path, folder: Path) -> None:
+    assert "\n    span        print the span" in run(site, folder, "analogrig.cli", "--help").stdout
+    run(
+        site,
+        folder,
+        "analogrig.cli",
+        "run",
+        "--dut",
+        "jump:80",
+        "--rig",
+        "flat",
+        "--scenario",
+        "scenario.toml",
+        "--out",
+        "out",
+    )
+    done = run(site, folder, "analogrig.cli", "span", "out/run.npz", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["force"] == 0
+    wrong = run(site, folder, "analogrig.cli", "span", "none.npz")
+    assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
+
+
+def test_instrument_of_another_package_records(site: Path, folder: Path) -> None:
+    (folder / "rigs.toml").write_text(files_of("add-an-instrument")["rigs.toml"])
+    refused = run(site, folder, "analogrig.cli", "doctor", "--rig", "loop")
+    assert refused.returncode == 2
+    assert "--allow loop://bench" in refused.stderr
+    done = run(site, folder, "analogrig.cli", "doctor", "--rig", "loop", "--allow", "loop://bench", "--json")
+    assert (done.returncode, done.stderr) == (1, ""), done.stdout
+    assert any(check["state"] == "wrong" for check in json.loads(done.stdout)["checks"])
+
+
+@pytest.mark.parametrize(
+    ("target", "text"),
+    [
+        ("no_such_module:add", "No module named 'no_such_module'"),
+        ("json:loads", "TypeError: "),
+        ("nothing:add", "adds no command of this name"),
+    ],
+)
+def test_broken_command_harms_no_other(site: Path, folder: Path, target: str, text: str) -> None:
+    (folder / "nothing.py").write_text("def add(commands): pass\n")
+    install(folder, "broken", commands={"broke": target, "run": "my_command:add"})
+    both = Path(f"{site}{os.pathsep}{folder}")
+    helped = run(both, folder, "analogrig.cli", "--help")
+    assert helped.returncode == 0
+    assert "command 'run' of the package broken (analogrig.commands: my_command:add) is ignored" in helped.stderr
+    broken = run(both, folder, "analogrig.cli", "broke", "--any", "thing")
+    assert broken.returncode == 2
+    assert text in broken.stderr.splitlines()[-1]
+    assert run(both, folder, "analogrig.cli", "span", "none.npz").returncode == 2

@@ -36,18 +36,17 @@ from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.store import Store
 from analogrig.cli import main
 from analogrig.devices.can import CanDevice
-from analogrig.devices.opening import open_dut, reopen_dut
-from analogrig.devices.registry import KINDS, describe, from_table, named_things
-from analogrig.devices.serial import SerialDevice
+from analogrig.devices.port import SerialDevice
+from analogrig.devices.registry import KINDS, describe, from_table, named_things, open_dut, reopen_dut
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import DRIVERS
-from analogrig.hardware.pots import InstrumentPots, PotsDescription
-from analogrig.hardware.wiring import Input, RealDescription
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.counterexample import Counterexample
 from analogrig.trust import FiledName, Thing, Trust, resolve_name
+from analogrig_instruments.instrument import DRIVERS
+from analogrig_instruments.pots import InstrumentPots, PotsDescription
+from analogrig_instruments.wiring import Input, RealDescription
 from tests.served.serving import serving
 
 pytestmark = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io:pytest.PytestUnraisableExceptionWarning")

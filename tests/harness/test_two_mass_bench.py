@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analogrig.estimator_config import EstimatorConfig
-from tests.benchmarks.bench_two_mass import delays, device, false_alarms
+from tests.bench.bench_two_mass import delays, device, false_alarms
 
 
 def test_changes_of_the_suspension_are_detected_within_the_bound_of_the_benchmark() -> None:

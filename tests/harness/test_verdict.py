@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from analogrig.catalogue import Change
-from analogrig.judging.verdict import DiagnosisVerdict, as_json, judge
+from analogrig.judging.verdict import NOTHING_TO_DETECT, DiagnosisVerdict, as_json, judge
 from analogrig.plant import Plant
 from analogrig.run import LOST
 from tests.harness.runs import ESTIMATOR, made_run
@@ -61,15 +61,15 @@ def test_change_just_before_the_end_without_an_alarm_is_not_missed() -> None:
     late = judge(made_run(LOADED, [(0, FRONT), (785, SOFT)]))
     assert late.tweaks[0].bound_n is not None
     assert late.tweaks[0].result == "unseeable"
-    assert late.outcome == "passed"
+    assert late.reasons == (NOTHING_TO_DETECT,)
     assert judge(made_run(LOADED, [(0, FRONT), (760, SOFT)])).tweaks[0].missed
 
 
-def test_undetectable_change_without_an_alarm_passes() -> None:
+def test_undetectable_change_without_an_alarm_proves_nothing() -> None:
     verdict = judge(made_run(np.zeros(800), CHANGE))
     assert verdict.tweaks[0].bound_n is None
     assert not verdict.tweaks[0].missed
-    assert verdict.outcome == "passed"
+    assert (verdict.outcome, verdict.reasons) == ("inconclusive", (NOTHING_TO_DETECT,))
 
 
 def test_alarm_after_a_change_without_information_is_false() -> None:

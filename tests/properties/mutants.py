@@ -130,14 +130,12 @@ _library: list[Path] = []
 _begun: list[tuple[Session, Build]] = []
 
 
-def _load_mutants() -> None:
-    """Have ctypes load the mutant wherever the project's device is asked for."""
-    from analogrig.devices.library import LIBRARY
-
+def _load_mutants(device: Path) -> None:
+    """Have ctypes load the mutant wherever the device is asked for, which is not the bundled library."""
     load: Callable[..., Any] = ctypes.CDLL
 
     def load_mutant(name: Any, *args: Any, **kwargs: Any) -> Any:
-        return load(str(_library[-1]) if name == str(LIBRARY) else name, *args, **kwargs)
+        return load(str(_library[-1]) if name == str(device) else name, *args, **kwargs)
 
     ctypes.CDLL = load_mutant  # type: ignore[assignment,misc]
 
@@ -174,8 +172,9 @@ def try_all(
     """Report each outcome as soon as it is known; RuntimeError if a property fails on the device as it is."""
     with tempfile.TemporaryDirectory() as scratch:
         build = Build(Path(scratch, "device"))
-        _library.append(build.folder / "device.so")
-        _load_mutants()
+        device = build.folder / "device.so"
+        _library.append(device)
+        _load_mutants(device)
 
         def work(session: Session) -> None:
             _begun.append((session, build))
@@ -185,7 +184,14 @@ def try_all(
 
         arguments = [
             *("-c", os.devnull, f"--rootdir={scratch}", "-p", "no:randomly", "-p", FOUND_ONLY, "--tb=no"),
-            *("--pyargs", "analogrig.testing.properties", "--hil-dut", "inproc", "--hil-runs-dir", f"{scratch}/runs"),
+            *(
+                "--pyargs",
+                "analogrig.testing.properties",
+                "--hil-dut",
+                f"inproc:{device}",
+                "--hil-runs-dir",
+                f"{scratch}/runs",
+            ),
             *(("-k", only) if only else ()),
         ]
         Session(arguments, noticed, work, begin=_forget_devices, deadline_s=DEADLINE_S).run()

@@ -6,6 +6,7 @@ simplest scenario, and writes the table of README.md. test_planted_defects.py do
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -141,19 +142,27 @@ def _words(scenario: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    rows, missed = [], []
+    parser = argparse.ArgumentParser(description="Plant each defect of defects.toml, and write the table of README.md.")
+    parser.add_argument("--new", action="store_true", help="try only defects that the table lacks")
+    is_new_only = parser.parse_args().new
+    head, _, table = README.read_text(encoding="utf-8").partition(TABLE)
+    rows = {row.split(" | ")[0].removeprefix("| "): row for row in table.splitlines()} if is_new_only else {}
+    missed = []
     for defect in defects():
+        if defect.name in rows:
+            continue
         folder = ROOT / "build" / "defects" / re.sub(r"\W+", "-", defect.name)
         shutil.rmtree(folder, ignore_errors=True)
         found = tried(planted(defect, folder), defect.property, folder, shrunk=True)
         (folder / "output.txt").write_text(found.output, encoding="utf-8")
         if not found.failed:
             missed.append(defect.name)
-        rows.append(f"| {defect.name} | `{defect.property}` | {simplest(found.runs)} | {found.why.replace('|', '/')} |")
+        cells = defect.name, f"`{defect.property}`", simplest(found.runs), found.why.replace("|", "/")
+        rows[defect.name] = f"| {' | '.join(cells)} |"
         sys.stdout.write(f"{'found ' if found.failed else 'MISSED'} {defect.name}\n")
         sys.stdout.flush()
-    head = README.read_text(encoding="utf-8").partition(TABLE)[0]
-    README.write_text(head + TABLE + "\n".join(rows) + "\n", encoding="utf-8")
+        kept = [rows[each.name] for each in defects() if each.name in rows]
+        README.write_text(head + TABLE + "\n".join(kept) + "\n", encoding="utf-8")
     sys.stdout.write(json.dumps({"missed": missed}) + "\n")
     return 1 if missed else 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.estimator import ReferenceEstimator
-from analogrig.testing.reference.isolation import ReferenceIsolation
+from analogrig.run import Run
+from tests.reference.estimator import ReferenceEstimator
+from tests.reference.isolation import ReferenceIsolation
+
+ROUNDING = 0.1
+"""Largest deviation of an innovation from the reference, in standard deviations of that innovation: float32 may cost a
+tenth of what noise costs. Half of it is the most that was measured."""
+
+THETA_ROUNDING = 0.2
+"""The same of an element of theta, in its own standard deviations."""
+
+STATISTIC_ROUNDING = 0.2
+"""The same of the statistic, relative to the statistic and 1."""
+
+EXTENT_ROUNDING = 0.0075
+"""The same of the extent of a change, in its own standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,3 +103,51 @@ def _expected(config: EstimatorConfig, u: bytes, y: bytes, valid: bytes) -> Expe
         sure_n=sure_n,
         sure_diagnoses_n=sure_diagnoses_n,
     )
+
+
+def differences(run: Run, expected: Expected) -> Iterator[str]:
+    """Differences of a run from the reference, the most telling first, as far as rounding decides nothing."""
+    sure = slice(0, expected.sure_n)
+    if not np.array_equal(run.flags[sure], expected.flags[sure]):
+        at = int(np.argmax(run.flags != expected.flags))
+        yield f"flags at sample {at} are {run.flags[at]:#04x}, expected {expected.flags[at]:#04x}"
+    alarms, wanted = ([k for k in each if k < sure.stop] for each in (run.alarm_index.tolist(), expected.alarms))
+    if alarms != wanted:
+        yield f"alarms at {alarms[:9]}, expected at {wanted[:9]}"
+    for name, deviation in (
+        ("innovation", ROUNDING * expected.deviation),
+        ("theta", THETA_ROUNDING * expected.theta_deviation),
+        ("statistic", STATISTIC_ROUNDING * (1.0 + expected.statistic)),
+    ):
+        yield from _beyond(name, getattr(run, name)[sure], getattr(expected, name)[sure], deviation[sure])
+    if not np.array_equal(run.alarm_statistic, run.statistic[run.alarm_index]):
+        yield "an alarm has another statistic than its sample"
+    yield from _other_diagnoses(run, expected)
+    for name, count in expected.counters.items() if sure.stop == run.samples else ():
+        if run.conditions.counters[name] != count:
+            yield f"{run.conditions.counters[name]} {name} counted, expected {count}"
+
+
+def _other_diagnoses(run: Run, expected: Expected) -> Iterator[str]:
+    sure = run.diagnosis_index < expected.sure_diagnoses_n
+    named = np.column_stack([run.diagnosis_index, run.diagnosis_change, run.diagnosis_onset])[sure].tolist()
+    diagnoses = [each for each in expected.diagnoses if each[0] < expected.sure_diagnoses_n]
+    wanted = [list(each[:3]) for each in diagnoses]
+    if named != wanted:
+        yield f"diagnoses (sample, change, onset) {named}, expected {wanted}"
+        return
+    extents, deviations = (np.array([each[i] for each in diagnoses]) for i in (3, 4))
+    yield from _beyond("extent", run.diagnosis_extent[sure], extents, EXTENT_ROUNDING * deviations)
+
+
+def _beyond(
+    name: str, found: NDArray[np.float32], expected: NDArray[np.float64], allowed: NDArray[np.float64]
+) -> Iterator[str]:
+    if found.shape != expected.shape:
+        yield f"{name} has the shape {found.shape}, expected {expected.shape}"
+        return
+    outside = np.argwhere(~(np.abs(found - expected) <= allowed + 1e-6 * (1.0 + np.abs(expected))))
+    if len(outside):
+        at = tuple(outside[0].tolist())
+        element = f"[{at[1]}]" if len(at) > 1 else ""
+        yield f"{name}{element} at sample {at[0]} is {found[at]:g}, expected {expected[at]:g} +- {allowed[at]:.2g}"

@@ -37,8 +37,8 @@ from analogrig.catalogue import (
 )
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.estimator import COUNTERS, ReferenceEstimator
-from analogrig.testing.reference.settings import ReferenceSettings
+from tests.reference.estimator import COUNTERS, ReferenceEstimator
+from tests.reference.settings import ReferenceSettings
 
 LATE_MAX, GAP_MAX, MOST_INTERVAL = 32, 1024, 65_535
 """Sequence numbers that count as repeated, samples of a gap that are entered, and longest interval of reports."""

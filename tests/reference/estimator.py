@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from analogrig.catalogue import SteppedFlag
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.regression import (
+from tests.reference.regression import (
     Covariance,
     Vector,
     Whitener,
@@ -25,7 +25,7 @@ from analogrig.testing.reference.regression import (
     to_delta,
     to_plain,
 )
-from analogrig.testing.reference.trigger import Meaning, ReferenceTrigger
+from tests.reference.trigger import Meaning, ReferenceTrigger
 
 DOUBT_N = 12
 """Samples after an edge during which a slip is considered."""

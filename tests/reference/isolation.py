@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from analogrig.catalogue import Change, SteppedFlag
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.estimator import ReferenceEstimator, ReferenceStep
+from tests.reference.estimator import ReferenceEstimator, ReferenceStep
 
 KEPT_N, PAST_N, SETTLED_N = 40, 4, 100
 """Samples that are kept, those of them before the earliest onset or not yet processed, and samples after an alarm at

@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import Enum
 
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.correlation import ReferenceCorrelation
-from analogrig.testing.reference.regression import Vector
+from tests.reference.correlation import ReferenceCorrelation
+from tests.reference.regression import Vector
 
 BLOCK_N = 32
 """Equations between two updates."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import Enum
 
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.testing.reference.correlation import DRIFT, GAIN, cusum
-from analogrig.testing.reference.scale import HIGH_LIMIT, ReferenceScale
+from tests.reference.correlation import DRIFT, GAIN, cusum
+from tests.reference.scale import HIGH_LIMIT, ReferenceScale
 
 NEAR = 0.003
 """Distance from the ceiling at which rounding may decide, relative to the ceiling and 1."""

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.lucidac_messages import protocol
-from analogrig.hardware.simulator.lucidac_registers import Registers
-from analogrig.hardware.simulator.served_lucidac import MAC
 from analogrig_emulator.lucidac.configuration import Configuration
 from analogrig_emulator.lucidac.machine import Lucidac
+from analogrig_lucidac.messages import protocol
+from analogrig_lucidac.registers import Registers
+from analogrig_lucidac.served_machine import MAC
 from tests.emulator.ideal_lucidac import ideal_solution
 from tests.harness.processes import LONG_S
 from tests.served.lucidac_examples import Example

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.config import locate
-from analogrig.hardware.simulator.served import ServedDescription
-from analogrig.hardware.simulator.server import Server
-from analogrig.hardware.simulator.tcp_server import TcpServer
 from analogrig.program import Program
 from analogrig.scenario import DEFAULT_SEED
+from analogrig_instruments.simulator.served import ServedDescription
+from analogrig_instruments.simulator.server import Server
+from analogrig_instruments.simulator.tcp_server import TcpServer
 from tests.harness.processes import LONG_S
 
 ROOT = Path(__file__).parents[2]

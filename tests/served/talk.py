@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.simulator.scpi import Interpreter
-from analogrig.hardware.simulator.served import InstrumentDescription, ServedRedPitaya
 from analogrig_emulator import SuspensionComputer
+from analogrig_instruments.simulator.scpi import Interpreter
+from analogrig_instruments.simulator.served import InstrumentDescription, ServedRedPitaya
 
 SEQUENCE = (
     "GEN:RST",

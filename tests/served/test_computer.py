@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analogrig.hardware.instrument import DialChange
-from analogrig.hardware.simulator.computer import CHUNK_N, Amplifier, Booster, WiredComputer, Wiring
 from analogrig_emulator import EmulatorError, Excitation, PotTurn
+from analogrig_instruments.instrument import DialChange
+from analogrig_instruments.simulator.computer import CHUNK_N, Amplifier, Booster, WiredComputer, Wiring
 from tests.served.talk import front
 
 RATE_HZ = 20e3

@@ -17,18 +17,18 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
-from analogrig.hardware import lucidac_messages
-from analogrig.hardware.lucidac_messages import FrameError, FrameReader, frame, framed, protocol
-from analogrig.hardware.simulator.served_lucidac import CHUNK_VALUES, MAC, LucidacServer, specimen
-from analogrig.hardware.simulator.tcp_server import Client
 from analogrig.scenario import DEFAULT_SEED
 from analogrig_emulator.lucidac.configuration import COEFFICIENT_STEPS
 from analogrig_emulator.lucidac.machine import Lucidac
+from analogrig_instruments.simulator.tcp_server import Client
+from analogrig_lucidac import messages as lucidac_messages
+from analogrig_lucidac.messages import FrameError, FrameReader, frame, framed, protocol
+from analogrig_lucidac.served_machine import CHUNK_VALUES, MAC, LucidacServer, specimen
 from tests.harness.processes import LONG_S
-from tests.served.hostile_lucidac import nested, varint
 from tests.served.lucidac_deviations import calibrated_deviation, deviation, play, read_configuration, run_examples
 from tests.served.lucidac_examples import EXAMPLES
 from tests.served.serving import Served, in_thread, serving
+from tests.soak.hostile_lucidac import nested, varint
 
 CLIENT = os.environ.get("LUCIDAC_CLIENT", sys.executable)
 """Python with the manufacturer's package: make lucidac-next sets one with its newest version."""
@@ -61,7 +61,7 @@ def test_manufacturers_client_gets_the_ideal_solution_after_calibration_and_not_
 
 @pytest.mark.parametrize("name", ["roessler", "van-der-pol"])
 def test_another_calibrated_specimen_gets_the_ideal_solution(runs: Path, name: str) -> None:
-    """All examples on twelve specimens: python -m tests.benchmarks.bandwidth_lucidac."""
+    """All examples on twelve specimens: python -m tests.bench.bandwidth_lucidac."""
     assert calibrated_deviation(specimen(5), EXAMPLES[name], read_configuration(runs, name)) < 0.01
 
 

@@ -20,18 +20,6 @@ from analogrig import Bench, Run, Scenario, judge, open_dut, open_rig
 from analogrig.catalogue import Change
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RigClosed, RigError, RigRefused, RigTimeout
-from analogrig.hardware import lucidac_connection
-from analogrig.hardware.calibration.averages import record, scenarios
-from analogrig.hardware.calibration.fit import calibrate
-from analogrig.hardware.instrument import DialChange
-from analogrig.hardware.lucidac import LucidacInstrument
-from analogrig.hardware.lucidac_connection import LucidacConnection
-from analogrig.hardware.lucidac_messages import FrameReader, frame, protocol
-from analogrig.hardware.lucidac_patch import LinearPatch
-from analogrig.hardware.real import RealRig
-from analogrig.hardware.self_test import self_test
-from analogrig.hardware.simulator.served_lucidac import specimen
-from analogrig.hardware.wiring import RealDescription
 from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig.rigs.description import describe
@@ -39,6 +27,18 @@ from analogrig.scenario import DEFAULT_SEED, PotChange
 from analogrig_emulator import Capacitor, Excitation, PotTurn, SuspensionComputer
 from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
 from analogrig_emulator.lucidac.wiring import FAST_FARAD
+from analogrig_instruments.calibration.averages import record, scenarios
+from analogrig_instruments.calibration.fit import calibrate
+from analogrig_instruments.instrument import DialChange
+from analogrig_instruments.real import RealRig
+from analogrig_instruments.self_test import self_test
+from analogrig_instruments.wiring import RealDescription
+from analogrig_lucidac import connection as lucidac_connection
+from analogrig_lucidac.connection import LucidacConnection
+from analogrig_lucidac.driver import LucidacInstrument
+from analogrig_lucidac.messages import FrameReader, frame, protocol
+from analogrig_lucidac.patching import LinearPatch
+from analogrig_lucidac.served_machine import specimen
 from tests.served.serving import Served, serving
 
 MOST_LATENCY_N = 3

@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 
 from analogrig import config
-from analogrig.hardware.simulator.served import InstrumentDescription
+from analogrig_instruments.simulator.served import InstrumentDescription
 from tests.harness.processes import LONG_S
 from tests.served.serving import serving
 from tests.served.talk import interpreter

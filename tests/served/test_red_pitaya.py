@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.hardware.simulator.computer import Amplifier, Booster, Wiring
-from analogrig.hardware.simulator.inputs import InputFaults
-from analogrig.hardware.simulator.records import BUFFER_N, MIDDLE_N, AcquisitionFaults
-from analogrig.hardware.simulator.scpi import DropOut, Interpreter
-from analogrig.hardware.simulator.served import MOST_SCHEDULED, InstrumentDescription, ServedRedPitaya
 from analogrig_emulator import Excitation, PotTurn, SuspensionComputer
+from analogrig_instruments.simulator.computer import Amplifier, Booster, Wiring
+from analogrig_instruments.simulator.inputs import InputFaults
+from analogrig_instruments.simulator.records import BUFFER_N, MIDDLE_N, AcquisitionFaults
+from analogrig_instruments.simulator.scpi import DropOut, Interpreter
+from analogrig_instruments.simulator.served import MOST_SCHEDULED, InstrumentDescription, ServedRedPitaya
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
 LSB_V = 40.0 / 2**14

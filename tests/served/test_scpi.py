@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from analogrig.hardware.simulator.scpi import (
+from analogrig_instruments.simulator.scpi import (
     MOST_ARGUMENTS,
     MOST_ERRORS,
     VOLTS,

@@ -14,14 +14,14 @@ import pytest
 import pyvisa
 
 from analogrig.cli import main
-from analogrig.hardware.simulator.scpi import Interpreter
-from analogrig.hardware.simulator.served import ServedDescription
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
 from analogrig.signals import ENDING
 from analogrig_emulator import Excitation
+from analogrig_instruments.simulator.scpi import Interpreter
+from analogrig_instruments.simulator.served import ServedDescription
 from tests.harness.processes import LONG_S
 from tests.served.serving import ServedByProcess, ended, serving
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say

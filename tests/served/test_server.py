@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.hardware.simulator.records import AcquisitionFaults
-from analogrig.hardware.simulator.scpi import Call, Command, Response
-from analogrig.hardware.simulator.served import InstrumentDescription, ServedRedPitaya
-from analogrig.hardware.simulator.server import Servable, Server
-from analogrig.hardware.simulator.tcp_server import BUFFERED_BYTES, MOST_CLIENTS
+from analogrig_instruments.simulator.records import AcquisitionFaults
+from analogrig_instruments.simulator.scpi import Call, Command, Response
+from analogrig_instruments.simulator.served import InstrumentDescription, ServedRedPitaya
+from analogrig_instruments.simulator.server import Servable, Server
+from analogrig_instruments.simulator.tcp_server import BUFFERED_BYTES, MOST_CLIENTS
 from tests.harness.processes import LONG_S
 from tests.served.talk import SEQUENCE, front
 
@@ -273,6 +273,7 @@ async def test_newcomer_is_turned_away_when_all_places_are_taken() -> None:
         for client in clients:
             assert await client.ask("COUNT?") == "0"
         newcomer = await served.client()
+        newcomer.say("COUNT?")
         with contextlib.suppress(ConnectionError):
             assert await newcomer.reader.read() == b""
         assert await clients[0].ask("COUNT?") == "0"

@@ -12,7 +12,7 @@ import itertools
 import re
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
@@ -194,7 +194,7 @@ def _link(line: Any, link: LinkKind) -> Link:
 
 
 def _kept(link: Link) -> int:
-    return len(link._messages) + len(link._decoder._begun) if isinstance(link, FramedLink) else 0
+    return len(link.unread) + len(link._decoder._begun) if isinstance(link, FramedLink) else 0
 
 
 def _play(link: Link, description: InprocDevice, case: Case) -> Played:
@@ -249,6 +249,7 @@ class _Tap:
 
     def __init__(self, link: Link) -> None:
         self._link = link
+        self.unread: deque[Message] = deque()
         self.passed: dict[Direction, list[Message]] = {"to": [], "from": []}
 
     def __getattr__(self, name: str) -> Any:

@@ -1,6 +1,6 @@
 """Hostile clients beside one well-behaved client; as a program, a table of the memory and time that each costs.
 
-    python -m tests.served.hostile SECONDS SEED
+    python -m tests.soak.hostile SECONDS SEED
 
 A witness queries the server at the same time.
 """

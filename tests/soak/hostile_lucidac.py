@@ -1,6 +1,6 @@
 """Hostile clients of the served LUCIDAC; as a program, a table of the memory and time that each costs.
 
-python -m tests.served.hostile_lucidac SECONDS SEED [FRAMES]
+python -m tests.soak.hostile_lucidac SECONDS SEED [FRAMES]
 
 With FRAMES only as many random frames are sent, however long they take.
 """
@@ -16,12 +16,12 @@ import sys
 import time
 from typing import Any
 
-from analogrig.hardware.lucidac_messages import MOST_FRAME_BYTES, FrameReader, frame, protocol
-from analogrig.hardware.lucidac_patch import module_of
-from analogrig.hardware.simulator.served_lucidac import MAC
 from analogrig_emulator.lucidac.configuration import Configuration, LucidacLane
-from tests.served.hostile import Attack, Stop, connect_often, ignore_disconnection, survive_all
+from analogrig_lucidac.messages import MOST_FRAME_BYTES, FrameReader, frame, protocol
+from analogrig_lucidac.patching import module_of
+from analogrig_lucidac.served_machine import MAC
 from tests.served.serving import ServedByProcess, serving
+from tests.soak.hostile import Attack, Stop, connect_often, ignore_disconnection, survive_all
 
 MOST_FRAMES_AT_ONCE = 200
 SILENT_N = 100_000

@@ -1,6 +1,6 @@
 """Commands killed at random instants: what they leave behind, and whether they leave it.
 
-    python -m tests.harness.kills [KILLS] [SEED]     so many of each command by each signal (40)
+    python -m tests.soak.kills [KILLS] [SEED]     so many of each command by each signal (40)
 
 After every kill there is no process of the command, no result of an earlier command that looks like one of it, and no
 part of a result that looks whole.
@@ -146,7 +146,20 @@ CASES = {
     "run": Case(("run", "--dut", "host", "--out", "out"), check_run),
     "campaign": Case(("campaign", "spec.toml", "--out", "out.sqlite", "--workers", "2"), check_campaign),
     "certify": Case(
-        ("certify", "--far", "2e-3", "--confidence", "0.9", "--dut", "host", "--workers", "2"), check_nothing
+        (
+            "certify",
+            "--far",
+            "2e-3",
+            "--bounds",
+            "independent",
+            "--confidence",
+            "0.9",
+            "--dut",
+            "host",
+            "--workers",
+            "2",
+        ),
+        check_nothing,
     ),
     "calibrate": Case(
         ("calibrate", "--components", "nominal", "--pots", "coefficient", "--out", "twin.toml"), check_twin

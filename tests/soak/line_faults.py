@@ -1,6 +1,6 @@
 """Faults of a line of text, each at each step, against a scripted firmware on a real pseudo-terminal.
 
-python -m tests.harness.line_faults enumerates all of them and prints a table.
+python -m tests.soak.line_faults enumerates all of them and prints a table.
 
 The firmware runs when the harness reads or writes, in the same thread, and the clock stands still but for time-outs.
 So nothing depends on the speed of the machine. The estimate a1 is the sample's own u, which shows to which sample an

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from analogrig.run import Run
+from tests.harness.plants import front
 from tests.harness.reported import reported_run
 from tests.harness.runs import made_run
-
-from .plants import front
 
 FIRM, SOFT = front(115.0, 3021.0, 24500.0), front(115.0, 3021.0, 18000.0)
 SETTLED = 1100

@@ -8,8 +8,10 @@ import pytest
 
 from analogrig.devices.registry import describe
 from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
-from tests.harness import fault_runs
-from tests.harness.fault_runs import (
+from tests.harness.firmware import needs_firmware
+from tests.harness.idle_clock import IdleClocked
+from tests.soak import fault_runs
+from tests.soak.fault_runs import (
     BACK_AT,
     FAULTY,
     WAYS,
@@ -23,8 +25,6 @@ from tests.harness.fault_runs import (
     reference,
     steps,
 )
-from tests.harness.firmware import needs_firmware
-from tests.harness.idle_clock import IdleClocked
 
 TALKED_OVER = {("serial", "sample"), ("can", "sample"), ("can-fd", "block")}
 """Way of a link on which every step has its second frame and its last two tried.
@@ -33,13 +33,18 @@ Only the samples go otherwise on the others: handshake, configuration, start and
 which the first frame of each step is tried.
 """
 
+QUICKEST = ("serial", "block")
+"""Way that `make test` tries; `make test-heavy` tries the others."""
+
 
 def test_every_fault_is_documented() -> None:
     for link, faulty in FAULTY.items():
         assert {*documented(link)} == {(kind, direction) for kind in faulty.KINDS for direction in DIRECTIONS}
 
 
-@pytest.mark.parametrize(("link", "exchange"), WAYS)
+@pytest.mark.parametrize(
+    ("link", "exchange"), [pytest.param(*way, marks=() if way == QUICKEST else pytest.mark.heavy) for way in WAYS]
+)
 def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchange: ExchangeKind) -> None:
     ends = 2 if (link, exchange) in TALKED_OVER else 0
     stride = 50 if link == "serial" else 100
@@ -47,6 +52,7 @@ def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchang
         assert outcomes_everywhere(link, kind, exchange, stride, ends).total() > 15
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("first", range(0, 1000, 500))
 def test_faults_by_chance_never_lead_to_a_wrong_estimate(first: int) -> None:
     assert outcomes_by_chance(range(first, first + 500)).total() == 500
@@ -73,6 +79,7 @@ def test_collision_on_the_last_message_of_a_run_is_noticed() -> None:
         assert play(Case(faults, link="can")).outcome == "inconclusive"
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["drop", "duplicate", "reorder", "repeat", "flip"])
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_diagnosis_is_that_of_a_line_without_faults_or_the_run_is_not_valid(kind: str, direction: Direction) -> None:
@@ -101,10 +108,10 @@ REAL = [
     *(pytest.param("serial", "qemu-m4", kind, marks=needs_firmware) for kind in SOME),
     pytest.param("serial", "qemu-f405", "reset", marks=needs_firmware),
     *(("can", "can:virtual", kind) for kind in SOME_OF_CAN),
-    *(("can", "host?link=slcan", kind) for kind in ("drop", "collide", "reset")),
 ]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: f"{place[0]}-{place[1]}")
 @pytest.mark.parametrize(("link", "device", "kind"), REAL)
 def test_fault_leads_to_the_same_over_a_real_line(

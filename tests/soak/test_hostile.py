@@ -10,11 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from analogrig.hardware.simulator.scpi import MOST_ERRORS
+from analogrig_instruments.simulator.scpi import MOST_ERRORS
 from tests.harness.processes import LONG_S
-from tests.served.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survive, warm
 from tests.served.serving import ServedByProcess, ended, serving
 from tests.served.talk import SEQUENCE, asking, interpreter, record, say
+from tests.soak.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survive, warm
 
 ERROR = re.compile(r'(0|-\d{3}),"[^"]{0,255}"')
 

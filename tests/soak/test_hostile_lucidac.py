@@ -1,4 +1,4 @@
-"""Hostile clients of the served LUCIDAC; python -m tests.served.hostile_lucidac runs longer."""
+"""Hostile clients of the served LUCIDAC; python -m tests.soak.hostile_lucidac runs longer."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.hardware.lucidac_connection import LucidacConnection
-from analogrig.hardware.lucidac_patch import module_of
-from analogrig.hardware.simulator.served_lucidac import MAC, specimen
 from analogrig.scenario import DEFAULT_SEED
 from analogrig_emulator.lucidac.configuration import Configuration, Integrator, LucidacLane
+from analogrig_lucidac.connection import LucidacConnection
+from analogrig_lucidac.patching import module_of
+from analogrig_lucidac.served_machine import MAC, specimen
 from tests.harness.processes import LONG_S
-from tests.served.hostile import Attack, survive
-from tests.served.hostile_lucidac import ATTACKS, claim_lengths, fuzz, leave_half_open, nest, query
 from tests.served.serving import ServedByProcess, ended, serving
+from tests.soak.hostile import Attack, survive
+from tests.soak.hostile_lucidac import ATTACKS, claim_lengths, fuzz, leave_half_open, nest, query
 
 OSCILLATOR = Configuration(
     (Integrator(-0.875), *[Integrator()] * 7), {0: LucidacLane(0, 1, 0.05), 1: LucidacLane(1, 0, -0.05)}, adc=(0, 1) * 4

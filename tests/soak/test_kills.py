@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from analogrig.signals import Interrupted, interruption
-from tests.harness.kills import CASES, SIGNALS, duration_s, instants, kill, prepared
+from tests.soak.kills import CASES, SIGNALS, duration_s, instants, kill, prepared
 
 SEED, KILLS = 1995, 2
 
@@ -26,6 +26,7 @@ def durations_s(before: Path) -> dict[str, float]:
     return {name: duration_s(case, before) for name, case in CASES.items()}
 
 
+@pytest.mark.heavy
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize(("name", "number"), list(itertools.product(CASES, SIGNALS)))
 def test_killed_command_leaves_no_process_and_no_result_that_is_none(

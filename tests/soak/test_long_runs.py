@@ -17,9 +17,9 @@ from analogrig.plant import Segment
 from analogrig.reporting import render
 from analogrig.reporting.payload import MOST_POINTS, Piece, condense, pieces
 from analogrig.run import Run
-from tests.harness.long_runs import FIRM, long_run
 from tests.harness.plants import front
 from tests.harness.reported import Page
+from tests.soak.long_runs import FIRM, long_run
 
 MOST_BYTES_A_SAMPLE = 100
 MOST_PAGE_BYTES = 5_000_000
@@ -58,6 +58,7 @@ def healthy(folder: Path, samples: int) -> Path:
     return path
 
 
+@pytest.mark.heavy
 @needs_proc
 @pytest.mark.timeout(2 * PATIENCE_S)
 @pytest.mark.parametrize(("dut", "long"), [("inproc", 210_000), ("host", 210_000)])
@@ -75,6 +76,7 @@ def test_run_takes_at_most_a_hundred_bytes_a_sample(tmp_path: Path, dut: str, lo
     assert (peaks[1] - peaks[0]) / (long - short) <= MOST_BYTES_A_SAMPLE
 
 
+@pytest.mark.heavy
 @needs_proc
 @pytest.mark.timeout(2 * PATIENCE_S)
 @pytest.mark.parametrize("changes", [0, 2])
@@ -88,6 +90,7 @@ def test_judging_a_recording_takes_at_most_a_hundred_bytes_a_sample(tmp_path: Pa
     assert (peaks[1] - peaks[0]) / (long - short) <= MOST_BYTES_A_SAMPLE
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("samples", [100_000, 400_000, 2_000_000])
 def test_page_has_at_most_five_megabytes(samples: int) -> None:
     run = long_run(samples)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.bench import Bench
-from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import DeviceDescription
 from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.opening import open_dut
+from analogrig.devices.registry import open_dut
 from analogrig.judging.verdict import SegmentEstimate, Verdict, judge
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario

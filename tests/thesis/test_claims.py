@@ -18,9 +18,9 @@ from scipy.signal import butter, cont2discrete, freqz, lfilter
 from analogrig.cli import main
 from analogrig.config import fixtures
 from analogrig.run import Run
-from analogrig.testing.reference.estimator import ReferenceEstimator
 from analogrig_thesis.chapter4 import SCHEMES
 from analogrig_thesis.reproduction import CLAIMS, PAGE, RECORDINGS, reproduce
+from tests.reference.estimator import ReferenceEstimator
 from tests.thesis.oracle import (
     CHANGES,
     PERIOD_S,

@@ -11,6 +11,8 @@ import pytest
 
 from tests.thesis.detection import Detection, detect
 
+pytestmark = pytest.mark.heavy
+
 SEEDS = range(100)
 CLIPPED_SEEDS = range(50)
 

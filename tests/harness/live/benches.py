@@ -16,16 +16,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from analogrig.cli.bench import NO_FAULTS, REPORT_INTERVAL_N
 from analogrig.devices.device import Device
-from analogrig.devices.opening import open_dut
-from analogrig.devices.registry import describe
-from analogrig.live.commands import Command
-from analogrig.live.server import BenchServer
-from analogrig.live.session import LiveSession, Saved
+from analogrig.devices.registry import describe, open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.scenario import Scenario
+from analogrig_live.bench_command import NO_FAULTS, REPORT_INTERVAL_N
+from analogrig_live.commands import Command
+from analogrig_live.server import BenchServer
+from analogrig_live.session import LiveSession, Saved
 
 SEED = 7
 

@@ -23,8 +23,8 @@ from websockets.sync.client import ClientConnection
 
 from analogrig.run import Run
 from tests import tools
-from tests.harness.kills import LONG_S, open_page
 from tests.harness.processes import descendants, gone, marked
+from tests.soak.kills import LONG_S, open_page
 
 
 def kill_browsers(kills: int, seed: int) -> None:

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from analogrig import cli
-from analogrig.live.commands import SetRecording
 from analogrig.run import Run
+from analogrig_live.commands import SetRecording
 from tests.harness.live.benches import benched, scripted_session
 from tests.harness.live.test_server import Client, open_client, played
 from tests.served.serving import serving

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import ClientConnection
 
-from analogrig.live import foxglove
-from analogrig.live.server import BenchServer
+from analogrig_live import foxglove
+from analogrig_live.server import BenchServer
 from tests.harness.live.benches import LiveBench
 from tests.harness.live.test_server import open_client, played
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analogrig.live.scope import measures
+from analogrig_live.scope import measures
 
 RATE_HZ, LSB = 20_000.0, 0.005
 SQUARE = np.where(np.arange(400) % 100 < 50, 1.0, 0.0)

@@ -22,10 +22,10 @@ from websockets.exceptions import InvalidStatus
 from websockets.http11 import USER_AGENT
 
 from analogrig.errors import ConfigurationError
-from analogrig.live.foxglove import SUBPROTOCOL
-from analogrig.live.scope import unpacked
-from analogrig.live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from analogrig.run import Run
+from analogrig_live.foxglove import SUBPROTOCOL
+from analogrig_live.scope import unpacked
+from analogrig_live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from tests.harness.live.benches import LiveBench
 
 TIMEOUT_S = 600.0  # only if something is broken, also under a load of ten
@@ -325,15 +325,16 @@ def test_newcomers_are_turned_away_when_all_places_are_taken(bench: BenchServer)
     played(work)
 
 
-def test_sockets_without_a_request_are_limited(bench: BenchServer) -> None:
+def test_sockets_without_a_request_are_limited_and_the_oldest_gives_way(bench: BenchServer) -> None:
     host, _, port = host_of(bench).rpartition(":")
     with contextlib.ExitStack() as stack:
         silent = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(MOST_SOCKETS + 1)]
         with contextlib.suppress(ConnectionError):
-            assert silent[-1].recv(1) == b""
-        silent[0].settimeout(0.0)
+            assert silent[0].recv(1) == b""
+        silent[-1].settimeout(0.0)
         with pytest.raises(BlockingIOError):
-            silent[0].recv(1)
+            silent[-1].recv(1)
+        assert status_of(bench.address) == 200
 
 
 def test_token_of_any_characters_opens_the_printed_address(tmp_path: Path) -> None:

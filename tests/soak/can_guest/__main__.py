@@ -1,4 +1,4 @@
-"""Run the tests of suite/ in a guest; results in build/can_guest. python -m tests.can_guest [ARGUMENT OF PYTEST...]."""
+"""Run the tests of suite/ in a guest; results in build/can_guest. python -m tests.soak.can_guest [ARGUMENT...]."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import IO
 from . import guest
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
+ROOT = HERE.parents[2]
 RESULTS = ROOT / "build" / "can_guest"
 REPORT = "junit.xml"
 
@@ -31,6 +31,7 @@ _ENVIRONMENT = {
     "TMPDIR": "/run",
     "PYTHONPATH": str(HERE / "without"),
     "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # each takes seconds to import
+    "HYPOTHESIS_STORAGE_DIRECTORY": "/run/hypothesis",  # its own place is read-only
 }
 _PYTEST = (
     *(sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider", "--color=no"),
@@ -71,7 +72,7 @@ def throughput_in_guest() -> dict[str, float]:
     report = "throughput.json"
     with tempfile.TemporaryDirectory() as results, (Path(results) / "console").open("w+b") as console:
         status = guest.run(
-            [sys.executable, "-m", "tests.can_guest.throughput", guest.RESULTS / report],
+            [sys.executable, "-m", "tests.soak.can_guest.throughput", guest.RESULTS / report],
             Path(results),
             folder=ROOT,
             environment=_ENVIRONMENT | _NO_BYTECODE,

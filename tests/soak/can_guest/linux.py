@@ -1,7 +1,7 @@
 """Extract Debian's kernel for the guest from its package, without installing it.
 
-python -m tests.can_guest.linux writes build/can_guest/linux: vmlinux, unpacked, since QEMU starts it in half the time;
-the modules in load order; busybox, which loads them. The kernel for clouds has no CAN.
+python -m tests.soak.can_guest.linux writes build/can_guest/linux: vmlinux, unpacked, since QEMU starts it in half the
+time; the modules in load order; busybox, which loads them. The kernel for clouds has no CAN.
 """
 
 from __future__ import annotations

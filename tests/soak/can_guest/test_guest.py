@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from tests import tools
-from tests.can_guest import guest
-from tests.can_guest.__main__ import REPORT, ROOT, TIME_LIMIT_S, run_suite
 from tests.harness.processes import descendants, ends
+from tests.soak.can_guest import guest
+from tests.soak.can_guest.__main__ import REPORT, ROOT, TIME_LIMIT_S, run_suite
 
 needs_guest = pytest.mark.tools(*guest.NEEDED)
 
@@ -21,6 +21,7 @@ BOOT_S = 600.0
 """Limit for one command in the guest, which takes three seconds on an idle machine."""
 
 
+@pytest.mark.heavy
 @needs_guest
 @pytest.mark.timeout(TIME_LIMIT_S + BOOT_S)  # the guest ends the tests before pytest does
 def test_suite_passes_on_socketcan(tmp_path: Path) -> None:
@@ -32,6 +33,7 @@ def test_suite_passes_on_socketcan(tmp_path: Path) -> None:
     assert suite.attrib["skipped"] == "0"
 
 
+@pytest.mark.heavy
 @needs_guest
 def test_command_sees_the_files_of_the_host_cannot_change_them_and_its_status_and_results_come_out(
     tmp_path: Path,
@@ -49,6 +51,7 @@ def test_command_sees_the_files_of_the_host_cannot_change_them_and_its_status_an
     assert (tmp_path / "given").read_text() == "for it to read"
 
 
+@pytest.mark.heavy
 @needs_guest
 def test_guest_that_does_not_end_in_time_is_ended(tmp_path: Path) -> None:
     before = set(descendants(os.getpid()))
@@ -57,12 +60,13 @@ def test_guest_that_does_not_end_in_time_is_ended(tmp_path: Path) -> None:
     assert set(descendants(os.getpid())) <= before
 
 
+@pytest.mark.heavy
 @needs_guest
 def test_guest_ends_with_whoever_started_it(tmp_path: Path) -> None:
     """Also after SIGKILL."""
     command = ["sh", "-c", "echo up; sleep 1000"]
     words = f"guest.run({command}, Path('.'), folder=Path('/'), environment={{}}, time_limit_s={BOOT_S})"
-    program = f"from pathlib import Path; from tests.can_guest import guest; {words}"
+    program = f"from pathlib import Path; from tests.soak.can_guest import guest; {words}"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         [sys.executable, "-c", program], cwd=tmp_path, env=environment, stdout=subprocess.PIPE
@@ -99,6 +103,6 @@ def test_suite_is_not_collected_outside_the_guest() -> None:
     """Outside the guest it would take down the interfaces of this machine."""
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "pytest_timeout"]
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    suite = ROOT / "tests/can_guest/suite"
+    suite = ROOT / "tests/soak/can_guest/suite"
     done = subprocess.run(command, cwd=suite, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == pytest.ExitCode.NO_TESTS_COLLECTED, done.stdout

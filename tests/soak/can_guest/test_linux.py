@@ -6,7 +6,7 @@ import lzma
 
 import pytest
 
-from tests.can_guest.linux import LinuxError, in_order, needed_by, vmlinux
+from tests.soak.can_guest.linux import LinuxError, in_order, needed_by, vmlinux
 
 
 def module(*needs: str) -> bytes:

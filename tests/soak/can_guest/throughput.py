@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from analogrig.devices.can import CanDevice
-from tests.benchmarks.bench_link import WAYS, samples_per_s
+from tests.bench.bench_link import WAYS, samples_per_s
 
 from .suite.interfaces import CONTROLLERS, VIRTUAL, device
 

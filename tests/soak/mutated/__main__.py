@@ -1,4 +1,4 @@
-"""A soak: ``python -m tests.mutated`` plays mutated files through the real commands and prints a table.
+"""A soak: ``python -m tests.soak.mutated`` plays mutated files through the real commands and prints a table.
 
 Options set how many recordings, files, logs and keys with absurd values there are; by default all that the table names.
 
@@ -20,13 +20,13 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from tests.mutated.cases import Cases, Seeds
-from tests.mutated.trial import MOST_CPU_S, MOST_MB, Case, Outcome, Running, begin
+from tests.soak.mutated.cases import Cases, Seeds
+from tests.soak.mutated.trial import MOST_CPU_S, MOST_MB, Case, Outcome, Running, begin
 
 _LOADED = (
     *("analogrig.bench", "analogrig.judging.verdict", "analogrig.reporting", "analogrig.reporting.summary"),
     *("analogrig.campaigns.conduct", "analogrig.reporting.campaign", "analogrig.rigs.description"),
-    *("analogrig.hardware.self_test", "analogrig.recordings", "analogrig.links.python_can"),
+    *("analogrig_instruments.self_test", "analogrig.recordings"),
     *("cantools", "asammdf"),
 )
 """Loaded once, before the cases are forked."""
@@ -108,7 +108,7 @@ def _say(text: str) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.mutated", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.soak.mutated", description=__doc__)
     for name, count in (("recordings", 5000), ("files", 2000), ("logs", 500), ("keys", 1_000_000)):
         parser.add_argument(f"--{name}", type=int, default=count, metavar="N")
     parser.add_argument("--seed", type=int, default=1995)

@@ -11,7 +11,7 @@ import sqlite3
 import zlib
 from pathlib import Path
 
-from tests.mutated.nasty import replace_one
+from tests.soak.mutated.nasty import replace_one
 
 Mutated = tuple[bytes, str]
 

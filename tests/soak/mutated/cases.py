@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli import main
-from tests.mutated import campaign_files, can_logs, descriptions, recordings
-from tests.mutated.nasty import Place, brief, each_value, parent, places
-from tests.mutated.trial import Case
+from tests.soak.mutated import campaign_files, can_logs, descriptions, recordings
+from tests.soak.mutated.nasty import Place, brief, each_value, parent, places
+from tests.soak.mutated.trial import Case
 
 SCENARIO = Path(__file__).with_name("short.toml")
-DBC = Path(__file__).parents[2] / "estimator_c" / "catalogue" / "analogrig.dbc"
+DBC = Path(__file__).parents[3] / "estimator_c" / "catalogue" / "analogrig.dbc"
 _STRIDE = 7919
 """Prime, and so of no common divisor with their number."""
 
-FIXTURES = Path(__file__).parents[2] / "fixtures"
+FIXTURES = Path(__file__).parents[3] / "fixtures"
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from tests.mutated.nasty import replace_one
+from tests.soak.mutated.nasty import replace_one
 
 SCENARIO: dict[str, Any] = {
     "description": "all keys",

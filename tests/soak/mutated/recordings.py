@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.mutated.nasty import brief, replace_one
+from tests.soak.mutated.nasty import brief, replace_one
 
 Members = dict[str, NDArray[Any]]
 

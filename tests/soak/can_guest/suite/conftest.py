@@ -4,6 +4,6 @@ from __future__ import annotations
 
 import os
 
-from tests.can_guest.__main__ import WITHIN
+from tests.soak.can_guest.__main__ import WITHIN
 
 collect_ignore_glob = [] if os.environ.get(WITHIN) else ["test_*.py"]

@@ -11,7 +11,7 @@ from typing import Any
 import can
 
 from analogrig.devices.child import Child
-from analogrig.devices.host import HOST_PROGRAM
+from analogrig.devices.processes import HOST_PROGRAM
 
 VIRTUAL = "vcan0"
 CONTROLLERS = ("can0", "can1", "can2")

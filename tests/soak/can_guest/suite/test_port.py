@@ -29,7 +29,7 @@ from analogrig.catalogue import (
     unpack,
 )
 from analogrig.devices.child import Child
-from analogrig.devices.host import HOST_PROGRAM
+from analogrig.devices.processes import HOST_PROGRAM
 from tests.harness.processes import LONG_S, children, ends
 
 from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan
