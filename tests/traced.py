@@ -69,8 +69,8 @@ def traced(act: Callable[[], object]) -> Trace:
 def play(samples: int, changes: int) -> Run:
     """A play of the scenario thesis on the emulator, with its first ``changes`` changes, through ``inproc``."""
     thesis = Scenario.load("thesis")
-    kept = tuple(dataclasses.replace(each, sample=samples // 2) for each in thesis.tweaks[:changes])
-    scenario = dataclasses.replace(thesis, samples=samples, tweaks=kept)
+    kept = tuple(dataclasses.replace(each, sample=samples // 2) for each in thesis.changes[:changes])
+    scenario = dataclasses.replace(thesis, samples=samples, changes=kept)
     with open_rig("emulator") as rig, open_dut("inproc") as dut:
         return Bench(rig, dut).play(scenario, seed=1)
 

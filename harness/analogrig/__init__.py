@@ -11,7 +11,7 @@ A rig plays a scenario, a device under test answers with alarms and estimates, a
     >>> verdict = judge(run)
     >>> verdict.outcome
     'passed'
-    >>> all(change.latency_n is not None for change in verdict.tweaks)
+    >>> all(change.latency_n is not None for change in verdict.changes)
     True
 
 The names in ``__all__`` of a module are public, and so are their documented members. Everything else is private: it

@@ -141,7 +141,7 @@ class Scenario:
     program: Program = field(default_factory=lambda: Program.load(DEFAULT_PROGRAM))
     set: Mapping[str, float] = field(default_factory=dict)
     """Initial values of parameters that differ from the program's, by name."""
-    tweaks: tuple[PotChange, ...] = ()
+    changes: tuple[PotChange, ...] = ()
     expect: Expectations = field(default_factory=Expectations)
     random_phase: bool = False
     """The excitation's phase is drawn from the seed instead of taken from ``excitation.phase``."""
@@ -164,7 +164,7 @@ class Scenario:
             raise ValueError(f"samples must be in 1 .. {MAX_SAMPLES}, not {self.samples}")
         if self.random_phase and self.excitation.shape == "recorded":
             raise ValueError("random_phase: an excitation of the shape recorded has no phase")
-        self._check_tweaks()
+        self._check_changes()
 
     def _convert(self) -> None:
         """Replace values that are spelt as in files.
@@ -178,34 +178,36 @@ class Scenario:
             if isinstance(value := getattr(self, name), Mapping):
                 converted[name] = config.build(kind, value, name)
         converted["set"] = {program.names.get(name, name): value for name, value in self.set.items()}
-        converted["tweaks"] = tuple(
-            config.build(PotChange, _with_set(tweak, program), f"tweaks[{i}]") if isinstance(tweak, Mapping) else tweak
-            for i, tweak in enumerate(self.tweaks)
+        converted["changes"] = tuple(
+            config.build(PotChange, _with_set(change, program), f"changes[{i}]")
+            if isinstance(change, Mapping)
+            else change
+            for i, change in enumerate(self.changes)
         )
         for name, value in converted.items():
             object.__setattr__(self, name, value)
 
-    def _check_tweaks(self) -> None:
-        if len(self.tweaks) > MAX_CHANGES:
-            raise ValueError(f"there must be at most {MAX_CHANGES} tweaks, not {len(self.tweaks)}")
-        instants = [tweak.sample for tweak in self.tweaks]
+    def _check_changes(self) -> None:
+        if len(self.changes) > MAX_CHANGES:
+            raise ValueError(f"there must be at most {MAX_CHANGES} changes, not {len(self.changes)}")
+        instants = [change.sample for change in self.changes]
         if instants != sorted(set(instants)):
-            raise ValueError(f"tweaks must come in the order of their samples, each sample once, not {instants}")
+            raise ValueError(f"changes must come in the order of their samples, each sample once, not {instants}")
         if instants and instants[-1] >= self.samples:
             of = number_of(self.samples, "sample")
-            raise ValueError(f"the tweak at sample {instants[-1]} is beyond the last of {of}")
-        for tweak, following in itertools.pairwise(self.tweaks):
-            if tweak.sample + tweak.ramp_n > following.sample:
+            raise ValueError(f"the change at sample {instants[-1]} is beyond the last of {of}")
+        for change, following in itertools.pairwise(self.changes):
+            if change.sample + change.ramp_n > following.sample:
                 raise ValueError(
-                    f"the tweak at sample {tweak.sample} lasts {number_of(tweak.ramp_n, 'sample')},"
+                    f"the change at sample {change.sample} lasts {number_of(change.ramp_n, 'sample')},"
                     f" beyond the next one at {following.sample}"
                 )
         plant = self.plant
-        for i, tweak in enumerate(self.tweaks):
+        for i, change in enumerate(self.changes):
             try:
-                plant = plant.changed(tweak.set)
+                plant = plant.changed(change.set)
             except ValueError as error:
-                raise ValueError(f"tweaks[{i}]: {error}") from error
+                raise ValueError(f"changes[{i}]: {error}") from error
 
     @classmethod
     def load(cls, name: str | Path) -> Scenario:
@@ -250,13 +252,13 @@ class Scenario:
         driven = program.channels[0]
         volts = program.circuit.scales.volts(driven)
         low_v, high_v = (level * volts for level in program.equations.inputs[driven].trial)
-        tweaks: tuple[PotChange, ...] = ()
+        changes: tuple[PotChange, ...] = ()
         for name, row in itertools.islice(program.parameters.items(), 1):
             goals = (max(0.8 * row.value, row.low), min(1.2 * row.value, row.high))
             goal = max(goals, key=lambda value: abs(value / row.value - 1.0))
-            tweaks = (PotChange(1000, {name: goal}),) if goal != row.value else ()
+            changes = (PotChange(1000, {name: goal}),) if goal != row.value else ()
         excitation = Excitation(low_v=low_v, high_v=high_v)
-        return cls(1500, excitation, program, tweaks=tweaks, random_phase=True, name=program.name)
+        return cls(1500, excitation, program, changes=changes, random_phase=True, name=program.name)
 
     def on_program(self, program: Program | str) -> Scenario:
         """The same scenario on another program; its parameters are those of the same name or alias.
@@ -269,9 +271,9 @@ class Scenario:
             names = {name: program.names.get(self.program.parameters[name].alias, name) for name in values}
             return {name if name in program.names else names[name]: value for name, value in values.items()}
 
-        tweaks = tuple(dataclasses.replace(tweak, set=renamed(tweak.set)) for tweak in self.tweaks)
+        changes = tuple(dataclasses.replace(change, set=renamed(change.set)) for change in self.changes)
         try:
-            return dataclasses.replace(self, program=program, set=renamed(self.set), tweaks=tweaks)
+            return dataclasses.replace(self, program=program, set=renamed(self.set), changes=changes)
         except ValueError as error:
             raise ConfigurationError(f"scenario {self.name}: {error}") from error
 
@@ -290,17 +292,17 @@ class Scenario:
 
     def segments(self) -> tuple[Segment, ...]:
         """True plant from the start and after each change."""
-        return segments_of(self.plant, self.tweaks)
+        return segments_of(self.plant, self.changes)
 
 
-def segments_of(plant: Plant, tweaks: Iterable[PotChange]) -> tuple[Segment, ...]:
+def segments_of(plant: Plant, changes: Iterable[PotChange]) -> tuple[Segment, ...]:
     """True plant from the start and after each change."""
     out = [Segment(0, plant)]
-    for tweak in tweaks:
-        changed = out[-1].plant.changed(tweak.set)
+    for change in changes:
+        changed = out[-1].plant.changed(change.set)
         if changed == out[-1].plant:
             continue  # a pot set to where it stood changes nothing, and nothing can be detected
-        out.append(Segment(tweak.sample, changed, tweak.ramp_n))
+        out.append(Segment(change.sample, changed, change.ramp_n))
     return tuple(out)
 
 
@@ -327,9 +329,10 @@ def _with_program(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     """The table of a scenario with its program loaded, and with every change of a parameter in ``set``.
 
     A table ``plant`` is another form of the keys ``program`` and ``set``, with ``set`` as the name of the program and
-    parameters beside it. A parameter may stand beside the keys of a tweak by its alias.
+    parameters beside it. A parameter may stand beside the keys of a change by its alias. ``tweaks`` is the former name
+    of ``changes``.
     """
-    out = dict(table)
+    out = {"changes" if key == "tweaks" and "changes" not in table else key: value for key, value in table.items()}
     if "plant" in out:
         plant = out.pop("plant")
         if not isinstance(plant, Mapping) or "program" in out or "set" in out:
@@ -338,15 +341,15 @@ def _with_program(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     program = out["program"] = Program.of(out.get("program", DEFAULT_PROGRAM), f"{where}: program")
     if isinstance(out.get("set"), Mapping):
         out["set"] = {program.names.get(name, name): value for name, value in out["set"].items()}
-    if isinstance(tweaks := out.get("tweaks"), list):
-        out["tweaks"] = [_with_set(tweak, program) for tweak in tweaks]
+    if isinstance(changes := out.get("changes"), list):
+        out["changes"] = [_with_set(change, program) for change in changes]
     return out
 
 
-def _with_set(tweak: Any, program: Program) -> Any:
-    """A tweak with its aliases in ``set``."""
-    if not isinstance(tweak, Mapping) or not isinstance(tweak.get("set", {}), Mapping):
-        return tweak
-    beside = [key for key in tweak if key in program.names and key not in program.parameters]
-    rest = {key: value for key, value in tweak.items() if key not in beside}
-    return {**rest, "set": {**tweak.get("set", {}), **{program.names[key]: tweak[key] for key in beside}}}
+def _with_set(change: Any, program: Program) -> Any:
+    """A change with its aliases in ``set``."""
+    if not isinstance(change, Mapping) or not isinstance(change.get("set", {}), Mapping):
+        return change
+    beside = [key for key in change if key in program.names and key not in program.parameters]
+    rest = {key: value for key, value in change.items() if key not in beside}
+    return {**rest, "set": {**change.get("set", {}), **{program.names[key]: change[key] for key in beside}}}

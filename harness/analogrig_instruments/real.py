@@ -79,7 +79,7 @@ class RealRig(Rig):
 
         :raises ConfigurationError: the description contradicts itself, or the instrument.
         """
-        self.capabilities = frozenset({"excite", "tweak"} if description.pots.changeable else {"excite"})
+        self.capabilities = frozenset({"excite", "change"} if description.pots.changeable else {"excite"})
         kind, self._address = find_driver(description.instrument)
         self._place = kind.place(self._address)
         description.check_wiring()
@@ -139,8 +139,8 @@ class RealRig(Rig):
         description.check_dials(computer.dials, where)
         changes: list[PlannedChange] = []
         plant = scenario.plant
-        for i, tweak in enumerate(scenario.tweaks):
-            place = f"{where}tweaks[{i}] at sample {tweak.sample}: "
+        for i, change in enumerate(scenario.changes):
+            place = f"{where}changes[{i}] at sample {change.sample}: "
             if not description.pots.changeable:
                 raise ConfigurationError(f'{place}the pots of this rig cannot be changed: they have kind = "none"')
             if not description.pots.exact and not can_date(scenario.program):
@@ -148,13 +148,13 @@ class RealRig(Rig):
                     f"{place}the instant of a change by these pots is estimated from the samples, and that needs a"
                     f" linear program of two states and three parameters, not {scenario.program.name}"
                 )
-            if tweak.ramp_n:
+            if change.ramp_n:
                 raise ConfigurationError(f"{place}the pots of this rig jump, they do not turn evenly: leave out ramp_n")
             with emulator_errors(place):
-                dials = computer.dials_for(**tweak.set)
+                dials = computer.dials_for(**change.set)
             description.check_dials(dials, place)
-            before, plant = plant, plant.changed(tweak.set)
-            changes.append(PlannedChange(tweak.sample, dials, before, plant))
+            before, plant = plant, plant.changed(change.set)
+            changes.append(PlannedChange(change.sample, dials, before, plant))
         dated = None if description.pots.exact else [Segment(0, scenario.plant)]
         return PlayPlan(computer, excitation, tuple(changes), [], dated)
 

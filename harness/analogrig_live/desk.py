@@ -55,7 +55,7 @@ class Desk(Rig):
     def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
         self._rig = rig
         self._seed = seed
-        self.scenario = dataclasses.replace(scenario, samples=RECORD_N, tweaks=(), random_phase=False)
+        self.scenario = dataclasses.replace(scenario, samples=RECORD_N, changes=(), random_phase=False)
         self.capabilities = rig.capabilities
         self.program = scenario.program
         self.knobs: Mapping[str, Knob] = knobs_of(self.scenario.plant)
@@ -70,7 +70,7 @@ class Desk(Rig):
         :raises ConfigurationError: the rig's pots cannot turn so, or cannot show these values.
         """
         scenario = self.scenario.with_plant(self.scenario.plant.changed(values))
-        self.check(dataclasses.replace(scenario, tweaks=(PotChange(CHANGE_N, turned),)))
+        self.check(dataclasses.replace(scenario, changes=(PotChange(CHANGE_N, turned),)))
 
     def description(self) -> Mapping[str, Any]:
         return self._rig.description()

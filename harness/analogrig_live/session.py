@@ -275,12 +275,12 @@ class LiveSession:
         if not self.is_on:
             excitation = _OFF
         scenario = self.desk.scenario.with_plant(self.desk.scenario.plant.changed(self.values))
-        tweaks: tuple[PotChange, ...] = ()
+        changes: tuple[PotChange, ...] = ()
         turned = {name: turn.value for name, turn in self._turns.items() if turn.value != self.values[name]}
         if turned and not self.desk.is_stepped:
-            tweaks = (PotChange(CHANGE_N, turned),)
-        scenario = dataclasses.replace(scenario, excitation=excitation, tweaks=tweaks, seed=self.seed)
-        self.take = Take(scenario, is_recorded=self.is_recording, changes=list(tweaks))
+            changes = (PotChange(CHANGE_N, turned),)
+        scenario = dataclasses.replace(scenario, excitation=excitation, changes=changes, seed=self.seed)
+        self.take = Take(scenario, is_recorded=self.is_recording, changes=list(changes))
         self._ends_take = False
         self._pace = None
         self._taken = 0

@@ -79,7 +79,7 @@ class Take:
         return dataclasses.replace(
             self.scenario,
             samples=run.samples,
-            tweaks=changes,
+            changes=changes,
             name="by hand",
             description=f"Recorded by hand: {', '.join(told[:_MOST_TOLD]) or 'no change'}{more}.",
         )

@@ -82,7 +82,7 @@ TRACKING = Scenario(
     samples=1000,
     excitation=Excitation(frequency_hz=100.0, phase=0.25),
     # Each change sets all pots, also those that stay.
-    tweaks=tuple(
+    changes=tuple(
         PotChange(start, segment.plant.parameters())
         for start, segment in zip((200, 400, 600, 800), PROFILE[1:], strict=True)
     ),

@@ -136,7 +136,7 @@ def compare(simulation: Simulation, circuit: CircuitRuns) -> Table:
 
 
 def _compared(name: str, qualities: Mapping[str, TrackQuality], tracked: TrackedRun | None = None) -> Table:
-    bound_n = [] if tracked is None else [tweak.bound_n for tweak in judge(tracked.run).tweaks]
+    bound_n = [] if tracked is None else [change.bound_n for change in judge(tracked.run).changes]
     return {"name": name, "schemes": qualities, "bound_n": bound_n}
 
 

@@ -229,14 +229,14 @@ def _play_change(bench: Bench, what: str, trial: int, effort: Effort) -> _Trial:
     instant = FIRST_CHANGE_N + trial * 37 % INSTANTS_N
     plant = changed_plant(what, SIGNS[trial % len(SIGNS)])
     change = PotChange(instant, plant.parameters())
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=instant + AFTER_N, tweaks=(change,))
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=instant + AFTER_N, changes=(change,))
     seed = CHANGE_SEED + 1000 * list(CHANGES).index(what) + trial
     run = _sound(bench.play(scenario, seed))
     bound_n = first_at_level(change_information(run)[0], math.log(effort.arl0))
     assert bound_n is not None, f"{what} at {instant}, seed {seed}: not detectable"
     verdict = judge(run)
     before = sum(index < instant for index in verdict.false_alarms)
-    return _Trial(verdict.tweaks[0].latency_n, bound_n, before, len(verdict.false_alarms) - before)
+    return _Trial(verdict.changes[0].latency_n, bound_n, before, len(verdict.false_alarms) - before)
 
 
 # ----------------------------------------------------------------------------------------------------------------- cost

@@ -56,7 +56,7 @@ from tests.emulator.conftest import _read_raw
 from . import gnucap
 from .figure import Figure
 
-THESIS_TWEAKS: tuple[PotTurn, ...] = (
+THESIS_CHANGES: tuple[PotTurn, ...] = (
     PotTurn(200, {"K": 18000.0}),
     PotTurn(400, {"B": 3453.0}),
     PotTurn(500, {"B": 2123.0, "K": 20000.0}),
@@ -151,7 +151,7 @@ def front(seed: int, *, noisy: bool, sample_rate_hz: float = RATE_HZ) -> Suspens
 
 def run_trials(count: int, *, noisy: bool = False) -> None:
     for seed in range(count):
-        for _ in front(seed, noisy=noisy).play(Excitation(), 800, THESIS_TWEAKS):
+        for _ in front(seed, noisy=noisy).play(Excitation(), 800, THESIS_CHANGES):
             pass
 
 
@@ -234,7 +234,7 @@ def own_trial_s() -> float:
     def run() -> None:
         for seed in itertools.islice(seeds, MOST_TRIALS_OF_THEIR_OWN):
             computer = SuspensionComputer("front", rng=np.random.default_rng(seed))
-            for _ in computer.play(Excitation(), 800, THESIS_TWEAKS):
+            for _ in computer.play(Excitation(), 800, THESIS_CHANGES):
                 pass
 
     return best_s(run) / MOST_TRIALS_OF_THEIR_OWN
@@ -243,7 +243,7 @@ def own_trial_s() -> float:
 def repeated_trial_s() -> float:
     """CPU time of such a trial as campaigns play it: the machine is made once."""
     computer, rng = SuspensionComputer("front"), np.random.default_rng(1)
-    repeated = RepeatedPlay(computer, 800, THESIS_TWEAKS)
+    repeated = RepeatedPlay(computer, 800, THESIS_CHANGES)
 
     def run() -> None:
         for _ in range(MOST_TRIALS_OF_THEIR_OWN):
@@ -266,7 +266,7 @@ OWN_STREAM: Mapping[str, Callable[[], float]] = {"machine included": stream_s}
 # ---- ngspice
 
 
-def deck(setting: Setting, samples: int, tweaks: Sequence[PotTurn]) -> str:
+def deck(setting: Setting, samples: int, changes: Sequence[PotTurn]) -> str:
     """Text of the front suspension with a square wave for ngspice.
 
     Without any time point at the start ngspice's first step is too long, and it misses the first edge by 0.3 LSB.
@@ -276,12 +276,12 @@ def deck(setting: Setting, samples: int, tweaks: Sequence[PotTurn]) -> str:
         computer.circuit,
         samples=samples,
         edges={"F": Excitation().edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)},
-        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks],
+        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in changes],
         nodes=["u5"],
         accuracy=setting.accuracy,
     )
     text = in_setting(text, setting, "U[2-5]")
-    return text if setting.pots == "turned" else _with_altered_pots(text, computer, tweaks)
+    return text if setting.pots == "turned" else _with_altered_pots(text, computer, changes)
 
 
 def in_setting(text: str, setting: Setting, linear: str) -> str:
@@ -301,7 +301,7 @@ def in_setting(text: str, setting: Setting, linear: str) -> str:
     return text
 
 
-def _with_altered_pots(text: str, computer: SuspensionComputer, tweaks: Sequence[PotTurn]) -> str:
+def _with_altered_pots(text: str, computer: SuspensionComputer, changes: Sequence[PotTurn]) -> str:
     """The same deck with two resistors for each pot. They are altered where the run stops."""
 
     def legs(pot: str, dial: float) -> dict[str, float]:
@@ -318,8 +318,8 @@ def _with_altered_pots(text: str, computer: SuspensionComputer, tweaks: Sequence
     text = re.sub(r"^V_dial_.*\n(\+.*\n)+", "", text, flags=re.MULTILINE)
     text = re.sub(r"^X_(\S+) (\S+) (\S+) (\S+) \S+ turned_pot .*$", resistors, text, flags=re.MULTILINE)
     # A step of the source ends at the instant. ngspice passes over one that it has begun when it stops.
-    commands = [f"stop when time = {change.sample / RATE_HZ - 1e-9!r}" for change in tweaks] + [r"\g<1>"]
-    for change in tweaks:
+    commands = [f"stop when time = {change.sample / RATE_HZ - 1e-9!r}" for change in changes] + [r"\g<1>"]
+    for change in changes:
         turned = [legs(pot, dial) for pot, dial in computer.dials_for(**change.values).items()]
         commands += [f"alter {name} = {ohm!r}" for ohms in turned for name, ohm in ohms.items()] + ["resume"]
     control = "\n".join([".control", *commands, "write out.raw v(u5)", "quit 0", ".endc"])
@@ -375,15 +375,15 @@ def simulate(text: str, exact_v: NDArray[np.float64], node: str = "u5") -> Simul
     return Simulated(spent_s, float(min(errors_v)) / LSB_V)
 
 
-def exact_v(samples: int, tweaks: Sequence[PotTurn]) -> NDArray[np.float64]:
+def exact_v(samples: int, changes: Sequence[PotTurn]) -> NDArray[np.float64]:
     """Displacement at the samples, by the emulator."""
-    return np.concatenate(list(SuspensionComputer("front").play(Excitation(), samples, tweaks)))[:, 1]
+    return np.concatenate(list(SuspensionComputer("front").play(Excitation(), samples, changes)))[:, 1]
 
 
-def search(samples: int, tweaks: Sequence[PotTurn]) -> dict[Setting, Simulated]:
+def search(samples: int, changes: Sequence[PotTurn]) -> dict[Setting, Simulated]:
     """Run the whole grid once, write it to GRID, and return it."""
-    exact = exact_v(samples, tweaks)
-    found = {setting: simulate(deck(setting, samples, tweaks), exact) for setting in SETTINGS}
+    exact = exact_v(samples, changes)
+    found = {setting: simulate(deck(setting, samples, changes), exact) for setting in SETTINGS}
     GRID.parent.mkdir(exist_ok=True)
     rows = [f"{1e3 * run.spent_s:.1f},{run.error_lsb:.3f},{setting}" for setting, run in found.items()]
     GRID.write_text("\n".join(["CPU ms,error LSB,setting", *rows, ""]))
@@ -398,23 +398,23 @@ def fastest(found: Mapping[Setting, Simulated], accuracy_lsb: float = TOLERATED_
     )
 
 
-def leanest(samples: int, tweaks: Sequence[PotTurn]) -> Setting:
+def leanest(samples: int, changes: Sequence[PotTurn]) -> Setting:
     """The fastest setting with knowing op-amps and altered pots."""
-    exact = exact_v(samples, tweaks)
+    exact = exact_v(samples, changes)
     settings = {
         replace(each, op_amps="knowing", points="start", pots="altered", reltol=reltol)
         for each in SETTINGS
         for reltol in (1e-3, 1e-4, 1e-5, 1e-6)
     }
-    return fastest({each: simulate(deck(each, samples, tweaks), exact) for each in settings})[0]
+    return fastest({each: simulate(deck(each, samples, changes), exact) for each in settings})[0]
 
 
 def final(
-    settings: Iterable[Setting], samples: int, tweaks: Sequence[PotTurn]
+    settings: Iterable[Setting], samples: int, changes: Sequence[PotTurn]
 ) -> tuple[dict[Setting, Simulated], float]:
     """Best of REPEATS runs of each setting, and of the start of ngspice alone, all in turn."""
-    exact, best, start_s = exact_v(samples, tweaks), dict[Setting, Simulated](), math.inf
-    texts = {setting: deck(setting, samples, tweaks) for setting in settings}
+    exact, best, start_s = exact_v(samples, changes), dict[Setting, Simulated](), math.inf
+    texts = {setting: deck(setting, samples, changes) for setting in settings}
     short = deck(SETTINGS[-1], 2, ())
     for _ in range(REPEATS):
         start_s = min(start_s, simulate(short, exact[:2]).spent_s)
@@ -427,18 +427,18 @@ def final(
 
 def ngspice_figures() -> Iterator[Figure]:
     """Trial and stream beside ngspice at its best, and beside a deck that knows which amplifiers never limit."""
-    for name, samples, tweaks, own in (
-        ("trial of 800 samples with 4 tweaks", 800, THESIS_TWEAKS, OWN_TRIALS),
+    for name, samples, changes, own in (
+        ("trial of 800 samples with 4 changes", 800, THESIS_CHANGES, OWN_TRIALS),
         ("square wave of 800 samples in a stream", 800, (), OWN_STREAM),
     ):
-        found = search(samples, tweaks)
+        found = search(samples, changes)
         order = fastest(found)
         winner = order[0]
         knowing = {"the same with op-amps that know the circuit": replace(winner, op_amps="knowing")}
-        if tweaks:
-            knowing["the leanest that knows the circuit"] = leanest(samples, tweaks)
+        if changes:
+            knowing["the leanest that knows the circuit"] = leanest(samples, changes)
         finalists = [replace(each, solver=solver) for each in order[:FINALISTS] for solver in ("sparse", "klu")]
-        runs, start_s = final([*finalists, *knowing.values()], samples, tweaks)
+        runs, start_s = final([*finalists, *knowing.values()], samples, changes)
         general = min(finalists, key=lambda setting: runs[setting].spent_s)
         for group, settings in itertools.groupby(
             sorted(found), key=lambda each: (each.method, each.op_amps, each.points)
@@ -497,14 +497,14 @@ def _group_figure(name: str, settings: Sequence[Setting], found: Mapping[Setting
 def own_error() -> Figure:
     """Largest difference of the trial from ngspice at its tightest setting: a bound of the emulator's own error."""
     tight = Setting("trap", "exported", "every sample", 1e-7, 0.1, 1e-5)
-    run = simulate(deck(tight, 800, THESIS_TWEAKS), exact_v(800, THESIS_TWEAKS))
+    run = simulate(deck(tight, 800, THESIS_CHANGES), exact_v(800, THESIS_CHANGES))
     return Figure("emulator, trial: difference from ngspice at its tightest", run.error_lsb, "LSB", str(tight))
 
 
 def figures() -> Iterator[Figure]:
     yield from emulator_figures()
     spent_s, noisy_s = trial_s(), trial_s(noisy=True)
-    yield Figure("emulator, trial of 800 samples with 4 tweaks", 1e3 * spent_s, "ms")
+    yield Figure("emulator, trial of 800 samples with 4 changes", 1e3 * spent_s, "ms")
     yield Figure("emulator, the same trial repeated with other offsets", 1e3 * repeated_trial_s(), "ms")
     yield Figure("emulator, noisy trial", 1e3 * noisy_s, "ms", "the quiet trial", spent_s / noisy_s)
     if shutil.which("ngspice") is not None:

@@ -154,7 +154,7 @@ async def _real_time(seconds: float) -> list[Figure]:
     return [
         Figure(f"samples recorded in {seconds:g} s", run.samples, "samples", compared_with=behind),
         Figure("samples lost in the recording", lost, "samples"),
-        Figure("changes in the recording", len(run.conditions.scenario["tweaks"]), "changes"),
+        Figure("changes in the recording", len(run.conditions.scenario["changes"]), "changes"),
         Figure("frames", frames / spent_s, "Hz"),
         Figure("processor time of the server", 100 * used_s / spent_s, "% of a core"),
         Figure("memory of the server", memory_mb, "MB"),

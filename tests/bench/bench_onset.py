@@ -120,12 +120,12 @@ def _served() -> Iterator[Rig]:
 def _told(name: str, every: Sequence[Several]) -> Iterator[Figure]:
     held, unseen, silent = [], 0, []
     for record in every:
-        for tweak, alone in record.stretches():
+        for change, alone in record.stretches():
             search = range(alone.start + 1, alone.stop - 1)
-            found = date_jump(record.signals, tweak.before, tweak.after, search, within=alone)
-            held.append(isinstance(found, Instant) and _holds(found, tweak.sample))
+            found = date_jump(record.signals, change.before, change.after, search, within=alone)
+            held.append(isinstance(found, Instant) and _holds(found, change.sample))
             unseen += isinstance(found, NoInstant)
-            silent.append(not _doubted(record, tweak, alone, 0))
+            silent.append(not _doubted(record, change, alone, 0))
     yield _coverage(f"{name}: instants within the interval", held, len(held))
     yield Figure(f"{name}: nothing found", unseen, f"of {len(held)}")
     yield _coverage(f"{name}: true instants that are not doubted", silent, len(silent))
@@ -136,23 +136,23 @@ def _wrong(name: str, every: Sequence[Several]) -> Iterator[Figure]:
     for error_n in WRONG_BY_N:
         said: dict[str, list[bool]] = {size: [] for size in SIZES}
         for record in every:
-            for tweak, alone in record.stretches():
-                said[_size(tweak)] += [_doubted(record, tweak, alone, each) for each in (-error_n, error_n)]
+            for change, alone in record.stretches():
+                said[_size(change)] += [_doubted(record, change, alone, each) for each in (-error_n, error_n)]
         by_size = ", ".join(f"{size}: {np.mean(each):.2f} of {len(each)}" for size, each in said.items())
         share = float(np.mean(np.concatenate(list(said.values()))))
         yield Figure(f"{name}: doubted if wrong by {error_n} samples", share, by_size)
 
 
-def _size(tweak: PlannedChange) -> str:
-    (old, new), *_ = tweak.before.changes_to(tweak.after).values()
+def _size(change: PlannedChange) -> str:
+    (old, new), *_ = change.before.changes_to(change.after).values()
     part = 1.0 - min(old, new) / max(old, new)
     return next(size for size, most in SIZES.items() if part < most)
 
 
-def _doubted(record: Several, tweak: PlannedChange, alone: range, error_n: int) -> bool:
+def _doubted(record: Several, change: PlannedChange, alone: range, error_n: int) -> bool:
     """True if the change alone contradicts an instant that is given ``error_n`` samples off."""
     first = alone.start - 1
-    told = dataclasses.replace(tweak, sample=tweak.sample - first + error_n)
+    told = dataclasses.replace(change, sample=change.sample - first + error_n)
     return bool(contradictions(record.signals.part(first, alone.stop), [told], first))
 
 

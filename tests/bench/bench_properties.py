@@ -113,8 +113,8 @@ def _latency() -> Iterator[Figure]:
 
 def _sums(played: Played) -> tuple[float, float]:
     """Sums of the latencies and of the bounds of a play, in samples."""
-    tweaks = played.verdict.tweaks
-    return float(sum(each.latency_n or 0 for each in tweaks)), float(sum(each.bound_n or 0 for each in tweaks))
+    changes = played.verdict.changes
+    return float(sum(each.latency_n or 0 for each in changes)), float(sum(each.bound_n or 0 for each in changes))
 
 
 def _beyond(values: NDArray[np.float64], count: int) -> float:

@@ -73,11 +73,11 @@ def figures() -> Iterator[Figure]:
 def _cases() -> Iterator[tuple[str, Scenario, int]]:
     healthy, thesis = Scenario.load("healthy"), Scenario.load("thesis")
     yield f"healthy, {LONG_N} samples", dataclasses.replace(healthy, samples=LONG_N), 4
-    later = tuple(dataclasses.replace(tweak, sample=tweak.sample + THESIS_LATER_N) for tweak in thesis.tweaks)
-    longer = dataclasses.replace(thesis, samples=thesis.samples + THESIS_LATER_N, tweaks=later)
+    later = tuple(dataclasses.replace(change, sample=change.sample + THESIS_LATER_N) for change in thesis.changes)
+    longer = dataclasses.replace(thesis, samples=thesis.samples + THESIS_LATER_N, changes=later)
     yield f"the thesis's changes in {longer.samples} samples", longer, 20
     yield f"the thesis's changes in {thesis.samples} samples", thesis, 100
-    short = dataclasses.replace(thesis, samples=300, tweaks=(dataclasses.replace(thesis.tweaks[0], sample=200),))
+    short = dataclasses.replace(thesis, samples=300, changes=(dataclasses.replace(thesis.changes[0], sample=200),))
     yield f"one change in {short.samples} samples", short, 200
 
 

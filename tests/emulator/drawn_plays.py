@@ -39,8 +39,8 @@ def table_of(seed: int) -> dict[str, Any]:
 def scenario_of(table: Mapping[str, Any], samples: int = SAMPLES) -> Scenario:
     """First samples of the run that a program plays by default."""
     scenario = Scenario.of_program(Program.from_table(table, str(table["name"])))
-    tweaks = tuple(tweak for tweak in scenario.tweaks if tweak.sample < samples)
-    return replace(scenario, samples=samples, tweaks=tweaks)
+    changes = tuple(change for change in scenario.changes if change.sample < samples)
+    return replace(scenario, samples=samples, changes=changes)
 
 
 def failures(scenario: Scenario, rig: str, seeds: Sequence[int]) -> Iterator[tuple[int, str]]:

@@ -12,7 +12,7 @@ from tests.bench import bench_engine
 from tests.bench.bench_engine import (
     METHODS,
     SETTINGS,
-    THESIS_TWEAKS,
+    THESIS_CHANGES,
     TOLERATED_LSB,
     Setting,
     Simulated,
@@ -85,6 +85,6 @@ def test_ngspice_integrates_by_the_method_of_the_setting() -> None:
     ids=str,
 )
 def test_decks_without_time_points_on_the_samples_compute_the_same_signals(setting: Setting) -> None:
-    run = simulate(deck(setting, SAMPLES, THESIS_TWEAKS), exact_v(SAMPLES, THESIS_TWEAKS))
+    run = simulate(deck(setting, SAMPLES, THESIS_CHANGES), exact_v(SAMPLES, THESIS_CHANGES))
     assert run.error_lsb <= TOLERATED_LSB
     assert run.spent_s > 0.0

@@ -33,12 +33,12 @@ TL07X = OpAmpModel(avol=2e5, gbw_hz=3e6, slew_v_per_s=13e6, swing_v=(-13.5, 13.5
 def test_machine_with_offsets_turned_pots_and_initial_conditions_agrees_with_ngspice(ngspice: NgSpice) -> None:
     computer = SuspensionComputer("front", rng=np.random.default_rng(1), offset_v=3e-3)
     excitation = Excitation(clock="free", drift_ppm=200.0, phase=0.637, frequency_hz=317.0)
-    tweaks = (PotTurn(60, {"K": 18000.0}), PotTurn(90, {"B": 2123.0, "K": 20000.0}))
+    changes = (PotTurn(60, {"K": 18000.0}), PotTurn(90, {"B": 2123.0, "K": 20000.0}))
     deck = Deck(
         computer.circuit,
         samples=120,
         edges={"F": excitation.edges(0, 120 * TICKS_PER_SAMPLE, RATE_HZ)},
-        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks],
+        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in changes],
         initial_v={"C2": 1.5, "U3": -1.5, "U5": 1.5},
     )
     nodes = ("u1", "u2", "u3", "u4", "u5")

@@ -55,7 +55,7 @@ excitations = st.builds(
     phase=st.floats(0.0, 0.99),
     clock=st.sampled_from(("card", "free")),
 )
-tweaks = st.lists(
+changes = st.lists(
     st.builds(
         PotTurn,
         st.integers(0, 299),
@@ -135,7 +135,7 @@ def test_superposition_holds_while_nothing_limits(
 
 
 @deterministic
-@given(programs, factors, excitations, tweaks, st.integers(1, 300), st.integers(0, 99))
+@given(programs, factors, excitations, changes, st.integers(1, 300), st.integers(0, 99))
 def test_halving_the_block_size_changes_no_code(
     program: SuspensionProgram,
     by: tuple[float, float, float],
@@ -181,13 +181,13 @@ def test_block_size_changes_no_bit_while_a_pot_turns(
 
 @deterministic
 @given(programs, factors, excitations, st.integers(0, 298), st.sampled_from(("M", "B", "K")))
-def test_a_tweak_to_the_same_value_changes_nothing(
+def test_a_change_to_the_same_value_changes_nothing(
     program: SuspensionProgram, by: tuple[float, float, float], excitation: Excitation, sample: int, setting: str
 ) -> None:
     plain, touched = (SuspensionComputer(scaled(program, by)) for _ in range(2))
-    tweak = PotTurn(sample, {setting: touched.program.values[setting]})
+    change = PotTurn(sample, {setting: touched.program.values[setting]})
     untouched = np.concatenate(list(plain.play(excitation, 300)))
-    assert np.array_equal(np.concatenate(list(touched.play(excitation, 300, [tweak]))), untouched)
+    assert np.array_equal(np.concatenate(list(touched.play(excitation, 300, [change]))), untouched)
 
 
 def test_cost_grows_linearly_with_samples() -> None:

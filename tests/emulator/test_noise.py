@@ -98,13 +98,13 @@ def test_the_displacements_noise_is_that_of_its_covariance() -> None:
 
 
 def test_noise_adds_to_what_is_played_and_follows_its_pots() -> None:
-    tweaks = [PotTurn(30, {"K": 18000.0}), PotTurn(90, {"M": 30.0})]
+    changes = [PotTurn(30, {"K": 18000.0}), PotTurn(90, {"M": 30.0})]
 
     def played(block_samples: int, seed: int = 1) -> np.ndarray:
         machine = NoisySuspension(SuspensionComputer("front"), np.random.default_rng(seed), op_amps=TL07X)
-        return np.concatenate(list(machine.play(Excitation(), 150, tweaks, block_samples)))
+        return np.concatenate(list(machine.play(Excitation(), 150, changes, block_samples)))
 
-    quiet = np.concatenate(list(SuspensionComputer("front").play(Excitation(), 150, tweaks)))
+    quiet = np.concatenate(list(SuspensionComputer("front").play(Excitation(), 150, changes)))
     noise = played(150) - quiet
     assert np.array_equal(noise[:, 0], np.zeros(150))
     assert 0 < np.abs(noise[:, 1]).max() < 0.2 * LSB_V

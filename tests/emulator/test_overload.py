@@ -62,8 +62,8 @@ def test_741s_slew_so_long_at_an_edge_that_the_summers_lamp_lights(program: str)
 def test_stiffness_back_as_the_force_falls_clamps_the_summer_too_shortly_for_its_lamp() -> None:
     """K x = 24500 N/m times 0.163 m are 13.6 V; at 1 MHz the swing of 13.5 V shows, less what Rout takes."""
     computer = SuspensionComputer("front", sample_rate_hz=1e6)
-    tweaks = [PotTurn(20, {"K": 18000.0}), PotTurn(7500, {"K": 24500.0})]
-    volts = np.concatenate(list(computer.play(Excitation(frequency_hz=20e3 / 300), 7600, tweaks)))
+    changes = [PotTurn(20, {"K": 18000.0}), PotTurn(7500, {"K": 24500.0})]
+    volts = np.concatenate(list(computer.play(Excitation(frequency_hz=20e3 / 300), 7600, changes)))
     assert volts[7499, 1] * 24500.0 * 0.01996 / 294.0 == pytest.approx(13.6, abs=0.05)
     clamped = np.flatnonzero(volts[:, 3] < -13.34)
     assert 2 <= len(clamped) < 10

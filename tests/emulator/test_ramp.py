@@ -37,8 +37,8 @@ BUSY = Excitation(low_v=1.0, high_v=9.0)
 K_RAMP: PotTurn = PotTurn(120, {"K": 18000.0}, 80)
 
 
-def played(computer: SuspensionComputer, samples: int, tweaks: Sequence[PotTurn] = (), block: int = 4096) -> Volts:
-    return np.concatenate(list(computer.play(BUSY, samples, tweaks, block)))
+def played(computer: SuspensionComputer, samples: int, changes: Sequence[PotTurn] = (), block: int = 4096) -> Volts:
+    return np.concatenate(list(computer.play(BUSY, samples, changes, block)))
 
 
 def under_load(dial: float, load_ohm: float) -> float:

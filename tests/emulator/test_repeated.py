@@ -71,7 +71,7 @@ def test_lamp_of_an_overload_is_lit_in_its_own_repeat_alone() -> None:
     assert all(lamp is None for lamp in repeated.play(quiet, zero_v).lamps.values())
 
 
-def test_tweak_beyond_the_play_is_refused() -> None:
+def test_change_beyond_the_play_is_refused() -> None:
     with pytest.raises(PotError, match="at sample 400"):
         RepeatedPlay(fresh(preset("tl07x"), "front", 0), SAMPLES, [PotTurn(SAMPLES, {"K": 18000.0})])
 

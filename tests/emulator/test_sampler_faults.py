@@ -49,11 +49,11 @@ class Wave:
         self,
         excitation: Excitation,
         samples: int,
-        tweaks: Sequence[PotTurn] = (),
+        changes: Sequence[PotTurn] = (),
         block_samples: int = 256,
         ahead_ticks: int = 0,
     ) -> Iterator[Volts]:
-        del excitation, tweaks
+        del excitation, changes
         instants = [0, ahead_ticks] if ahead_ticks else [0]
         ticks = np.arange(samples)[:, None] * TICKS_PER_SAMPLE + np.repeat(instants, self.channels)
         times = ticks / TICKS_PER_SAMPLE / self.sample_rate_hz * 1e6
@@ -90,16 +90,16 @@ def test_a_skew_off_any_grid_is_refused() -> None:
 
 @pytest.mark.parametrize("skew_us", [10.0, 25.0])
 def test_skewed_displacement_is_that_of_a_machine_sampled_faster(skew_us: float) -> None:
-    """The same machine at five, or two, times the rate: its own samples at that instant, tweak included."""
+    """The same machine at five, or two, times the rate: its own samples at that instant, change included."""
     count = round(50.0 / skew_us)
     card = Card(skew_s=(0.0, skew_us * 1e-6, 0.0, 0.0))
     assert probes_per_sample(card) == count
-    excitation, tweak = Excitation(clock="free", phase=0.3), {"K": 18000.0}
+    excitation, change = Excitation(clock="free", phase=0.3), {"K": 18000.0}
     machine = SuspensionComputer("front", sample_rate_hz=20e3 * count)
     rng = np.random.default_rng(1)
-    volts = np.concatenate(list(acquired(machine, card, excitation, 150, [PotTurn(60, tweak)], rng=rng)))
+    volts = np.concatenate(list(acquired(machine, card, excitation, 150, [PotTurn(60, change)], rng=rng)))
     fast = SuspensionComputer("front", sample_rate_hz=20e3 * count)
-    every = np.concatenate(list(fast.play(excitation, 150 * count, [PotTurn(60 * count, tweak)])))
+    every = np.concatenate(list(fast.play(excitation, 150 * count, [PotTurn(60 * count, change)])))
     np.testing.assert_allclose(volts[:, 0], every[::count, 0], rtol=0, atol=1e-12)
     np.testing.assert_allclose(volts[:, 1], every[1::count, 1], rtol=0, atol=1e-9)
 

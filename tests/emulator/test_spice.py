@@ -30,7 +30,7 @@ Volts = NDArray[np.float64]
 
 LSB_V = 10.0 / 4096
 SAMPLE_RATE_HZ = 20e3
-THESIS_TWEAKS = (
+THESIS_CHANGES = (
     PotTurn(200, {"K": 18000.0}),
     PotTurn(400, {"B": 3453.0}),
     PotTurn(500, {"B": 2123.0, "K": 20000.0}),
@@ -43,13 +43,13 @@ def deck_of(
     computer: SuspensionComputer,
     excitation: Excitation,
     samples: int,
-    tweaks: Sequence[PotTurn] = (),
+    changes: Sequence[PotTurn] = (),
 ) -> str:
     return to_spice(
         computer.circuit,
         samples=samples,
         edges={"F": excitation.edges(0, samples * TICKS_PER_SAMPLE, SAMPLE_RATE_HZ)},
-        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks],
+        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in changes],
     )
 
 
@@ -58,24 +58,24 @@ def every_amplifier(computer: SuspensionComputer, excitation: Excitation, sample
     return engine.run(samples, {"F": excitation.edges(*engine.window(samples), SAMPLE_RATE_HZ)})
 
 
-@pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("front", ()), ("shock", ())])
+@pytest.mark.parametrize(("program", "changes"), [("front", THESIS_CHANGES), ("front", ()), ("shock", ())])
 def test_displacement_and_velocity_agree_with_ngspice_at_every_sample(
-    ngspice: NgSpice, program: str, tweaks: Sequence[PotTurn]
+    ngspice: NgSpice, program: str, changes: Sequence[PotTurn]
 ) -> None:
     computer = SuspensionComputer(program)
-    reference = ngspice(deck_of(computer, Excitation(), 800, tweaks), ("u5", "u2"), 800)
-    volts = np.concatenate(list(computer.play(Excitation(), 800, tweaks)))
+    reference = ngspice(deck_of(computer, Excitation(), 800, changes), ("u5", "u2"), 800)
+    volts = np.concatenate(list(computer.play(Excitation(), 800, changes)))
     assert np.abs(volts[:, 1:3] - reference).max() < 0.05 * LSB_V
 
 
-@pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("front", ()), ("shock", ())])
+@pytest.mark.parametrize(("program", "changes"), [("front", THESIS_CHANGES), ("front", ()), ("shock", ())])
 def test_every_amplifier_agrees_with_ngspice_at_every_sample(
-    ngspice: NgSpice, program: str, tweaks: Sequence[PotTurn]
+    ngspice: NgSpice, program: str, changes: Sequence[PotTurn]
 ) -> None:
     """The edges come between samples: at an edge's own instant ngspice still shows the level before it."""
     computer, excitation = SuspensionComputer(program), Excitation(clock="free", phase=0.637)
-    reference = ngspice(deck_of(computer, excitation, 800, tweaks), AMPLIFIERS, 800)
-    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks]
+    reference = ngspice(deck_of(computer, excitation, 800, changes), AMPLIFIERS, 800)
+    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in changes]
     volts = played_with_turns(computer.circuit, excitation, 800, turns)
     assert np.abs(volts - reference).max() < 0.05 * LSB_V
 

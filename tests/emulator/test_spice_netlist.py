@@ -25,10 +25,10 @@ random_phase = true
 [excitation]
 clock = "free"
 drift_ppm = 30.0
-[[tweaks]]
+[[changes]]
 sample = 60
 stiffness_n_per_m = 18000.0
-[[tweaks]]
+[[changes]]
 sample = 100
 mass_kg = 60.0
 damping_n_s_per_m = 2500.0

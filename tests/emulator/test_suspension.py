@@ -28,7 +28,7 @@ from analogrig_emulator import (
 Volts = NDArray[np.float64]
 
 LSB_V = 10.0 / 4096
-THESIS_TWEAKS: tuple[PotTurn, ...] = (
+THESIS_CHANGES: tuple[PotTurn, ...] = (
     PotTurn(200, {"K": 18000.0}),
     PotTurn(400, {"B": 3453.0}),
     PotTurn(500, {"B": 2123.0, "K": 20000.0}),
@@ -37,15 +37,15 @@ THESIS_TWEAKS: tuple[PotTurn, ...] = (
 
 
 def played(
-    computer: SuspensionComputer, samples: int, tweaks: Sequence[PotTurn] = (), excitation: Excitation | None = None
+    computer: SuspensionComputer, samples: int, changes: Sequence[PotTurn] = (), excitation: Excitation | None = None
 ) -> Volts:
-    return np.concatenate(list(computer.play(excitation or Excitation(), samples, tweaks)))
+    return np.concatenate(list(computer.play(excitation or Excitation(), samples, changes)))
 
 
-def plant(program: ProgramCircuit, force_n: Volts, tweaks: Sequence[PotTurn] = ()) -> Volts:
+def plant(program: ProgramCircuit, force_n: Volts, changes: Sequence[PotTurn] = ()) -> Volts:
     """M x'' + B x' + K x = F with F held between samples, exactly, by scipy: x in m, v in m/s, (samples, 2)."""
     values = program.values
-    turns = {change.sample: change.values for change in tweaks}
+    turns = {change.sample: change.values for change in changes}
     x = np.zeros(2)
     rows = []
     for k, force in enumerate(force_n):
@@ -59,12 +59,12 @@ def plant(program: ProgramCircuit, force_n: Volts, tweaks: Sequence[PotTurn] = (
     return np.array(rows)
 
 
-@pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("shock", ())])
-def test_with_ideal_amplifiers_it_is_the_plant(program: str, tweaks: Sequence[PotTurn]) -> None:
+@pytest.mark.parametrize(("program", "changes"), [("front", THESIS_CHANGES), ("shock", ())])
+def test_with_ideal_amplifiers_it_is_the_plant(program: str, changes: Sequence[PotTurn]) -> None:
     computer = SuspensionComputer(program, opamp="ideal")
-    volts = played(computer, 800, tweaks)
+    volts = played(computer, 800, changes)
     scales = computer.scales
-    expected = plant(computer.program, volts[:, 0] / scales.volts("force"), tweaks)
+    expected = plant(computer.program, volts[:, 0] / scales.volts("force"), changes)
     np.testing.assert_allclose(volts[:, 1], expected[:, 0] * scales.volts("displacement"), rtol=0, atol=1e-9)
     np.testing.assert_allclose(volts[:, 2], expected[:, 1] * scales.volts("velocity"), rtol=0, atol=1e-9)
 
@@ -99,13 +99,13 @@ def test_amplifiers_much_faster_than_the_samples_are_ideal() -> None:
 
 def test_tl07x_amplifiers_differ_from_ideal_ones_by_about_an_lsb() -> None:
     """1 to 3 LSB, for bandwidth and slew together, is what ngspice gave for this circuit."""
-    ideal = played(SuspensionComputer("front", opamp="ideal"), 800, THESIS_TWEAKS)
-    real = played(SuspensionComputer("front"), 800, THESIS_TWEAKS)
+    ideal = played(SuspensionComputer("front", opamp="ideal"), 800, THESIS_CHANGES)
+    real = played(SuspensionComputer("front"), 800, THESIS_CHANGES)
     assert 1.0 < np.abs(real - ideal)[:, 1].max() / LSB_V < 3.0
 
 
 def test_the_thesis_profile_stays_within_the_ranges_seen() -> None:
-    volts = played(SuspensionComputer("front"), 800, THESIS_TWEAKS)
+    volts = played(SuspensionComputer("front"), 800, THESIS_CHANGES)
     assert volts[:, 1].min() == pytest.approx(-0.34, abs=0.01)
     assert volts[:, 1].max() == pytest.approx(8.01, abs=0.01)
     assert np.abs(volts[:, 2]).max() < 5.7
@@ -125,15 +125,15 @@ def test_all_programs_move_as_far_for_10_v(program: str) -> None:
     assert PROGRAMS[program].scales.full("displacement") == pytest.approx(0.1996, rel=1e-12)
 
 
-def test_a_tweak_at_k_shows_first_at_the_next_sample() -> None:
+def test_a_change_at_k_shows_first_at_the_next_sample() -> None:
     computer = SuspensionComputer("front")
     plain = played(computer, 300)
-    tweaked = played(computer, 300, [PotTurn(130, {"K": 18000.0})])
-    assert np.array_equal(tweaked[:131], plain[:131])
-    assert abs(tweaked[131, 3] - plain[131, 3]) > 1.0
+    changeed = played(computer, 300, [PotTurn(130, {"K": 18000.0})])
+    assert np.array_equal(changeed[:131], plain[:131])
+    assert abs(changeed[131, 3] - plain[131, 3]) > 1.0
 
 
-def test_a_tweak_to_the_same_value_changes_no_bit() -> None:
+def test_a_change_to_the_same_value_changes_no_bit() -> None:
     plain = played(SuspensionComputer("front"), 300)
     same = played(SuspensionComputer("front"), 300, [PotTurn(123, {"M": FRONT.M_kg, "K": FRONT.K_n_per_m})])
     assert np.array_equal(plain, same)
@@ -142,21 +142,21 @@ def test_a_tweak_to_the_same_value_changes_no_bit() -> None:
 @pytest.mark.parametrize("block_samples", [1, 7, 200, 5000])
 def test_the_size_of_the_blocks_changes_no_bit(block_samples: int) -> None:
     excitation = Excitation(clock="free", phase=0.77, drift_ppm=20.0)
-    whole = played(SuspensionComputer("front"), 800, THESIS_TWEAKS, excitation)
-    blocks = list(SuspensionComputer("front").play(excitation, 800, THESIS_TWEAKS, block_samples))
+    whole = played(SuspensionComputer("front"), 800, THESIS_CHANGES, excitation)
+    blocks = list(SuspensionComputer("front").play(excitation, 800, THESIS_CHANGES, block_samples))
     assert {len(block) for block in blocks[:-1]} <= {block_samples}
     assert np.array_equal(np.concatenate(blocks), whole)
 
 
-def test_setting_a_pot_between_blocks_is_a_tweak() -> None:
-    tweaked = played(SuspensionComputer("front"), 300, [PotTurn(199, {"M": 30.0})])
+def test_setting_a_pot_between_blocks_is_a_change() -> None:
+    changeed = played(SuspensionComputer("front"), 300, [PotTurn(199, {"M": 30.0})])
     computer = SuspensionComputer("front")
     blocks = []
     for block in computer.play(Excitation(), 300, block_samples=100):
         blocks.append(block)
         if len(blocks) == 2:
             computer.set(M=30.0)
-    assert np.array_equal(np.concatenate(blocks), tweaked)
+    assert np.array_equal(np.concatenate(blocks), changeed)
 
 
 def test_every_play_starts_from_rest_with_the_pots_where_they_were_left() -> None:
@@ -251,10 +251,10 @@ def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
             SuspensionComputer("front", rng=np.random.default_rng(1), offset_v=offset_v)
 
 
-@pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("shock", ())])
-def test_a_healthy_play_lights_no_lamp(program: str, tweaks: Sequence[PotTurn]) -> None:
+@pytest.mark.parametrize(("program", "changes"), [("front", THESIS_CHANGES), ("shock", ())])
+def test_a_healthy_play_lights_no_lamp(program: str, changes: Sequence[PotTurn]) -> None:
     computer = SuspensionComputer(program, rng=np.random.default_rng(1))
-    played(computer, 800, tweaks)
+    played(computer, 800, changes)
     assert computer.machine.lamps == dict.fromkeys(("U1", "U2", "U3", "U4", "U5"))
 
 

@@ -31,7 +31,7 @@ QUANTITIES = (
     "tyre_velocity",
     "tyre_displacement",
 )
-TWEAKS: tuple[PotTurn, ...] = (
+CHANGES: tuple[PotTurn, ...] = (
     PotTurn(120, {"K2": 18000.0}),
     PotTurn(200, {"M1": 14.0, "B2": 3453.0}),
     PotTurn(280, {"K1": 150e3, "M2": 90.0}),
@@ -41,18 +41,18 @@ TWEAKS: tuple[PotTurn, ...] = (
 READ_NODES = [PROGRAM.scales.quantities[quantity].node for quantity in QUANTITIES]
 
 
-def deck_of(computer: SuspensionComputer, tweaks: Sequence[PotTurn] = TWEAKS) -> Deck:
+def deck_of(computer: SuspensionComputer, changes: Sequence[PotTurn] = CHANGES) -> Deck:
     edges = Excitation().edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
-    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks]
+    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in changes]
     return Deck(computer.circuit, SAMPLES, RATE_HZ, {"F": edges}, turns, title="two masses")
 
 
-def by_equations(tweaks: Sequence[PotTurn]) -> Volts:
+def by_equations(changes: Sequence[PotTurn]) -> Volts:
     """Equ 2.1 and 2.2 stepped exactly: (samples, quantities in the order of QUANTITIES), in V at their nodes."""
     values, scales = dict(PROGRAM.values), PROGRAM.scales
     edges = Excitation().edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
     force_v = edges.levels_v[np.searchsorted(edges.ticks, np.arange(SAMPLES) * TICKS_PER_SAMPLE, side="right") - 1]
-    settings = {change.sample: change.values for change in tweaks}
+    settings = {change.sample: change.values for change in changes}
     rows: list[list[float]] = []
     state: Volts = np.zeros(4)
     for k in range(SAMPLES):
@@ -86,13 +86,13 @@ def stepped(values: Mapping[str, float], state: Volts, force_n: float) -> Volts:
 
 def test_with_ideal_amplifiers_it_solves_the_equations_of_the_thesis() -> None:
     volts = deck_of(SuspensionComputer(PROGRAM, opamp="ideal")).volts(READ_NODES)
-    np.testing.assert_allclose(volts, by_equations(TWEAKS), atol=1e-9)
+    np.testing.assert_allclose(volts, by_equations(CHANGES), atol=1e-9)
 
 
 def test_with_real_amplifiers_it_stays_within_25_lsb_of_them() -> None:
     # Bandwidth: the tyre rings at 3.4 kHz of machine time, and the summers have inputs of gain 10.
     volts = deck_of(SuspensionComputer(PROGRAM)).volts(READ_NODES)
-    deviation = dict(zip(QUANTITIES, np.abs(volts - by_equations(TWEAKS)).max(axis=0) / LSB_V, strict=True))
+    deviation = dict(zip(QUANTITIES, np.abs(volts - by_equations(CHANGES)).max(axis=0) / LSB_V, strict=True))
     moving = ("displacement", "velocity", "compression", "tyre_velocity", "tyre_displacement")
     assert max(deviation[name] for name in moving) < 25.0
 

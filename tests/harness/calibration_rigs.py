@@ -130,7 +130,7 @@ def thesis_profile(program: ProgramName) -> Scenario:
         samples=thesis.samples,
         excitation=thesis.excitation,
         program=Program.load("shock"),
-        tweaks=(
+        changes=(
             PotChange(1200, {"K": 18000.0 * k}),
             PotChange(1400, {"B": 3453.0 * b}),
             PotChange(1500, {"B": 2123.0 * b, "K": 20000.0 * k}),

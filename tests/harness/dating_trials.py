@@ -59,8 +59,8 @@ def scenario_of(
     samples: int, clock: Clock, frequency_hz: float, plant: Plant = FRONT, sample: int = 0, ramp_n: int = 0
 ) -> Scenario:
     """Scenario of the front suspension, which becomes ``plant`` at a sample."""
-    tweaks = (tweak_of(sample, FRONT, plant, ramp_n),) if plant != FRONT else ()
-    return Scenario(samples, square(clock, frequency_hz, 9.9), random_phase=True, tweaks=tweaks, name="onset")
+    changes = (change_of(sample, FRONT, plant, ramp_n),) if plant != FRONT else ()
+    return Scenario(samples, square(clock, frequency_hz, 9.9), random_phase=True, changes=changes, name="onset")
 
 
 def square(clock: Clock, frequency_hz: float, high_v: float) -> Excitation:
@@ -68,7 +68,7 @@ def square(clock: Clock, frequency_hz: float, high_v: float) -> Excitation:
     return Excitation(low_v=0.1, high_v=high_v, frequency_hz=frequency_hz, clock=clock, drift_ppm=drift_ppm)
 
 
-def tweak_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> PotChange:
+def change_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> PotChange:
     return PotChange(sample, {name: new for name, (_, new) in before.changes_to(after).items()}, ramp_n)
 
 
@@ -153,7 +153,7 @@ class Several:
     """Several changes of one record at known samples."""
 
     signals: Signals
-    tweaks: tuple[PlannedChange, ...]
+    changes: tuple[PlannedChange, ...]
 
     @classmethod
     def of(cls, seed: int, clock: Clock, rig: Rig | None = None) -> Several:
@@ -171,16 +171,16 @@ class Several:
             samples=int(instants[-1]),
             excitation=square(clock, float(rng.choice([100.0, 200.0])), 9.0 * softest),
             random_phase=True,
-            tweaks=tuple(tweak_of(*pair) for pair in pairs),
+            changes=tuple(change_of(*pair) for pair in pairs),
             name="several",
         )
         return cls(play(scenario, seed, rig), tuple(PlannedChange(sample, {}, *both) for sample, *both in pairs))
 
     def stretches(self) -> Iterator[tuple[PlannedChange, range]]:
         """Each change with the samples between its neighbours."""
-        starts = [tweak.sample for tweak in self.tweaks]
-        for tweak, before, after in zip(self.tweaks, [0, *starts], [*starts[1:], len(self.signals)], strict=False):
-            yield tweak, range(before + 1, after)
+        starts = [change.sample for change in self.changes]
+        for change, before, after in zip(self.changes, [0, *starts], [*starts[1:], len(self.signals)], strict=False):
+            yield change, range(before + 1, after)
 
 
 def _next(

@@ -56,7 +56,7 @@ def reported_verdict(run: Run) -> Verdict:
     return Verdict(
         outcome="failed",
         reasons=("missed 1 of 2 changes",),
-        tweaks=(
+        changes=(
             ChangeVerdict(
                 *(1200, "K", {"K": 24500.0}, {"K": 18000.0}),
                 latency_n=3,

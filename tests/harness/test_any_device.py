@@ -80,7 +80,7 @@ def test_alarms_are_judged_as_those_of_our_device(run: Run, ours: Run) -> None:
     verdict, reference = judge(run), judge(ours)
     assert verdict.outcome == "passed"
     assert verdict.alarm_hash == reference.alarm_hash
-    for mine, other in zip(verdict.tweaks, reference.tweaks, strict=True):
+    for mine, other in zip(verdict.changes, reference.changes, strict=True):
         assert dataclasses.replace(other, diagnosis=None) == mine
     assert verdict.false_alarms == reference.false_alarms
 

@@ -63,7 +63,7 @@ def test_the_nominal_row_is_the_shipped_rig() -> None:
 def _shipped_rig_run(change: PotChange) -> Run:
     rig = open_rig("emulator")
     assert isinstance(rig, EmulatorRig)
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=SAMPLES, tweaks=(change,))
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=SAMPLES, changes=(change,))
     return direct_bench(rig, InprocDevice(name="shipped"), alarms_only=True).play(scenario, 5)
 
 

@@ -33,17 +33,17 @@ class Hand(Pots):
         self.clock.advance(self.takes_s)
 
 
-def turned(tweaks: Sequence[PlannedChange], takes_s: float, *, slow: bool = False) -> HandChanges:
+def turned(changes: Sequence[PlannedChange], takes_s: float, *, slow: bool = False) -> HandChanges:
     """Changes made by hand in virtual time, each when it is due."""
     clock = VirtualClock()
-    by_hand = HandChanges(Hand(clock, takes_s, slow), tweaks, RATE_HZ, clock, clock.advance)
+    by_hand = HandChanges(Hand(clock, takes_s, slow), changes, RATE_HZ, clock, clock.advance)
     by_hand.make_all()
     return by_hand
 
 
 def taken(samples: int, *changes: PotChange) -> Signals:
     """Signals of a machine of real components."""
-    return play(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
+    return play(dataclasses.replace(scenario_of(samples, "card", 200.0), changes=changes), 3)
 
 
 def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) -> PlannedChange:
@@ -95,8 +95,8 @@ def test_two_changes_of_a_record_are_dated_separately() -> None:
         PotChange(1630, {"K": soft.parameters()["K"]}),
         PotChange(3250, {"M": light.parameters()["M"]}),
     )
-    tweaks = [asked(1500, {"K": 0.6}, FRONT, soft), asked(3200, {"M": 0.5}, soft, light)]
-    first, second = turned(tweaks, takes_s=0.01).date(signals, first=0)
+    changes = [asked(1500, {"K": 0.6}, FRONT, soft), asked(3200, {"M": 0.5}, soft, light)]
+    first, second = turned(changes, takes_s=0.01).date(signals, first=0)
     for segment, sample in ((first, 1630), (second, 3250)):
         assert not segment.unseen, segment.unseen
         assert segment.earliest().start <= sample <= segment.latest().start
@@ -126,8 +126,8 @@ def test_plant_between_two_jumps_has_the_first_change() -> None:
 
 def test_two_changes_after_the_end_of_the_record_are_one() -> None:
     soft, light = FRONT.scaled("K", 0.7), FRONT.scaled("K", 0.7).scaled("M", 0.5)
-    tweaks = [asked(2600, {"K": 0.6}, FRONT, soft), asked(2900, {"M": 0.5}, soft, light)]
-    (segment,) = turned(tweaks, takes_s=0.01).date(taken(1100), first=0)
+    changes = [asked(2600, {"K": 0.6}, FRONT, soft), asked(2900, {"M": 0.5}, soft, light)]
+    (segment,) = turned(changes, takes_s=0.01).date(taken(1100), first=0)
     assert (segment.plant, bool(segment.unseen)) == (light, True)
 
 
@@ -139,7 +139,7 @@ def test_changes_at_the_scheduled_instants_are_not_contradicted(clock: Clock) ->
     """Test 24 changes each. ``make bench ARGS=onset`` has 400."""
     for seed in range(3):
         several = Several.of(seed, clock)
-        assert contradictions(several.signals, several.tweaks, first=0) == []
+        assert contradictions(several.signals, several.changes, first=0) == []
 
 
 @pytest.mark.parametrize("error_n", [-900, -250, -30, -2, 2, 30, 250, 900])

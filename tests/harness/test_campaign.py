@@ -104,7 +104,7 @@ def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
     damping = plan.draw(4)["damping_n_s_per_m"]
     assert 2500.0 < damping < 3021.0
     base = dataclasses.replace(Scenario.load("healthy"), samples=1300)
-    scenario = dataclasses.replace(base, set={"B": damping}, tweaks=(PotChange(1200, {"K": 0.9 * 24500.0}),))
+    scenario = dataclasses.replace(base, set={"B": damping}, changes=(PotChange(1200, {"K": 0.9 * 24500.0}),))
     rig_file = tmp_path / "emulator.toml"
     rig_file.write_text((Path("fixtures/rigs/emulator.toml")).read_text().replace("noise_lsb = 1.0", "noise_lsb = 0.5"))
     with open_rig(str(rig_file)) as rig, open_dut("inproc", exchange="block") as dut:
@@ -152,14 +152,14 @@ def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
         ("name = '../../elsewhere'", "name must be one that a file can have, not '../../elsewhere'"),
         ('name = "two\\nlines"', r"name must be one that a file can have, not 'two\\nlines'"),
         ("[grid]\nmass_kg = [10.0]", "M = 10 cannot be set .*at least 29.4: pot M"),
-        ("scenario = 'thesis'\n[grid]\nmass_factor = [0.5]", "has tweaks of its own"),
+        ("scenario = 'thesis'\n[grid]\nmass_factor = [0.5]", "has changes of its own"),
         ("[grid]\nmass_factor = [0.5]\n", None),
         ("[stop]\nquantity = 'late'\nrate = 0.1", "quantity: must be one of"),
         ("samples = 1100\n[grid]\nmass_factor = [0.5]\nchange_at = 3", "grid.change_at: must be an array, not 3"),
         ("false_alarms = -1\n[grid]\nmass_factor = [0.5]", "false_alarms must not be negative, not -1"),
         (
             "samples = 500\n[grid]\nmass_factor = [0.5]",
-            "mass_factor = 0.5: the tweak at sample 1000 is beyond the last",
+            "mass_factor = 0.5: the change at sample 1000 is beyond the last",
         ),
         ("rigs = ['recording:x.npz']", "x.npz"),
         ("[draw]\nnoise_lsb = [-0.05, 1.0]", "campaign spec: draw: noise_lsb = -0.05: .*noise_lsb must be 0 to"),

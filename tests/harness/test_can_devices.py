@@ -150,7 +150,7 @@ def test_device_that_cannot_be_on_the_bus_of_the_configuration_is_refused() -> N
 
 @pytest.mark.usefixtures("_configured")
 def test_bit_rate_of_the_configuration_is_in_the_record() -> None:
-    run = play(describe("can:"), scenario=dataclasses.replace(THESIS, samples=56, tweaks=()))
+    run = play(describe("can:"), scenario=dataclasses.replace(THESIS, samples=56, changes=()))
     assert run.conditions.line == {"bitrate": 250_000, "samples_per_message": 1, "window": 1}
 
 

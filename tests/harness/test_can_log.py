@@ -37,7 +37,7 @@ DBC = Path(__file__).parents[2] / "estimator_c" / "catalogue" / "analogrig.dbc"
 SCENARIO = dataclasses.replace(
     Scenario.load("thesis"),
     samples=800,
-    tweaks=tuple(dataclasses.replace(tweak, sample=650) for tweak in Scenario.load("thesis").tweaks[:1]),
+    changes=tuple(dataclasses.replace(change, sample=650) for change in Scenario.load("thesis").changes[:1]),
 )
 SEED = 7
 

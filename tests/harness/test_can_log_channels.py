@@ -89,7 +89,7 @@ def test_virtual_bus_is_logged_whatever_name_it_draws(
 ) -> None:
     monkeypatch.setattr(secrets, "token_hex", lambda _: drawn)
     log = CanLog(tmp_path / f"run.{suffix}")
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=20, tweaks=())
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=20, changes=())
     with open_rig("emulator") as rig, open_dut("can:virtual", listener=log) as dut:
         log.begin()
         Bench(rig, dut).play(scenario, 1)

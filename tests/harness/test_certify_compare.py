@@ -421,7 +421,7 @@ def test_recordings_of_one_name_that_played_something_else_are_not_paired(tmp_pa
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=700, name="drawn")
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for factor in (0.7, 0.9):
-            drawn = dataclasses.replace(scenario, tweaks=(PotChange(400, {"K": 24500.0 * factor}),))
+            drawn = dataclasses.replace(scenario, changes=(PotChange(400, {"K": 24500.0 * factor}),))
             Bench(rig, dut).play(drawn, 0).save(tmp_path / "both" / str(factor) / "run.npz")
     assert len(dict(recorded(tmp_path / "both"))) == 2
     found = compare(recorded(tmp_path / "both" / "0.7"), recorded(tmp_path / "both" / "0.9"))
@@ -534,7 +534,7 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
 
 def test_too_few_seeds_to_show_anything_are_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     healthy = Scenario.load("healthy")
-    scenario = dataclasses.replace(healthy, samples=700, tweaks=(PotChange(400, {"K": 20000.0}),))
+    scenario = dataclasses.replace(healthy, samples=700, changes=(PotChange(400, {"K": 20000.0}),))
     with open_rig("emulator") as rig:
         for name, dut in (("a", "inproc"), ("b", "mean-between-faults")):
             with open_dut(dut, exchange="block") as device:

@@ -22,7 +22,7 @@ SCENARIO = """
 samples = 100
 [excitation]
 shape = "square"
-[[tweaks]]
+[[changes]]
 sample = 50
 mass_kg = 30.0
 """
@@ -76,9 +76,9 @@ def test_mistake_is_named_with_its_place(table: dict[str, object], message: str)
     [
         ("samples = 100", "samples = 100\nsampels = 3", "unknown key 'sampels'"),
         ("samples = 100", "samples = 0", "samples must be in 1 .. 10000000, not 0"),
-        ("sample = 50", "sample = 100", "the tweak at sample 100 is beyond the last of 100 samples"),
-        ("mass_kg = 30.0", "mass_kg = -30.0", "tweaks[0]: M must be more than 0, not -30"),
-        ("mass_kg = 30.0", "", "tweaks[0]: a pot change must set a parameter of the program"),
+        ("sample = 50", "sample = 100", "the change at sample 100 is beyond the last of 100 samples"),
+        ("mass_kg = 30.0", "mass_kg = -30.0", "changes[0]: M must be more than 0, not -30"),
+        ("mass_kg = 30.0", "", "changes[0]: a pot change must set a parameter of the program"),
         (
             'shape = "square"',
             'shape = "triangle"',

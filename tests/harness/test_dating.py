@@ -320,12 +320,12 @@ def test_two_pots_that_jump_in_succession_are_both_found() -> None:
         middle = FRONT.scaled(first, 0.75)
         after = middle.scaled(second, 0.7)
         scenario = scenario_of(2200, "card", 200.0, middle, 1000 + 7 * seed)
-        (tweak,) = scenario.tweaks
-        (later,) = scenario_of(2200, "card", 200.0, after, tweak.sample + gap).tweaks
-        signals = play(dataclasses.replace(scenario, tweaks=(tweak, later)), seed)
+        (change,) = scenario.changes
+        (later,) = scenario_of(2200, "card", 200.0, after, change.sample + gap).changes
+        signals = play(dataclasses.replace(scenario, changes=(change, later)), seed)
         out = date_turn(signals, FRONT, after, range(800, 1400), middle=middle)
         assert isinstance(out, TurnInstants), out
-        for each, sample in ((out.begin, tweak.sample), (out.end, later.sample)):
+        for each, sample in ((out.begin, change.sample), (out.end, later.sample)):
             miss_n.append(max(0, each.low - sample, sample - each.high))
         assert out.end.high - out.begin.low <= gap + 60
     assert sum(n > 0 for n in miss_n) <= 2

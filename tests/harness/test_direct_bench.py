@@ -60,16 +60,16 @@ def test_run_without_a_line_is_that_over_a_line_to_the_bit(scenario_name: str, r
     assert trial.conditions.segments == run.conditions.segments
     assert trial.conditions.overloads == run.conditions.overloads
     assert dict(trial.conditions.counters).items() <= dict(run.conditions.counters).items()
-    ours, theirs = (dataclasses.replace(judge(each), tweaks=()) for each in (trial, run))
+    ours, theirs = (dataclasses.replace(judge(each), changes=()) for each in (trial, run))
     assert ours == dataclasses.replace(theirs, fit=None, channel_faults=())
-    for mine, other in zip(judge(trial).tweaks, judge(run).tweaks, strict=True):
+    for mine, other in zip(judge(trial).changes, judge(run).changes, strict=True):
         assert mine == dataclasses.replace(other, diagnosis=None)
 
 
 def test_alarms_alone_are_those_of_the_run_across_blocks() -> None:
     thesis = Scenario.load("thesis")
-    late = tuple(dataclasses.replace(tweak, sample=tweak.sample + DIRECT_BLOCK_SAMPLES) for tweak in thesis.tweaks)
-    scenario = dataclasses.replace(thesis, samples=thesis.samples + DIRECT_BLOCK_SAMPLES, tweaks=late)
+    late = tuple(dataclasses.replace(change, sample=change.sample + DIRECT_BLOCK_SAMPLES) for change in thesis.changes)
+    scenario = dataclasses.replace(thesis, samples=thesis.samples + DIRECT_BLOCK_SAMPLES, changes=late)
     rig, device = emulator("emulator"), describe("inproc")
     whole, bench = direct_bench(rig, device).play(scenario, 3), direct_bench(rig, device, alarms_only=True)
     for _ in range(2):  # a play leaves nothing behind
@@ -129,7 +129,7 @@ def test_length_of_blocks_changes_no_code() -> None:
 @pytest.mark.parametrize("rig_name", ["emulator", "emulator-0-10v", "emulator-ideal", "emulator-real"])
 def test_plays_of_one_scenario_are_each_those_of_a_rig_of_its_own(rig_name: str) -> None:
     bench, thesis = direct_bench(emulator(rig_name), describe("inproc")), Scenario.load("thesis")
-    other = dataclasses.replace(thesis, tweaks=thesis.tweaks[:2], samples=1500)
+    other = dataclasses.replace(thesis, changes=thesis.changes[:2], samples=1500)
     for scenario, seed in ((thesis, 3), (thesis, 1), (other, 1), (thesis, 4)):
         trial = bench.play(scenario, seed)
         own = list(emulator(rig_name).perform(scenario, seed).blocks)
@@ -149,7 +149,7 @@ def test_runs_played_and_judged_together_are_those_played_alone_to_the_bit(
     """The ranges of 0 to 10 V clip; with real components each seed has a machine of its own; a sine has no edges."""
     thesis = Scenario.load("thesis")
     excitation = dataclasses.replace(thesis.excitation, shape=shape)
-    scenario = dataclasses.replace(thesis, samples=1500, tweaks=thesis.tweaks[:2], excitation=excitation)
+    scenario = dataclasses.replace(thesis, samples=1500, changes=thesis.changes[:2], excitation=excitation)
     bench = direct_bench(emulator(rig_name), describe("inproc"), alarms_only=alarms_only)
     together, alone = bench.play_all(scenario, range(5)), [bench.play(scenario, seed) for seed in range(5)]
     for one, other in zip(together, alone, strict=True):
@@ -173,7 +173,7 @@ def test_runs_of_any_program_are_judged_together_by_the_courses_of_each_to_the_b
     assert judge_all(runs) == [judge(run) for run in runs]
     for run, model in zip(runs, models_of(runs), strict=True):
         shared, alone = (information.change_information(run, each) for each in (model, None))
-        assert len(shared) == len(scenario.tweaks)
+        assert len(shared) == len(scenario.changes)
         assert [each.tobytes() for each in shared] == [each.tobytes() for each in alone]
         assert information.isolation_bounds(run, model) == information.isolation_bounds(run)
 
@@ -187,7 +187,7 @@ def test_long_runs_are_played_one_by_one() -> None:
 
 def test_runs_of_several_kinds_are_judged_each_by_its_own_conditions() -> None:
     bench, thesis = direct_bench(emulator("emulator"), describe("inproc")), Scenario.load("thesis")
-    shorter = dataclasses.replace(thesis, samples=1500, tweaks=thesis.tweaks[:2])
+    shorter = dataclasses.replace(thesis, samples=1500, changes=thesis.changes[:2])
     runs = [bench.play(scenario, seed) for scenario in (thesis, shorter, thesis) for seed in (1, 2)]
     assert judge_all(runs) == [judge(run) for run in runs]
 

@@ -63,14 +63,14 @@ def thesis(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
     return folder, run_json("run", "--seed", "3", "--out", folder / "run", cwd=folder)
 
 
-def test_run_finds_every_tweak_of_the_thesis(thesis: tuple[Path, dict[str, Any]]) -> None:
+def test_run_finds_every_change_of_the_thesis(thesis: tuple[Path, dict[str, Any]]) -> None:
     _, out = thesis
     assert (out["outcome"], out["valid"], out["seed"], out["samples"]) == ("passed", True, 3, 1800)
-    assert [tweak["sample"] for tweak in out["tweaks"]] == [1200, 1400, 1500, 1600]
-    assert [tweak["what"] for tweak in out["tweaks"]] == ["K", "B", "B, K", "M"]
-    assert out["tweaks"][2]["from"] == {"B": 3453.0, "K": 18000.0}
-    assert out["tweaks"][2]["to"] == {"B": 2123.0, "K": 20000.0}
-    assert all(tweak["latency"] >= 1 and tweak["bound"] >= 1 for tweak in out["tweaks"])
+    assert [change["sample"] for change in out["changes"]] == [1200, 1400, 1500, 1600]
+    assert [change["what"] for change in out["changes"]] == ["K", "B", "B, K", "M"]
+    assert out["changes"][2]["from"] == {"B": 3453.0, "K": 18000.0}
+    assert out["changes"][2]["to"] == {"B": 2123.0, "K": 20000.0}
+    assert all(change["latency"] >= 1 and change["bound"] >= 1 for change in out["changes"])
     assert out["false_alarms"] == []
     assert out["counters"]["updated"] == 1800
     assert out["counters"]["alarms"] == 4
@@ -81,7 +81,7 @@ def test_stiffness_and_damping_of_the_thesis_are_named_and_their_extent_told(
 ) -> None:
     """The other two changes come within 100 samples of an alarm: nothing is said of them."""
     _, out = thesis
-    said = [tweak["diagnosis"] for tweak in out["tweaks"]]
+    said = [change["diagnosis"] for change in out["changes"]]
     assert [each and (each["named"], each["right"]) for each in said] == [("K", True), ("B", True), None, None]
     assert all(abs(each["extent_error"]) < 0.02 and each["delay_n"] < 60 for each in said if each)
 
@@ -115,7 +115,7 @@ def test_every_device_gives_the_same_estimates_bit_for_bit(
 def test_replay_gives_the_same_estimates_bit_for_bit(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     _, out = thesis
     again = run_json("replay", out["run"], cwd=tmp_path)
-    for key in ("theta_hash", "tweaks", "false_alarms", "outcome", "estimates"):
+    for key in ("theta_hash", "changes", "false_alarms", "outcome", "estimates"):
         assert again[key] == out[key], key
 
 
@@ -161,7 +161,7 @@ def test_failed_verdict_has_status_1(tmp_path: Path) -> None:
     (tmp_path / "deaf.toml").write_text(text)
     out = run_json("run", "--dut", "deaf.toml", cwd=tmp_path, status=1)
     assert out["outcome"] == "failed"
-    assert [tweak["latency"] for tweak in out["tweaks"]] == [None] * 4
+    assert [change["latency"] for change in out["changes"]] == [None] * 4
 
 
 def test_recording_is_a_rig_with_its_own_scenario_and_seed(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ A, B, OFFSET = slice(0, 2), slice(2, 5), 5
 SHORT = dataclasses.replace(Scenario.load("healthy"), samples=1300, random_phase=False)
 
 
-MASS_FALLS = dataclasses.replace(SHORT, samples=1500, tweaks=(PotChange(1150, {"M": 40.0}),))
+MASS_FALLS = dataclasses.replace(SHORT, samples=1500, changes=(PotChange(1150, {"M": 40.0}),))
 
 
 def play(scenario: Scenario = SHORT, rig_name: str = "emulator", seed: int = 1) -> Run:

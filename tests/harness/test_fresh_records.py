@@ -185,10 +185,10 @@ def bits(run: Run) -> tuple[str, ...]:
 def short(name: str, samples: int) -> Scenario:
     """Scenario in as many samples, with its changes at the same parts of them."""
     loaded = Scenario.load(name)
-    tweaks = tuple(
-        dataclasses.replace(tweak, sample=tweak.sample * samples // loaded.samples) for tweak in loaded.tweaks
+    changes = tuple(
+        dataclasses.replace(change, sample=change.sample * samples // loaded.samples) for change in loaded.changes
     )
-    return dataclasses.replace(loaded, samples=samples, tweaks=tweaks)
+    return dataclasses.replace(loaded, samples=samples, changes=changes)
 
 
 @pytest.mark.heavy

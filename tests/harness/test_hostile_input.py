@@ -179,7 +179,7 @@ def test_diagnosis_of_a_non_finite_extent_is_judged_and_reported(
 
     path = rewritten(recording, tmp_path / "run.npz", change)
     assert main(["judge", str(path), "--json", "--out", str(tmp_path / "judged")]) in (0, 1)
-    diagnosis = json.loads(capsys.readouterr().out)["tweaks"][0]["diagnosis"]
+    diagnosis = json.loads(capsys.readouterr().out)["changes"][0]["diagnosis"]
     assert diagnosis["named"] == "M"
     assert diagnosis["extent"] is None
 
@@ -256,7 +256,7 @@ def test_control_characters_of_a_recording_do_not_reach_the_terminal(
     [
         ("[plant]\nmass_kg = 1e30\n", "M must be less than 1e+15, not 1e+30"),
         ("[plant]\nmass_kg = 1e-30\n", "M must be more than 1e-15, not 1e-30"),
-        ("[[tweaks]]\nsample = 9\nstiffness_n_per_m = 1e29\n", "tweaks[0]: K must be less than 1e+15"),
+        ("[[changes]]\nsample = 9\nstiffness_n_per_m = 1e29\n", "changes[0]: K must be less than 1e+15"),
         ("a." * 20_000 + "a = 1\n", "a key has more than 32 parts"),
         ("[" + "a." * 20_000 + "a]\n", "a key has more than 32 parts"),
         ("a = " + "[" * 20_000 + "]" * 20_000 + "\n", "nested too deep"),

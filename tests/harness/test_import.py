@@ -324,7 +324,7 @@ def test_columns_are_judged_in_the_time_of_the_plant(settings: dict[str, Any], t
         verdict = judge(run)
         assert run.conditions.time_scale == 200.0
         assert run.conditions.sample_period_problem_s == pytest.approx(0.01)
-        assert all(tweak.bound_n is not None for tweak in verdict.tweaks)
+        assert all(change.bound_n is not None for change in verdict.changes)
         error = verdict.estimates[0].error
         assert error and all(abs(each) < 0.1 for each in error.values())
 

@@ -248,7 +248,7 @@ def test_own_estimator_is_judged_with_its_masses_and_dampings(own: Path) -> None
     )
     with description.connect() as device:
         verdict = judge(run_of(device))
-    assert [tweak.latency_n is None for tweak in verdict.tweaks] == [False, True, False, False]
+    assert [change.latency_n is None for change in verdict.changes] == [False, True, False, False]
     assert not verdict.false_alarms
     assert verdict.not_judged == ("diagnoses",)
 

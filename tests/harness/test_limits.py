@@ -137,9 +137,9 @@ def test_wrong_arl0_is_one_line(arl0: Any) -> None:
 
 def check_bounds(predicted: list[int | None], verdict: Verdict) -> None:
     """Equal but for one sample, which the start of the play in other real parts may cost."""
-    for expected, tweak in zip(predicted, verdict.tweaks, strict=True):
-        assert (expected is None) == (tweak.bound_n is None)
-        assert abs((expected or 0) - (tweak.bound_n or 0)) <= 1
+    for expected, change in zip(predicted, verdict.changes, strict=True):
+        assert (expected is None) == (change.bound_n is None)
+        assert abs((expected or 0) - (change.bound_n or 0)) <= 1
 
 
 def fixed(scenario: Scenario) -> Scenario:
@@ -152,7 +152,7 @@ def fixed(scenario: Scenario) -> Scenario:
 )
 def test_prediction_with_a_program_is_that_of_the_table_of_a_run(bench: Bench, changed: str, program: str) -> None:
     change = PotChange(sample=1000, set={changed: {"M": 92.0, "K": 18000.0}[changed]})
-    scenario = dataclasses.replace(fixed(Scenario.of_program("front")), tweaks=(change,))
+    scenario = dataclasses.replace(fixed(Scenario.of_program("front")), changes=(change,))
     verdict = judge(bench.play(scenario.on_program(program), 1))
     predicted = predicted_bounds(scenario, verdict.arl0, rig="emulator", program=program)
     check_bounds(predicted, verdict)
@@ -175,4 +175,4 @@ def test_prediction_with_a_program_that_lacks_the_changed_parameter_is_one_line(
 def test_prediction_loads_the_scenario_that_is_named() -> None:
     scenario = Scenario.load("thesis")
     assert predicted_bounds("thesis", 1e5, rig="emulator") == predicted_bounds(scenario, 1e5, rig="emulator")
-    assert scenario.tweaks and isinstance(scenario.tweaks[0], PotChange)
+    assert scenario.changes and isinstance(scenario.changes[0], PotChange)

@@ -21,7 +21,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 
 TWO_MASS = Scenario.load("two-mass")
-SHORT = dataclasses.replace(TWO_MASS, samples=60, tweaks=())
+SHORT = dataclasses.replace(TWO_MASS, samples=60, changes=())
 
 GIVEN = "[estimator]\nna = 2\nnb = 3\n"
 FOUR = (0.9, 0.8, 0.7, 0.6)
@@ -99,7 +99,7 @@ def test_sound_plant_of_order_3_raises_no_alarm(name: str, tmp_path: Path) -> No
     """C must follow the poles: (1 - 0.8 z^-1)^3 raises one in each play."""
     file = tmp_path / f"{name}.toml"
     file.write_text(THIRD_ORDER[name], encoding="utf-8")
-    sound = dataclasses.replace(Scenario.of_program(Program.load(str(file))), samples=6000, tweaks=())
+    sound = dataclasses.replace(Scenario.of_program(Program.load(str(file))), samples=6000, changes=())
     with open_rig("emulator") as rig:
         assert can_be_direct(rig, describe("inproc"))
         runs = direct_bench(rig, describe("inproc")).play_all(sound, range(1, 7))
@@ -118,10 +118,10 @@ def test_program_chooses_the_orders_of_a_device_without_settings(device: str) ->
     with open_rig("emulator") as rig, open_dut(device) as dut:
         run = Bench(rig, dut).play(SHORT, 1)
         assert run.theta.shape == (60, 10)
-        again = Bench(rig, dut).play(dataclasses.replace(Scenario.load("thesis"), samples=60, tweaks=()), 1)
+        again = Bench(rig, dut).play(dataclasses.replace(Scenario.load("thesis"), samples=60, changes=()), 1)
     assert again.theta.shape == (60, 6)
     with open_rig("emulator") as rig, open_dut(device) as dut:
-        alone = Bench(rig, dut).play(dataclasses.replace(Scenario.load("thesis"), samples=60, tweaks=()), 1)
+        alone = Bench(rig, dut).play(dataclasses.replace(Scenario.load("thesis"), samples=60, changes=()), 1)
     assert again.theta_hash() == alone.theta_hash()
 
 

@@ -44,7 +44,7 @@ def without_machine(run: Run) -> Run:
 def one_change(program: str, name: str, factor: float, sample: int) -> Scenario:
     wired = Program.load(program)
     change = PotChange(sample, {name: wired.parameters[name].value * factor})
-    return Scenario(sample + 350, WAVE, wired, tweaks=(change,), random_phase=True)
+    return Scenario(sample + 350, WAVE, wired, changes=(change,), random_phase=True)
 
 
 def test_played_detection_bound_is_the_closed_one_in_99_of_100_changes_on_ideal_amplifiers() -> None:
@@ -87,7 +87,7 @@ def information_of_whole_plays(run: Run, rig: str, scenario: Scenario) -> NDArra
     for is_changed in (True, False):
         computer, excitation, changes = opened.set_up(scenario, run.conditions.seed)
         (volts,) = computer.play(excitation, scenario.samples, changes if is_changed else ())
-        courses.append(volts[scenario.tweaks[0].sample + 1 :, 1] / channel.lsb_v)
+        courses.append(volts[scenario.changes[0].sample + 1 :, 1] / channel.lsb_v)
     return np.cumsum((courses[0] - courses[1]) ** 2) / (2.0 * (channel.noise_lsb**2 + 1.0 / 12.0))
 
 
@@ -102,7 +102,7 @@ def information_of_whole_plays(run: Run, rig: str, scenario: Scenario) -> NDArra
 )
 def test_information_is_that_of_whole_plays(rig: str, ramp_n: int, tolerance: float) -> None:
     """Left out are the windings of real pots, and the motion of a pot within a sample of its ramp."""
-    scenario = Scenario(800, WAVE, tweaks=(PotChange(450, {"K": 18000.0}, ramp_n=ramp_n),))
+    scenario = Scenario(800, WAVE, changes=(PotChange(450, {"K": 18000.0}, ramp_n=ramp_n),))
     run = bench(rig).play(scenario, 3)
     (played,) = information.change_information(run)
     assert played == pytest.approx(information_of_whole_plays(run, rig, scenario), rel=tolerance, abs=0.2)
@@ -120,7 +120,7 @@ def test_information_is_that_of_whole_plays(rig: str, ramp_n: int, tolerance: fl
 )
 @pytest.mark.parametrize("rig", ["emulator-skewed", "emulator-real"])
 def test_smooth_excitation_is_played_judged_and_replayed(excitation: Excitation, rig: str, tmp_path: Path) -> None:
-    scenario = Scenario(850, excitation, tweaks=(PotChange(600, {"K": 18000.0}),))
+    scenario = Scenario(850, excitation, changes=(PotChange(600, {"K": 18000.0}),))
     with open_rig(rig) as opened, open_dut("inproc") as device:
         run = Bench(opened, device).play(scenario, 3)
     (played,) = information.change_information(run)
@@ -132,12 +132,12 @@ def test_smooth_excitation_is_played_judged_and_replayed(excitation: Excitation,
     with RecordingRig.open(tmp_path / "run.npz") as recorded, open_dut("inproc") as device:
         again = Bench(recorded, device).play(recorded.scenario(), 3)
     assert again.theta_hash() == run.theta_hash()
-    assert judge(again).tweaks == verdict.tweaks
+    assert judge(again).changes == verdict.changes
 
 
 def test_two_changes_are_each_judged_from_the_state_at_the_change() -> None:
-    tweaks = (PotChange(450, {"K": 20000.0}), PotChange(630, {"B": 3600.0}))
-    run = bench("emulator-ideal").play(Scenario(900, WAVE, tweaks=tweaks), 3)
+    changes = (PotChange(450, {"K": 20000.0}), PotChange(630, {"B": 3600.0}))
+    run = bench("emulator-ideal").play(Scenario(900, WAVE, changes=changes), 3)
     for played, closed in zip(*map(information.change_information, (run, without_machine(run))), strict=True):
         assert first_at_level(played, LEVEL) == first_at_level(closed, LEVEL)
 

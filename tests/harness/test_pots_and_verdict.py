@@ -108,9 +108,9 @@ def program(tmp_path: Path) -> Path:
     return out
 
 
-def played(program: Path, tweak: Asked) -> Run:
+def played(program: Path, change: Asked) -> Run:
     scenario = Scenario(
-        samples=SAMPLES, excitation=Excitation(low_v=0.1, high_v=9.9), tweaks=(tweak,), name="by command"
+        samples=SAMPLES, excitation=Excitation(low_v=0.1, high_v=9.9), changes=(change,), name="by command"
     )
     card = CardAndComputer(program.parent / "said")
     with RealRig(described(program), connect=lambda *_: card) as rig, open_dut("inproc") as dut:
@@ -119,10 +119,10 @@ def played(program: Path, tweak: Asked) -> Run:
 
 def test_instant_of_a_command_is_dated_and_the_device_is_judged_by_it(program: Path) -> None:
     run = played(program, Asked(ASKED_AT, {"K": 18000.0}))
-    (tweak,) = judge(run).tweaks
-    assert tweak.between[0] <= INSTANTS[0] <= tweak.between[1]
-    assert tweak.between[1] - tweak.between[0] < 60
-    assert tweak.result == "detected"
+    (change,) = judge(run).changes
+    assert change.between[0] <= INSTANTS[0] <= change.between[1]
+    assert change.between[1] - change.between[0] < 60
+    assert change.result == "detected"
 
 
 def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(program: Path) -> None:
@@ -132,13 +132,13 @@ def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(progr
     earliest, latest = segment.earliest(), segment.latest()
     assert earliest.start <= INSTANTS[0] <= latest.start
     assert earliest.start + earliest.ramp_n <= INSTANTS[1] <= latest.start + latest.ramp_n
-    assert judge(run).tweaks[0].result == "detected"
+    assert judge(run).changes[0].result == "detected"
 
 
 def test_change_that_a_command_did_not_make_is_not_judged(program: Path) -> None:
     program.write_text("#!/bin/sh\nexit 0\n")
     verdict = judge(played(program, Asked(ASKED_AT, {"K": 18000.0})))
-    assert verdict.tweaks[0].result == "not judged"
+    assert verdict.changes[0].result == "not judged"
     assert verdict.outcome != "passed"
     assert "shows that the plant has changed" in verdict.reasons[-1]
 
@@ -181,10 +181,10 @@ def played_in_time(file: Path, scenario: Scenario) -> Run:
 
 
 def test_instants_of_a_users_command_are_dated_in_real_time(tmp_path: Path) -> None:
-    tweaks = (Asked(4000, {"K": 18000.0}), Asked(11_000, {"B": 2200.0}))
+    asked = (Asked(4000, {"K": 18000.0}), Asked(11_000, {"B": 2200.0}))
     scenario = Scenario.load("thesis")
     expect = dataclasses.replace(scenario.expect, false_alarms=1)  # at the ARL0 of the device one run of six has one
-    scenario = dataclasses.replace(scenario, samples=16_000, tweaks=tweaks, expect=expect)
+    scenario = dataclasses.replace(scenario, samples=16_000, changes=asked, expect=expect)
     script = tmp_path / "turn.py"
     script.write_text(PROGRAM)
     with serving("--rig", "emulator-real", "--real-time") as instrument:
@@ -195,10 +195,10 @@ def test_instants_of_a_users_command_are_dated_in_real_time(tmp_path: Path) -> N
         run = played_in_time(file, scenario)
     changes = run.conditions.segments[1:]
     assert [change.plant for change in changes] == [each.plant for each in scenario.segments()[1:]]
-    for tweak, change in zip(tweaks, changes, strict=True):
+    for each, change in zip(asked, changes, strict=True):
         assert change.start_low is not None
         assert change.start_high is not None
-        assert tweak.sample < change.start_low <= change.start <= change.start_high  # the program takes its time
+        assert each.sample < change.start_low <= change.start <= change.start_high  # the program takes its time
         assert change.start_high - change.start_low < 100
         noticed = run.alarm_index[run.alarm_index >= change.start_low]
         assert noticed[0] - change.start < 100, "the device has noticed another change than the harness has"

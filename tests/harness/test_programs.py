@@ -1,4 +1,4 @@
-"""Programs beyond one mass, damper and spring, and tweaks that last: from scenario to verdict, deck and signals."""
+"""Programs beyond one mass, damper and spring, and changes that last: from scenario to verdict, deck and signals."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ samples = 1100
 [excitation]
 low_v = 0.1
 high_v = 9.9
-[[tweaks]]
+[[changes]]
 sample = {CHANGE_AT}
 stiffness_n_per_m = 18000.0
 ramp_n = 60
@@ -72,10 +72,10 @@ def test_any_program_is_played_and_judged(program: str) -> None:
     verdict = judge(run)
     assert run.samples == scenario.samples
     assert (verdict.outcome, verdict.reasons) == ("passed", ())
-    (tweak,) = verdict.tweaks
-    assert tweak.latency_n is not None and tweak.deadline_n is not None and tweak.latency_n <= tweak.deadline_n
-    assert tweak.before == {name: scenario.program.parameters[name].value for name in tweak.after}
-    assert tweak.is_bounded and tweak.bound_n is not None
+    (change,) = verdict.changes
+    assert change.latency_n is not None and change.deadline_n is not None and change.latency_n <= change.deadline_n
+    assert change.before == {name: scenario.program.parameters[name].value for name in change.after}
+    assert change.is_bounded and change.bound_n is not None
     assert BOUNDS not in verdict.not_judged
     assert scenario.program.is_linear == (program != "duffing")
     assert (ESTIMATES in verdict.not_judged) == (program != "front")
@@ -160,7 +160,7 @@ def test_example_scenario_of_every_program_is_judged(name: str) -> None:
     with open_rig(scenario.rig or "emulator") as rig, open_dut("inproc") as dut:
         verdict = judge(Bench(rig, dut).play(scenario, scenario.seed or DEFAULT_SEED))
     assert verdict.outcome == "passed", verdict.reasons
-    assert verdict.tweaks and all(tweak.result == "detected" for tweak in verdict.tweaks)
+    assert verdict.changes and all(change.result == "detected" for change in verdict.changes)
 
 
 def test_scenario_names_a_program_beside_it_and_its_run_holds_it(tmp_path: Path) -> None:
@@ -189,8 +189,11 @@ def test_scenario_names_a_program_beside_it_and_its_run_holds_it(tmp_path: Path)
         ("program = 3", "program: must be a name, a .toml file, or a table, not 3"),
         ("[program]\nname = 3", "program: "),
         ("set = { L = 1.0 }", "program front: unknown parameter 'L' (known: M, B, K)"),
-        ("[[tweaks]]\nsample = 5\nset = { stifness = 1.0 }", "tweaks[0]: program front: unknown parameter 'stifness'"),
-        ("[[tweaks]]\nsample = 5\nstifness_n_per_m = 1.0", "tweaks[0]: unknown key 'stifness_n_per_m'"),
+        (
+            "[[changes]]\nsample = 5\nset = { stifness = 1.0 }",
+            "changes[0]: program front: unknown parameter 'stifness'",
+        ),
+        ("[[changes]]\nsample = 5\nstifness_n_per_m = 1.0", "changes[0]: unknown key 'stifness_n_per_m'"),
         ('program = "front"\n[plant]\nset = "front"', "plant: write program = ... and set = { ... } instead"),
         ('program = "friction.toml"', "M.diagnosis: no device names 'friction'; there are mass, damping, stiffness"),
         ('program = "sample.toml"', "parameters.M.alias: sample is a key of scenarios' changes; choose another"),
@@ -215,7 +218,7 @@ def test_scenario_with_the_keys_of_earlier_versions_is_the_same() -> None:
     [plant]
     set = "shock"
     mass_kg = 1.8
-    [[tweaks]]
+    [[changes]]
     sample = 200
     damping_n_s_per_m = 950.0
     """
@@ -224,7 +227,7 @@ def test_scenario_with_the_keys_of_earlier_versions_is_the_same() -> None:
     program = "shock"
     set = { M = 1.8 }
     [excitation]
-    [[tweaks]]
+    [[changes]]
     sample = 200
     set = { B = 950.0 }
     """
@@ -289,14 +292,14 @@ def test_program_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_latency_of_a_ramp_counts_from_its_start(ramped: Path) -> None:
     verdict = judge(played(Scenario.load(str(ramped))))
-    (tweak,) = verdict.tweaks
+    (change,) = verdict.changes
     assert verdict.outcome == "passed"
-    assert tweak.sample == CHANGE_AT
-    assert tweak.bound_n is not None
-    assert tweak.latency_n is not None
-    assert 0.5 * tweak.bound_n < tweak.latency_n < 60
-    jump = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(CHANGE_AT, {"K": 18000.0}),))
-    assert as_json(judge(played(jump)))["tweaks"][0]["bound"] < tweak.bound_n
+    assert change.sample == CHANGE_AT
+    assert change.bound_n is not None
+    assert change.latency_n is not None
+    assert 0.5 * change.bound_n < change.latency_n < 60
+    jump = dataclasses.replace(Scenario.load(str(ramped)), changes=(PotChange(CHANGE_AT, {"K": 18000.0}),))
+    assert as_json(judge(played(jump)))["changes"][0]["bound"] < change.bound_n
 
 
 @pytest.mark.parametrize("seed", range(1, 5))
@@ -305,10 +308,10 @@ def test_latencies_of_ramps_are_near_their_bounds(seed: int) -> None:
     with open_rig("emulator") as rig, open_dut("host") as dut:
         verdict = judge(Bench(rig, dut).play(Scenario.load("slow"), seed))
     assert verdict.outcome == "passed"
-    for tweak in verdict.tweaks:
-        assert tweak.bound_n is not None
-        assert tweak.latency_n is not None
-        assert tweak.bound_n <= tweak.latency_n < 2 * tweak.bound_n
+    for change in verdict.changes:
+        assert change.bound_n is not None
+        assert change.latency_n is not None
+        assert change.bound_n <= change.latency_n < 2 * change.bound_n
 
 
 def test_alarms_while_a_change_lasts_and_the_first_after_it_are_not_false() -> None:
@@ -320,7 +323,7 @@ def test_alarms_while_a_change_lasts_and_the_first_after_it_are_not_false() -> N
         alarm_statistic=np.full(5, 12.0, np.float32),
     )
     verdict = judge(alarmed)
-    assert verdict.tweaks[0].latency_n == 10
+    assert verdict.changes[0].latency_n == 10
     assert verdict.false_alarms == (100, 600)
 
 
@@ -328,7 +331,7 @@ def test_ramp_is_in_the_recording(ramped: Path, tmp_path: Path) -> None:
     run = played(Scenario.load(str(ramped)))
     run.save(tmp_path / "run.npz")
     assert Run.load(tmp_path / "run.npz").conditions.segments[1] == Segment(CHANGE_AT, SOFT, 60)
-    assert RecordingRig.open(tmp_path / "run.npz").scenario().tweaks[0].ramp_n == 60
+    assert RecordingRig.open(tmp_path / "run.npz").scenario().changes[0].ramp_n == 60
     assert judge(Run.load(tmp_path / "run.npz")) == judge(run)
 
 
@@ -370,7 +373,7 @@ def test_plant_of_the_truth_follows_the_emulated_machine_through_a_ramp(
     ramped: Path, given: dict[str, float], limit_lsb: float
 ) -> None:
     """1/M, B and K change evenly in the harness, dials in the machine, which the load of the pots tells apart."""
-    scenario = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(CHANGE_AT, given, 60),))
+    scenario = dataclasses.replace(Scenario.load(str(ramped)), changes=(PotChange(CHANGE_AT, given, 60),))
     after = FRONT.changed(given)
     with open_rig("emulator-ideal") as rig:
         volts = np.concatenate([block.volts for block in rig.perform(scenario, 1).blocks])
@@ -397,7 +400,7 @@ def test_deck_of_a_ramp_plays_what_the_rig_plays(ramped: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tweaks", "message"),
+    ("changes", "message"),
     [
         (
             (PotChange(300, {"M": 60.0}, ramp_n=60), PotChange(350, {"M": 70.0})),
@@ -406,14 +409,14 @@ def test_deck_of_a_ramp_plays_what_the_rig_plays(ramped: Path) -> None:
         ((PotChange(1099, {"M": 60.0}), PotChange(1100, {"M": 70.0})), "beyond the last of 1100 samples"),
     ],
 )
-def test_ramps_that_cannot_be_are_refused(ramped: Path, tweaks: tuple[PotChange, ...], message: str) -> None:
+def test_ramps_that_cannot_be_are_refused(ramped: Path, changes: tuple[PotChange, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(Scenario.load(str(ramped)), tweaks=tweaks)
+        dataclasses.replace(Scenario.load(str(ramped)), changes=changes)
 
 
 def test_ramp_of_no_whole_number_is_refused_naming_the_key(tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text(RAMPED.replace("ramp_n = 60", "ramp_n = -1"))
-    with pytest.raises(ConfigurationError, match=r"wrong.toml: tweaks\[0\]: ramp_n must be in 0 .. 100000, not -1"):
+    with pytest.raises(ConfigurationError, match=r"wrong.toml: changes\[0\]: ramp_n must be in 0 .. 100000, not -1"):
         Scenario.load(str(tmp_path / "wrong.toml"))
 
 

@@ -39,7 +39,7 @@ low_v = 0.1
 high_v = 9.9
 frequency_hz = 200.0
 
-[[tweaks]]
+[[changes]]
 sample = 700
 stiffness_n_per_m = 18000.0
 
@@ -214,7 +214,7 @@ def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) ->
         """
         import pytest
 
-        @pytest.mark.hil_needs("excite", "tweak")
+        @pytest.mark.hil_needs("excite", "change")
         @pytest.mark.parametrize("hil_rig", ["emulator", "recording:RECORDED"], indirect=True)
         def test_it(hil_rig):
             pass
@@ -222,7 +222,7 @@ def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) ->
     )
     result = run(user, "-rs")
     result.assert_outcomes(passed=1, skipped=1)
-    result.stdout.fnmatch_lines(["*rig recording:*run.npz cannot excite and tweak (it can nothing but play)*"])
+    result.stdout.fnmatch_lines(["*rig recording:*run.npz cannot excite and change (it can nothing but play)*"])
 
 
 def recorded(folder: Path) -> Path:
@@ -234,7 +234,7 @@ def recorded(folder: Path) -> Path:
 def test_need_that_no_rig_knows_ends_the_collection_in_one_line_with_those_known(user: pytest.Pytester) -> None:
     user.makepyfile("import pytest\n\n@pytest.mark.hil_needs('twaek')\ndef test_it(hil_rig):\n    pass\n")
     result = refused(user)
-    result.stderr.fnmatch_lines(["ERROR: *::test_it: hil_needs: no rig is known to 'twaek': there are excite, tweak"])
+    result.stderr.fnmatch_lines(["ERROR: *::test_it: hil_needs: no rig is known to 'twaek': there are excite, change"])
     assert len(result.errlines) <= 2
 
 

@@ -52,10 +52,12 @@ def shortened(name: str) -> Scenario:
     scenario = Scenario.load(name)
     if scenario.samples <= LONGEST:
         return scenario
-    at = scenario.tweaks[0].sample - CHANGE_AT if scenario.tweaks else 0
-    tweaks = [dataclasses.replace(tweak, sample=tweak.sample - at) for tweak in scenario.tweaks]
+    at = scenario.changes[0].sample - CHANGE_AT if scenario.changes else 0
+    changes = [dataclasses.replace(change, sample=change.sample - at) for change in scenario.changes]
     return dataclasses.replace(
-        scenario, samples=LONGEST, tweaks=tuple(tweak for tweak in tweaks if tweak.sample + tweak.ramp_n < LONGEST)
+        scenario,
+        samples=LONGEST,
+        changes=tuple(change for change in changes if change.sample + change.ramp_n < LONGEST),
     )
 
 

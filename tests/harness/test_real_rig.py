@@ -36,7 +36,7 @@ from tests.harness.processes import LONG_S
 from tests.served.serving import RIG, ROOT, Served, serving, serving_in_thread
 
 THESIS = Scenario.load("thesis")
-SHORT = dataclasses.replace(THESIS, samples=700, tweaks=())
+SHORT = dataclasses.replace(THESIS, samples=700, changes=())
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_signals_are_those_of_the_emulated_rig_to_the_converters_step(bench: str
     with open_allowed(bench) as real, open_rig("emulator-ideal") as emulated:
         measured, exact = volts(real.perform(THESIS, seed)), volts(emulated.perform(THESIS, seed))
     half_step_v = 0.5 * 40.0 / (1 << 14)
-    # 0.05 samples between sample and pot, as the tweak of a real machine comes between two; so much x moves meanwhile
+    # 0.05 samples between sample and pot, as the change of a real machine comes between two; so much x moves meanwhile
     np.testing.assert_allclose(measured[:1200], exact[:1200], atol=half_step_v + 1e-4)
     np.testing.assert_allclose(measured, exact, atol=half_step_v + 0.03)
 
@@ -78,7 +78,7 @@ def test_verdicts_are_those_of_the_emulated_rig(bench: str) -> None:
     for seed in range(6):
         real, emulated = judge(played(bench, THESIS, seed)), judge(played("emulator-ideal", THESIS, seed))
         assert real.outcome == emulated.outcome == "passed"
-        for mine, other in zip(real.tweaks, emulated.tweaks, strict=True):
+        for mine, other in zip(real.changes, emulated.changes, strict=True):
             assert (mine.sample, mine.what) == (other.sample, other.what)
             assert mine.latency_n is not None
             assert other.latency_n is not None
@@ -95,13 +95,13 @@ def test_each_play_begins_with_the_pots_of_its_scenario(ideal: Served, tmp_path:
 
 
 def test_scenario_longer_than_a_record_is_played_in_several(bench: str) -> None:
-    tweaks = (PotChange(5000, {"K": 18000.0}), PotChange(16_500, {"B": 3453.0}))
-    run = played(bench, dataclasses.replace(THESIS, samples=20_000, tweaks=tweaks), 1)
+    changes = (PotChange(5000, {"K": 18000.0}), PotChange(16_500, {"B": 3453.0}))
+    run = played(bench, dataclasses.replace(THESIS, samples=20_000, changes=changes), 1)
     assert run.conditions.records == (0, 16_384 - (16_384 - (16_500 - LEAD_N)))
     assert run.samples == 20_000
     verdict = judge(run)
     assert verdict.outcome == "passed", verdict.reasons
-    assert [tweak.sample for tweak in verdict.tweaks] == [5000, 16_500]
+    assert [change.sample for change in verdict.changes] == [5000, 16_500]
     assert verdict.estimates[-1].error["B"] == pytest.approx(0.0, abs=0.02)
 
 
@@ -231,7 +231,7 @@ def test_displaced_changes_of_the_instrument_are_detected(late_s: float, said: s
         instrument.pots = DisplacedPots(instrument.pots, late_s)
         return instrument
 
-    scenario = dataclasses.replace(THESIS, samples=1600, tweaks=THESIS.tweaks[:1])
+    scenario = dataclasses.replace(THESIS, samples=1600, changes=THESIS.changes[:1])
     description = describe(bench)
     assert isinstance(description, RealDescription)
     with RealRig(description, connected) as rig, open_dut("inproc") as dut:
@@ -395,7 +395,7 @@ def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_pa
         with pytest.raises(ConfigurationError, match=r"excitation of 0.1 V to 9.9 V exceeds limits.input_v"):
             rig.perform(THESIS, 1)
         mild = dataclasses.replace(THESIS, excitation=dataclasses.replace(THESIS.excitation, high_v=7.0))
-        with pytest.raises(ConfigurationError, match=r"tweaks\[3\] at sample 1600: pot M would stand at"):
+        with pytest.raises(ConfigurationError, match=r"changes\[3\] at sample 1600: pot M would stand at"):
             rig.perform(mild, 1)
 
 
@@ -411,7 +411,7 @@ def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_pa
         ),
         (dataclasses.replace(SHORT, excitation=Excitation("pulse", 0.1, 9.0, 100.0, duty=0.123)), "24.6 and 175.4"),
         (dataclasses.replace(SHORT, program=Program.load("shock")), "program 'shock'"),
-        (dataclasses.replace(SHORT, tweaks=(PotChange(100, {"M": 50.0}, ramp_n=20),)), "ramp_n"),
+        (dataclasses.replace(SHORT, changes=(PotChange(100, {"M": 50.0}, ramp_n=20),)), "ramp_n"),
         (dataclasses.replace(SHORT, excitation=Excitation(low_v=0.1, high_v=10.5)), "1.05 V"),
     ],
 )
@@ -489,8 +489,8 @@ def test_motor_is_tested_and_judged_as_on_the_emulated_rig(tmp_path: Path) -> No
         with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
             verdict = judge(Bench(rig, dut).play(scenario, 1))
     assert verdict.outcome == "passed", verdict.reasons
-    assert [change.latency_n for change in verdict.tweaks] == pytest.approx(
-        [change.latency_n for change in judge(played("emulator", scenario, 1)).tweaks], abs=3
+    assert [change.latency_n for change in verdict.changes] == pytest.approx(
+        [change.latency_n for change in judge(played("emulator", scenario, 1)).changes], abs=3
     )
 
 
@@ -558,9 +558,9 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
 def test_rig_with_fixed_pots_refuses_changes_beforehand(tmp_path: Path) -> None:
     name = described(tmp_path, lambda text: text.replace('pots.kind = "instrument"', 'pots.kind = "none"'))
     with open_allowed(name) as rig:
-        assert "tweak" not in rig.capabilities
+        assert "change" not in rig.capabilities
         with pytest.raises(
-            ConfigurationError, match=r"tweaks\[0\] at sample 1200: the pots of this rig cannot be changed"
+            ConfigurationError, match=r"changes\[0\] at sample 1200: the pots of this rig cannot be changed"
         ):
             rig.perform(THESIS, 1)
 

@@ -26,7 +26,7 @@ from tests.harness.fed import fed
 
 PERIOD_S = 5e-5
 THESIS = Scenario.load("thesis")
-SHORT = dataclasses.replace(THESIS, samples=600, tweaks=())
+SHORT = dataclasses.replace(THESIS, samples=600, changes=())
 
 
 def play(description: DeviceDescription, real_time: float | None = None, scenario: Scenario = SHORT) -> Run:

@@ -27,7 +27,7 @@ RECORD_N, CHANGE_AT = 1100, 800
 class Recorder(Rig):
     """Rig that plays the scenario on the emulated computer once for each record, from rest."""
 
-    capabilities = frozenset({"tweak"})
+    capabilities = frozenset({"change"})
 
     def __init__(self, rig: Rig, records: int) -> None:
         self._rig = rig
@@ -53,7 +53,7 @@ class Recorder(Rig):
 
 
 SCENARIO = dataclasses.replace(
-    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(PotChange(sample=CHANGE_AT, set={"K": 16000.0}),)
+    Scenario.load("thesis"), samples=2 * RECORD_N, changes=(PotChange(sample=CHANGE_AT, set={"K": 16000.0}),)
 )
 
 
@@ -81,9 +81,9 @@ def test_device_restarts_with_each_record(run: Run) -> None:
 def test_each_record_is_judged_as_a_separate_run(run: Run) -> None:
     whole, parts = judge(run), [judge(single(seed)) for seed in (0, 1)]
     assert whole.outcome == "passed"
-    assert [tweak.sample for tweak in whole.tweaks] == [CHANGE_AT, RECORD_N + CHANGE_AT]
-    for tweak, part in zip(whole.tweaks, parts, strict=True):
-        assert (tweak.latency_n, tweak.bound_n) == (part.tweaks[0].latency_n, part.tweaks[0].bound_n)
+    assert [change.sample for change in whole.changes] == [CHANGE_AT, RECORD_N + CHANGE_AT]
+    for change, part in zip(whole.changes, parts, strict=True):
+        assert (change.latency_n, change.bound_n) == (part.changes[0].latency_n, part.changes[0].bound_n)
     bounds = [0, CHANGE_AT, RECORD_N, RECORD_N + CHANGE_AT, 2 * RECORD_N]
     assert [(each.start, each.end) for each in whole.estimates] == list(itertools.pairwise(bounds))
 
@@ -91,7 +91,7 @@ def test_each_record_is_judged_as_a_separate_run(run: Run) -> None:
 def test_alarm_detects_no_change_of_an_earlier_record(run: Run) -> None:
     late = dataclasses.replace(run, alarm_index=np.array([RECORD_N + 5, RECORD_N + CHANGE_AT + 5]))
     verdict = judge(dataclasses.replace(late, alarm_kind=run.alarm_kind[:2], alarm_statistic=run.alarm_statistic[:2]))
-    assert verdict.tweaks[0].missed
+    assert verdict.changes[0].missed
     assert verdict.false_alarms == (RECORD_N + 5,)
 
 

@@ -88,7 +88,7 @@ def test_page_knows_which_samples_were_clipped_and_on_which_channel(read: Page) 
 
 def test_marks_are_those_of_the_run(read: Page) -> None:
     data = read.data()
-    assert data["tweaks"] == [{"sample": 1200, "label": "K ↓"}, {"sample": 1500, "label": "M ↓"}]
+    assert data["changes"] == [{"sample": 1200, "label": "K ↓"}, {"sample": 1500, "label": "M ↓"}]
     assert data["alarms"] == [{"sample": FALSE_ALARM, "false": True}, {"sample": NOTICED, "false": False}]
     assert [(s["start"], s["end"], s["K"]) for s in data["segments"]] == [
         (0, 1200, 24500.0),
@@ -123,28 +123,28 @@ def test_row_of_a_table_is_that_of_the_verdict(read: Page, row: list[str]) -> No
 
 def test_undetectable_change_is_not_marked_as_missed(run: Run) -> None:
     verdict = reported_verdict(run)
-    unseen = replace(verdict.tweaks[1], bound_n=None)
-    read = Page(render(run, replace(verdict, tweaks=(unseen,))))
+    unseen = replace(verdict.changes[1], bound_n=None)
+    read = Page(render(run, replace(verdict, changes=(unseen,))))
     assert read.row("1500")[-1] == "not detectable"
     assert "MISSED" not in read.text
 
 
 def test_late_alarm_is_marked(run: Run) -> None:
     verdict = reported_verdict(run)
-    late = replace(verdict.tweaks[0], latency_n=21)
-    assert "LATE" in Page(render(run, replace(verdict, tweaks=(late,)))).row("1200")[-1]
+    late = replace(verdict.changes[0], latency_n=21)
+    assert "LATE" in Page(render(run, replace(verdict, changes=(late,)))).row("1200")[-1]
 
 
 def test_wrong_diagnosis_is_marked(run: Run) -> None:
     several = replace(SAID, named="several", right=False, extent=None, extent_error=None)
-    wrong = replace(reported_verdict(run).tweaks[0], diagnosis=several)
-    again = Page(render(run, replace(reported_verdict(run), tweaks=(wrong,))))
+    wrong = replace(reported_verdict(run).changes[0], diagnosis=several)
+    again = Page(render(run, replace(reported_verdict(run), changes=(wrong,))))
     assert ["1200", "K", "several", "–", "–", "17", "9", "-1", "✗ WRONG"] in again.rows
 
 
 def test_page_states_that_there_is_no_diagnosis(run: Run) -> None:
-    silent = tuple(replace(tweak, diagnosis=None) for tweak in reported_verdict(run).tweaks)
-    read = Page(render(run, replace(reported_verdict(run), tweaks=silent)))
+    silent = tuple(replace(change, diagnosis=None) for change in reported_verdict(run).changes)
+    read = Page(render(run, replace(reported_verdict(run), changes=silent)))
     assert "The device reported no diagnosis of a change." in read.text
 
 

@@ -86,23 +86,23 @@ def test_undershoot_clips_on_the_unipolar_range_and_not_on_the_wide_one() -> Non
     assert clipped["emulator-0-10v"] > 5
 
 
-def test_segments_tell_the_truth_after_each_tweak() -> None:
+def test_segments_tell_the_truth_after_each_change() -> None:
     with open_rig("emulator") as rig:
         segments = rig.perform(Scenario.load("thesis"), 1).hindsight().segments
     assert [segment.start for segment in segments] == [0, 1200, 1400, 1500, 1600]
     assert list(segments[-1].plant.parameters().values()) == [30.0, 2123.0, 20000.0]
 
 
-def test_tweak_to_the_same_value_is_no_change() -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, set={"M": 115.0}),))
+def test_change_to_the_same_value_is_no_change() -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), changes=(PotChange(sample=50, set={"M": 115.0}),))
     assert len(scenario.segments()) == 1
 
 
 def test_pot_beyond_its_track_is_refused_before_the_run() -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, set={"M": 20.0}),))
+    scenario = dataclasses.replace(Scenario.load("healthy"), changes=(PotChange(sample=50, set={"M": 20.0}),))
     with (
         open_rig("emulator") as rig,
-        pytest.raises(ConfigurationError, match=r"healthy: tweaks\[0\] at sample 50: M = 20 cannot be set .*: pot M"),
+        pytest.raises(ConfigurationError, match=r"healthy: changes\[0\] at sample 50: M = 20 cannot be set .*: pot M"),
     ):
         rig.perform(scenario, 1)
 
@@ -330,10 +330,10 @@ def test_a_pot_set_by_its_dial_passes_what_track_and_load_make_of_it(
     """Pot K at 24500 and 18000 N/m (facts 1: coefficients .8300 and .6098, dials .8511 and .6380) with a track of 15k
     into 49.9k: .8511 / (1 + .8511 x .1489 x 15 / 49.9) = .8199, likewise .5966."""
     rig = own(tmp_path, f'pots = "{pots}"\nvalues = {{ deviation = {{ K = 0.5 }} }}')
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(100, {"K": 18000.0}),))
+    scenario = dataclasses.replace(Scenario.load("healthy"), changes=(PotChange(100, {"K": 18000.0}),))
     with open_rig(rig) as opened:
         assert isinstance(opened, EmulatorRig)
-        computer, _, tweaks = opened.set_up(scenario, 1)
+        computer, _, changes = opened.set_up(scenario, 1)
     assert computer.coefficients["K"] == pytest.approx(at_start, abs=1e-4)
-    computer.set(**tweaks[0][1])
+    computer.set(**changes[0][1])
     assert computer.coefficients["K"] == pytest.approx(after, abs=1e-4)

@@ -27,7 +27,7 @@ VERDICT: dict[str, Any] = {
     "seed": 7,
     "samples": 1800,
     "outcome": "passed",
-    "tweaks": [CHANGE, {**CHANGE, "latency": 9, "bound": 4}],
+    "changes": [CHANGE, {**CHANGE, "latency": 9, "bound": 4}],
     "false_alarms": [],
     "recorded_by": {"started": "2026-01-01T12:00:00+00:00", "commit": None, "devices": [{"sha256": "0123456789ab"}]},
 }
@@ -72,7 +72,7 @@ def test_row_of_a_run_is_that_of_its_verdict(add: Callable[..., Path], tmp_path:
 def test_runs_are_in_the_order_of_their_start_and_plotted_if_several(add: Callable[..., Path], tmp_path: Path) -> None:
     late = {**VERDICT["recorded_by"], "started": "2026-01-02T12:00:00+00:00", "devices": [{"sha256": "fedcba98"}]}
     missed = [{"latency": None, "bound": 4, "result": "missed"}]
-    add("a", recorded_by=late, outcome="failed", tweaks=missed)
+    add("a", recorded_by=late, outcome="failed", changes=missed)
     add("b", page=False)
     add("c", scenario="slow")
     runs = found(tmp_path).runs
@@ -119,8 +119,8 @@ def test_run_that_has_not_ended_is_inconclusive_and_earlier_results_are_left_out
         b"[" * 100_000,
         b'{"format": "analogrig-verdict", "version": 2}',
         json.dumps({**VERDICT, "outcome": "<script>"}).encode(),
-        json.dumps({**VERDICT, "tweaks": None}).encode(),
-        json.dumps({**VERDICT, "tweaks": [{**CHANGE, "latency": "NaN", "bound": 1e309}]}).encode(),
+        json.dumps({**VERDICT, "changes": None}).encode(),
+        json.dumps({**VERDICT, "changes": [{**CHANGE, "latency": "NaN", "bound": 1e309}]}).encode(),
         json.dumps({**VERDICT, "seed": "x"}).encode(),
         json.dumps({**VERDICT, "recorded_by": [1]}).encode(),
         json.dumps({**VERDICT, "dut": []}).encode(),

@@ -28,18 +28,18 @@ SPELT: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "program by its tables": ({"program": MOTOR.as_value()}, {"program": MOTOR}),
     "excitation as a table": ({"excitation": TABLE}, {"excitation": SQUARE}),
     "expectations as a table": ({"expect": {"missed": 1}}, {"expect": Expectations(missed=1)}),
-    "tweak as a table": (
-        {"program": "dc-motor", "tweaks": [{"sample": 50, "set": {"J": 1e-4}}]},
-        {"program": MOTOR, "tweaks": (PotChange(50, {"J": 1e-4}),)},
+    "change as a table": (
+        {"program": "dc-motor", "changes": [{"sample": 50, "set": {"J": 1e-4}}]},
+        {"program": MOTOR, "changes": (PotChange(50, {"J": 1e-4}),)},
     ),
-    "tweaks as a list": (
-        {"program": MOTOR, "tweaks": [PotChange(50, {"J": 1e-4})]},
-        {"program": MOTOR, "tweaks": (PotChange(50, {"J": 1e-4}),)},
+    "changes as a list": (
+        {"program": MOTOR, "changes": [PotChange(50, {"J": 1e-4})]},
+        {"program": MOTOR, "changes": (PotChange(50, {"J": 1e-4}),)},
     ),
     "alias at the start": ({"set": {"stiffness_n_per_m": 2e4}}, {"set": {"K": 2e4}}),
-    "alias in a tweak": (
-        {"tweaks": [{"sample": 50, "stiffness_n_per_m": 2e4}]},
-        {"tweaks": (PotChange(50, {"K": 2e4}),)},
+    "alias in a change": (
+        {"changes": [{"sample": 50, "stiffness_n_per_m": 2e4}]},
+        {"changes": (PotChange(50, {"K": 2e4}),)},
     ),
 }
 
@@ -58,7 +58,7 @@ def test_scenario_takes_values_as_files_spell_them(case: str) -> None:
         ({"program": 7}, "program: must be a name, a .toml file, or a table, not 7"),
         ({"excitation": {"low": 0.0}}, "excitation: unknown key 'low'"),
         ({"expect": {"mised": 0}}, "expect: unknown key 'mised'"),
-        ({"tweaks": [{"sample": 50, "sett": {}}]}, r"tweaks\[0\]: unknown key 'sett'"),
+        ({"changes": [{"sample": 50, "sett": {}}]}, r"changes\[0\]: unknown key 'sett'"),
     ],
 )
 def test_wrong_spelling_is_one_line(wrong: dict[str, Any], why: str) -> None:
@@ -70,7 +70,7 @@ def test_wrong_spelling_is_one_line(wrong: dict[str, Any], why: str) -> None:
 def test_programs_are_given_by_name_everywhere() -> None:
     assert Plant.of("dc-motor") == Plant.of(MOTOR)
     assert Scenario.of_program("dc-motor") == Scenario.of_program(MOTOR)
-    still = dataclasses.replace(Scenario.load("thesis"), tweaks=())
+    still = dataclasses.replace(Scenario.load("thesis"), changes=())
     assert still.on_program("dc-motor") == still.on_program(MOTOR)
     assert hypothesis.find(strategies.plants("dc-motor"), lambda _: True) == Plant.of(MOTOR)
 

@@ -75,7 +75,7 @@ def test_scenarios_of_any_program_stay_in_its_ranges_and_are_judged(bench: Bench
                 assert row.low <= value <= row.high
         verdict = judge(bench.play(scenario, seed))
         assert verdict.valid
-        assert len(verdict.tweaks) == 1
+        assert len(verdict.changes) == 1
 
     check()
 
@@ -113,9 +113,9 @@ def test_random_plants_are_those_that_the_device_is_held_to() -> None:
 @pytest.mark.parametrize(
     ("fails", "expected"),
     [
-        (lambda _: True, {"samples": FIRST_CHANGE_N + BETWEEN_CHANGES_N, "tweaks": 1}),
-        (lambda scenario: len(scenario.tweaks) == 2, {"tweaks": 2}),
-        (lambda scenario: any("M" in tweak.set for tweak in scenario.tweaks), {"tweaks": 1}),
+        (lambda _: True, {"samples": FIRST_CHANGE_N + BETWEEN_CHANGES_N, "changes": 1}),
+        (lambda scenario: len(scenario.changes) == 2, {"changes": 2}),
+        (lambda scenario: any("M" in change.set for change in scenario.changes), {"changes": 1}),
     ],
 )
 def test_failing_scenario_shrinks_to_the_usual_in_all_that_does_not_matter(
@@ -124,12 +124,12 @@ def test_failing_scenario_shrinks_to_the_usual_in_all_that_does_not_matter(
     found = hypothesis.find(scenarios(), fails, settings=settings(quick, max_examples=200, phases=list(Phase)))
     assert found.plant == front()
     assert found.excitation == Excitation(low_v=0.1, high_v=9.9)
-    assert len(found.tweaks) == expected["tweaks"]
+    assert len(found.changes) == expected["changes"]
     assert found.samples == expected.get("samples", found.samples)
 
 
 HALF = Excitation(low_v=0.1, high_v=9.9)
-FALLS = Scenario(1000, HALF, tweaks=(PotChange(600, {"K": 18000.0}),))
+FALLS = Scenario(1000, HALF, changes=(PotChange(600, {"K": 18000.0}),))
 
 
 def test_change_of_nothing_that_shows_is_not_detectable() -> None:
@@ -141,9 +141,9 @@ def test_change_of_nothing_that_shows_is_not_detectable() -> None:
 
 def test_predicted_bound_is_that_of_the_run(bench: Bench) -> None:
     (predicted,) = predicted_bounds(FALLS, 1e5, rig="emulator")
-    (tweak,) = judge(bench.play(FALLS, 1)).tweaks
-    assert predicted is not None and tweak.bound_n is not None
-    assert abs(predicted - tweak.bound_n) <= 1
+    (change,) = judge(bench.play(FALLS, 1)).changes
+    assert predicted is not None and change.bound_n is not None
+    assert abs(predicted - change.bound_n) <= 1
 
 
 def test_played_says_what_it_shows_and_why(bench: Bench) -> None:
@@ -151,7 +151,7 @@ def test_played_says_what_it_shows_and_why(bench: Bench) -> None:
     assert played.detects(within=6.0) and played.stays_quiet() and played.estimates(0.05) and played.isolates()
     late = played.detects(within=0.0)
     assert not late and "K at 600" in late.why and "allowed 1" in late.why
-    assert not Played(bench.play(dataclasses.replace(FALLS, tweaks=()), 1)).detects()
+    assert not Played(bench.play(dataclasses.replace(FALLS, changes=()), 1)).detects()
 
 
 def test_estimate_follows_itself_within_a_tube_and_not_what_comes_later(bench: Bench) -> None:
@@ -179,9 +179,9 @@ def test_prediction_takes_the_card_of_the_rig_and_the_program_of_the_scenario() 
             scenario = dataclasses.replace(Scenario.load(name), random_phase=False)
             verdict = judge(Bench(rig, dut).play(scenario, 1))
             predicted = predicted_bounds(scenario, verdict.arl0, rig=rig)
-            for expected, tweak in zip(predicted, verdict.tweaks, strict=True):
-                assert (expected is None) == (tweak.bound_n is None)
-                assert expected is None or abs(expected - (tweak.bound_n or 0)) <= 1
+            for expected, change in zip(predicted, verdict.changes, strict=True):
+                assert (expected is None) == (change.bound_n is None)
+                assert expected is None or abs(expected - (change.bound_n or 0)) <= 1
 
 
 @pytest.mark.parametrize("rig", ["recording:fixtures/recordings/simulated.npz", "red-pitaya"])

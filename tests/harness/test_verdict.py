@@ -31,9 +31,9 @@ def test_quiet_run_without_changes_passes() -> None:
 
 def test_alarm_after_the_change_is_its_detection() -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[404]))
-    (tweak,) = verdict.tweaks
-    assert (tweak.sample, tweak.what, tweak.latency_n) == (400, "K", 4)
-    assert (tweak.before, tweak.after) == ({"K": 24500.0}, {"K": 18000.0})
+    (change,) = verdict.changes
+    assert (change.sample, change.what, change.latency_n) == (400, "K", 4)
+    assert (change.before, change.after) == ({"K": 24500.0}, {"K": 18000.0})
     assert verdict.outcome == "passed"
 
 
@@ -41,7 +41,7 @@ def test_alarm_at_the_instant_of_the_change_is_false() -> None:
     """The sample at which a pot jumps was taken before the jump could act."""
     verdict = judge(made_run(LOADED, CHANGE, alarms=[400, 404]))
     assert verdict.false_alarms == (400,)
-    assert verdict.tweaks[0].latency_n == 4
+    assert verdict.changes[0].latency_n == 4
     assert verdict.outcome == "failed"
 
 
@@ -52,38 +52,38 @@ def test_second_alarm_after_a_change_is_false() -> None:
 
 def test_detectable_change_without_an_alarm_is_missed() -> None:
     verdict = judge(made_run(LOADED, CHANGE))
-    assert verdict.tweaks[0].missed
+    assert verdict.changes[0].missed
     assert verdict.outcome == "failed"
     assert verdict.reasons == ("missed 1 of 1 change (K at 400), at most 0 expected",)
 
 
 def test_change_just_before_the_end_without_an_alarm_is_not_missed() -> None:
     late = judge(made_run(LOADED, [(0, FRONT), (785, SOFT)]))
-    assert late.tweaks[0].bound_n is not None
-    assert late.tweaks[0].result == "unseeable"
+    assert late.changes[0].bound_n is not None
+    assert late.changes[0].result == "unseeable"
     assert late.reasons == (NOTHING_TO_DETECT,)
-    assert judge(made_run(LOADED, [(0, FRONT), (760, SOFT)])).tweaks[0].missed
+    assert judge(made_run(LOADED, [(0, FRONT), (760, SOFT)])).changes[0].missed
 
 
 def test_undetectable_change_without_an_alarm_proves_nothing() -> None:
     verdict = judge(made_run(np.zeros(800), CHANGE))
-    assert verdict.tweaks[0].bound_n is None
-    assert not verdict.tweaks[0].missed
+    assert verdict.changes[0].bound_n is None
+    assert not verdict.changes[0].missed
     assert (verdict.outcome, verdict.reasons) == ("inconclusive", (NOTHING_TO_DETECT,))
 
 
 def test_alarm_after_a_change_without_information_is_false() -> None:
     verdict = judge(made_run(np.zeros(800), CHANGE, alarms=[404]))
     assert verdict.false_alarms == (404,)
-    assert verdict.tweaks[0].result == "unseeable"
+    assert verdict.changes[0].result == "unseeable"
     assert verdict.outcome == "failed"
 
 
 def test_late_alarm_fails_and_names_its_deadline() -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[500]))
-    assert verdict.tweaks[0].late
+    assert verdict.changes[0].late
     assert verdict.outcome == "failed"
-    deadline = f"later than its deadline of {verdict.tweaks[0].deadline_n} samples (bound "
+    deadline = f"later than its deadline of {verdict.changes[0].deadline_n} samples (bound "
     assert f"K at 400 was detected after 100 samples, {deadline}" in verdict.reasons[0]
     assert verdict.reasons[0].endswith("; [expect] late_information_ratio = 4, late_slack_n = 15)")
 
@@ -96,8 +96,8 @@ def test_scenario_sets_the_limits_of_missed_changes_and_false_alarms() -> None:
 def test_bound_assumes_the_arl0_of_the_trigger() -> None:
     strict = judge(made_run(LOADED, CHANGE, estimator={**ESTIMATOR, "ceiling": math.log(1e12)}))
     usual = judge(made_run(LOADED, CHANGE))
-    assert strict.tweaks[0].bound_n is not None and usual.tweaks[0].bound_n is not None
-    assert strict.tweaks[0].bound_n > usual.tweaks[0].bound_n
+    assert strict.changes[0].bound_n is not None and usual.changes[0].bound_n is not None
+    assert strict.changes[0].bound_n > usual.changes[0].bound_n
     assert usual.arl0 == pytest.approx(1e5, rel=1e-4)
 
 
@@ -142,9 +142,9 @@ def test_lost_samples_must_match_the_device_and_stay_within_the_limit(
     assert verdict.outcome == ("inconclusive" if reasons else "passed")
 
 
-def test_tweak_after_the_end_of_a_short_run_is_not_judged() -> None:
+def test_change_after_the_end_of_a_short_run_is_not_judged() -> None:
     verdict = judge(made_run(LOADED[:300], CHANGE, samples_asked=800))
-    assert verdict.tweaks == ()
+    assert verdict.changes == ()
     assert verdict.outcome == "inconclusive"
 
 
@@ -157,7 +157,7 @@ def test_theta_hash_is_sha256_of_the_float32_bits() -> None:
 def test_json_has_the_documented_keys() -> None:
     out = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))
     promised = {"sample": 400, "what": "K", "from": {"K": 24500.0}, "to": {"K": 18000.0}, "latency": 4}
-    assert out["tweaks"][0].items() >= promised.items()
+    assert out["changes"][0].items() >= promised.items()
     assert {"outcome", "valid", "false_alarms", "estimates", "theta_hash", "arl0"} <= out.keys()
 
 
@@ -170,7 +170,7 @@ def told(
     """Verdict on ``diagnoses`` of an excited run whose plant changes at sample 400."""
     force = np.where(np.arange(800) // 50 % 2, 2900.0, 0.0)
     verdict = judge(made_run(force, [(0, FRONT), (400, after)], alarms=alarms, diagnoses=diagnoses))
-    return verdict.tweaks[0].diagnosis
+    return verdict.changes[0].diagnosis
 
 
 def test_right_diagnosis_has_delay_extent_and_onset_against_the_truth() -> None:
@@ -217,10 +217,10 @@ def test_wrong_diagnosis_does_not_fail_a_run() -> None:
 
 def test_json_has_the_diagnosis_of_each_change() -> None:
     run = made_run(LOADED, CHANGE, alarms=[404], diagnoses=[(420, Change.STIFFNESS, 398, 0.75)])
-    (tweak,) = as_json(judge(run))["tweaks"]
-    assert (tweak["diagnosis"]["named"], tweak["diagnosis"]["right"]) == ("K", True)
-    (tweak,) = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))["tweaks"]
-    assert tweak["diagnosis"] is None
+    (change,) = as_json(judge(run))["changes"]
+    assert (change["diagnosis"]["named"], change["diagnosis"]["right"]) == ("K", True)
+    (change,) = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))["changes"]
+    assert change["diagnosis"] is None
 
 
 def test_verdict_is_neither_true_nor_false() -> None:

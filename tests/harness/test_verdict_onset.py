@@ -45,21 +45,21 @@ def between(low: int, likeliest: int, high: int, **more: Any) -> Segment:
 
 def deadline_of(start: int) -> int:
     """Latest sample of an alarm that is not late, for a change at exactly ``start``."""
-    (tweak,) = judge(learned(Segment(start, SOFT), alarms=[start + 2])).tweaks
-    assert tweak.deadline_n is not None
-    return start + tweak.deadline_n
+    (change,) = judge(learned(Segment(start, SOFT), alarms=[start + 2])).changes
+    assert change.deadline_n is not None
+    return start + change.deadline_n
 
 
 def test_latency_is_an_interval_from_the_latest_to_the_earliest_instant() -> None:
-    (tweak,) = judge(learned(between(395, 400, 402), alarms=[404])).tweaks
-    assert (tweak.sample, tweak.between, tweak.latency_n, tweak.latencies_n) == (400, (395, 402), 4, (2, 9))
-    assert tweak.result == "detected"
+    (change,) = judge(learned(between(395, 400, 402), alarms=[404])).changes
+    assert (change.sample, change.between, change.latency_n, change.latencies_n) == (400, (395, 402), 4, (2, 9))
+    assert change.result == "detected"
 
 
 def test_exact_instant_is_judged_once() -> None:
-    (tweak,) = judge(learned(Segment(400, SOFT), alarms=[404])).tweaks
-    assert tweak.alternatives == ()
-    assert (tweak.between, tweak.latencies_n, tweak.result) == ((400, 400), (4, 4), "detected")
+    (change,) = judge(learned(Segment(400, SOFT), alarms=[404])).changes
+    assert change.alternatives == ()
+    assert (change.between, change.latencies_n, change.result) == ((400, 400), (4, 4), "detected")
 
 
 def test_alarm_before_the_earliest_instant_is_false() -> None:
@@ -74,7 +74,7 @@ def test_alarm_after_the_latest_instant_passes_if_it_is_in_time_even_for_the_ear
 
 def test_detection_is_late_only_if_late_for_the_latest_instant() -> None:
     late = judge(learned(between(395, 400, 402), alarms=[deadline_of(402) + 1]))
-    assert (late.outcome, late.tweaks[0].result) == ("failed", "late")
+    assert (late.outcome, late.changes[0].result) == ("failed", "late")
     assert "K at 400 was detected after" in late.reasons[0]
 
 
@@ -82,7 +82,7 @@ def test_detection_is_late_only_if_late_for_the_latest_instant() -> None:
 def test_between_the_deadlines_of_earliest_and_latest_instant_a_run_is_inconclusive(alarm: int) -> None:
     verdict = judge(learned(between(395, 400, 402), alarms=[alarm]))
     assert verdict.outcome == "inconclusive"
-    assert verdict.tweaks[0].result == "undecided"
+    assert verdict.changes[0].result == "undecided"
     assert verdict.reasons == ("K between 395 and 402 was late or detected, depending on its instant",)
 
 
@@ -90,13 +90,13 @@ def test_alarm_between_earliest_and_latest_instant_is_false_or_the_detection() -
     verdict = judge(learned(between(380, 400, 402), alarms=[390]))
     assert verdict.outcome == "inconclusive"
     assert (verdict.false_alarms, verdict.doubtful_alarms) == ((), (390,))
-    assert verdict.tweaks[0].result == "undecided"
+    assert verdict.changes[0].result == "undecided"
 
 
 def test_alarm_that_is_late_for_one_instant_and_false_for_another_may_be_in_time_for_a_third() -> None:
     change = between(390, 403, 442)
     verdict = judge(learned(change, alarms=[425], force_n=SWITCHED))
-    assert verdict.tweaks[0].result == "undecided"
+    assert verdict.changes[0].result == "undecided"
     assert verdict.outcome == "inconclusive"
     exact = judge(learned(Segment(415, SOFT), alarms=[425], force_n=SWITCHED))
     assert exact.outcome == "passed"
@@ -111,13 +111,13 @@ def test_one_of_two_alarms_after_the_earliest_instant_is_false() -> None:
 
 def test_change_missed_under_all_hypotheses_is_missed() -> None:
     verdict = judge(learned(between(380, 400, 402), alarms=[]))
-    assert (verdict.outcome, verdict.tweaks[0].result) == ("failed", "missed")
+    assert (verdict.outcome, verdict.changes[0].result) == ("failed", "missed")
 
 
 def test_missed_change_fails_a_run_with_undecided_changes() -> None:
     undecided = between(380, 400, 402)
     verdict = judge(learned(undecided, Segment(600, LIGHT), alarms=[deadline_of(402)], force_n=SWITCHED))
-    assert verdict.tweaks[1].result == "missed"
+    assert verdict.changes[1].result == "missed"
     assert verdict.outcome == "failed"
 
 
@@ -136,7 +136,7 @@ def test_change_that_was_not_found_is_not_judged_and_the_run_cannot_pass() -> No
     segment = Segment(300, SOFT, 200, unseen=reason)
     for alarms in ([], [450], [310, 450, 600]):
         verdict = judge(learned(segment, alarms=alarms))
-        assert (verdict.outcome, verdict.tweaks[0].result) == ("inconclusive", "not judged")
+        assert (verdict.outcome, verdict.changes[0].result) == ("inconclusive", "not judged")
         assert verdict.reasons == (f"K at 300 is not judged: {reason}",)
         assert [each.start for each in verdict.estimates] == [0], "what the plant became is not known"
     verdict = judge(learned(segment, alarms=[200]))
@@ -153,7 +153,7 @@ def test_instants_stay_within_the_record_and_the_run() -> None:
     """The search interval may begin before the record of the change."""
     run = learned(between(300, 310, 320), Segment(790, LIGHT, start_low=700, start_high=900), alarms=[313, 795])
     run = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, records=(0, 300)))
-    assert [tweak.between for tweak in judge(run).tweaks] == [(301, 320), (700, 799)]
+    assert [change.between for change in judge(run).changes] == [(301, 320), (700, 799)]
 
 
 # ---- what is shown
@@ -168,13 +168,13 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
     run = learned(between(395, 400, 402), alarms=[404])
     text, page, verdict = shown(run)
     line = next(line for line in text.splitlines() if "24500 -> 18000" in line)
-    assert line.split()[-2:] == ["2-9", str(verdict.tweaks[0].bound_n)]
+    assert line.split()[-2:] == ["2-9", str(verdict.changes[0].bound_n)]
     assert "between 395 and 402 (the likeliest instant is shown): detected" in text
     assert ">395–402</button>" in page and ">2–9</td>" in page
-    (tweak,) = as_json(verdict)["tweaks"]
+    (change,) = as_json(verdict)["changes"]
     wanted = {"sample": 400, "between": [395, 402], "latency": 4, "latencies": [2, 9], "result": "detected"}
-    assert tweak.items() >= wanted.items()
-    assert latency_property(verdict.tweaks[0]) == "2..9"
+    assert change.items() >= wanted.items()
+    assert latency_property(verdict.changes[0]) == "2..9"
 
 
 def test_undecided_result_is_shown_in_summary_and_page() -> None:
@@ -182,30 +182,30 @@ def test_undecided_result_is_shown_in_summary_and_page() -> None:
     assert "depending on the instants of the changes: alarms at 390" in text
     assert "? depends on its instant" in page and "the alarms at 390 are false" in page
     assert as_json(verdict)["doubtful_alarms"] == [390]
-    assert as_json(verdict)["tweaks"][0]["result"] == "undecided"
+    assert as_json(verdict)["changes"][0]["result"] == "undecided"
 
 
 def test_change_that_was_not_found_is_shown_with_the_reason() -> None:
     text, page, verdict = shown(learned(Segment(300, SOFT, 200, unseen="nothing to be seen"), alarms=[]))
     assert "K at 300 is not judged: nothing to be seen" in text
     assert "not judged: not found in the samples" in page
-    assert as_json(verdict)["tweaks"][0]["unseen"] == "nothing to be seen"
+    assert as_json(verdict)["changes"][0]["unseen"] == "nothing to be seen"
 
 
 def test_exact_instants_are_shown_without_an_interval() -> None:
     run = learned(Segment(400, SOFT), alarms=[404])
     text, page, verdict = shown(run)
     assert "between" not in text and ">400</button>" in page
-    assert latency_property(verdict.tweaks[0]) == "4"
+    assert latency_property(verdict.changes[0]) == "4"
 
 
 # ---- findings of a test
 
 
 def test_detection_limit_is_checked_for_every_instant() -> None:
-    (tweak,) = judge(learned(between(395, 400, 402), alarms=[404])).tweaks
-    assert [each.bound_n for each in tweak.hypotheses] == [1, 1, 1]
-    assert [each.latency_n for each in tweak.hypotheses] == [9, 4, 2]  # of them 1 more than so many bounds is allowed
+    (change,) = judge(learned(between(395, 400, 402), alarms=[404])).changes
+    assert [each.bound_n for each in change.hypotheses] == [1, 1, 1]
+    assert [each.latency_n for each in change.hypotheses] == [9, 4, 2]  # of them 1 more than so many bounds is allowed
     played = Played(learned(between(395, 400, 402), alarms=[404]))
     assert played.detects(within=8.0)
     assert not played.detects(within=7.0)

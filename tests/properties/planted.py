@@ -137,7 +137,7 @@ def _words(scenario: dict[str, Any]) -> str:
     words = [_values(scenario.get("set", {})) or str(scenario["program"])]
     levels = f"{excitation['low_v']:g} to {excitation['high_v']:g} V"
     words.append(f"{excitation['shape']} {levels}, {excitation['frequency_hz']:g} Hz")
-    words += [f"at {tweak['sample']} {_values(tweak['set'])}" for tweak in scenario.get("tweaks", [])]
+    words += [f"at {change['sample']} {_values(change['set'])}" for change in scenario.get("changes", [])]
     return f"{'; '.join(words)}; {scenario['samples']} samples, seed {scenario['seed']}"
 
 

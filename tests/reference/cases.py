@@ -72,7 +72,7 @@ def _large(name: str, high_v: float, phase: float) -> Scenario:
 SUCCESSIONS = dataclasses.replace(
     SUCCESSION,
     samples=6300,
-    tweaks=tuple(
+    changes=tuple(
         PotChange(at, {"K": 24_500.0 if n % 2 else 23_700.0})
         for n, at in enumerate((200, 300, 400, 500, 5940, 6040, 6140))
     ),

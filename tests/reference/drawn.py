@@ -98,11 +98,11 @@ def drawn(number: int) -> PlayedCase:
     first = draw.whole(300, samples - 100)
     plant = _plant(draw)
     spoils: list[Spoil] = []
-    tweaks: list[PotChange] = []
+    changes: list[PotChange] = []
     instants = [first, *(_instants(draw, samples) if is_long or draw.chance(0.4) else [])]
     for at in instants:
         if draw.chance(0.5):
-            tweaks.append(PotChange(at, _changed(draw, plant), draw.one(0, 0, 0, 15)))
+            changes.append(PotChange(at, _changed(draw, plant), draw.one(0, 0, 0, 15)))
         else:
             spoils.append(_fault(draw, at, draw.one(samples, at + draw.whole(30, 200))))
     if draw.chance(0.2):
@@ -114,7 +114,7 @@ def drawn(number: int) -> PlayedCase:
         spoils.append(_disturbance(draw, samples))
         settings |= {"warm_up_n": draw.whole(*DISTURBED_WARM_UP_N), "noise_estimated": draw.chance(0.9)}
     scenario = Scenario(
-        samples=samples, excitation=excitation, set=plant, tweaks=_ordered(tweaks), name=f"drawn {number}"
+        samples=samples, excitation=excitation, set=plant, changes=_ordered(changes), name=f"drawn {number}"
     )
     return PlayedCase(scenario, settings, _all_of(spoils) if spoils else None)
 
@@ -177,12 +177,12 @@ def _instants(draw: Draw, samples: int) -> list[int]:
     return list(range(draw.whole(200, 400), samples - 20, draw.whole(100, 400)))
 
 
-def _ordered(tweaks: Sequence[PotChange]) -> tuple[PotChange, ...]:
+def _ordered(changes: Sequence[PotChange]) -> tuple[PotChange, ...]:
     """Changes in order, none before the ramp of the one before has ended."""
     out: list[PotChange] = []
-    for tweak in sorted(tweaks, key=lambda each: each.sample):
-        if not out or tweak.sample > out[-1].sample + out[-1].ramp_n:
-            out.append(tweak)
+    for change in sorted(changes, key=lambda each: each.sample):
+        if not out or change.sample > out[-1].sample + out[-1].ramp_n:
+            out.append(change)
     return tuple(out)
 
 

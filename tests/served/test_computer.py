@@ -16,9 +16,9 @@ AMPLIFIED = Excitation("square", 0.1, 9.9, 100.0, clock="free")
 ROUNDING_V = 1e-9
 
 
-def played(samples: int, tweaks: tuple[PotTurn, ...] = (), rate_hz: float = RATE_HZ) -> np.ndarray:
+def played(samples: int, changes: tuple[PotTurn, ...] = (), rate_hz: float = RATE_HZ) -> np.ndarray:
     """Force and displacement of the emulator itself."""
-    return np.concatenate(list(front(rate_hz).play(AMPLIFIED, samples, tweaks)))[:, :2]
+    return np.concatenate(list(front(rate_hz).play(AMPLIFIED, samples, changes)))[:, :2]
 
 
 def wired(wiring: Wiring | None = None) -> WiredComputer:
@@ -44,8 +44,8 @@ def test_scheduled_changes_are_made_in_order_of_time_after_the_point_at_or_befor
     computer.schedule(
         [DialChange(900 / RATE_HZ, "B", 0.8), DialChange(300 / RATE_HZ, "K", 0.6), DialChange(1e3, "M", 0.1)]
     )
-    tweaks = (PotTurn(300, {"K_dial": 0.6}), PotTurn(900, {"B_dial": 0.8}))
-    assert np.abs(computer.run(1500) - played(1500, tweaks)).max() < ROUNDING_V
+    changes = (PotTurn(300, {"K_dial": 0.6}), PotTurn(900, {"B_dial": 0.8}))
+    assert np.abs(computer.run(1500) - played(1500, changes)).max() < ROUNDING_V
 
 
 def test_silenced_generator_gives_0_v_and_the_computer_comes_to_rest() -> None:
@@ -81,8 +81,8 @@ def test_another_rate_keeps_generator_pots_and_schedule() -> None:
     computer.schedule([DialChange(0.04, "K", 0.6)])
     computer.run(250)  # into the second period
     computer.set_rate(2 * RATE_HZ)
-    tweaks = (PotTurn(0, {"B_dial": 0.8}), PotTurn(1600, {"K_dial": 0.6}))
-    expected = played(4500, tweaks, 2 * RATE_HZ)[500:]
+    changes = (PotTurn(0, {"B_dial": 0.8}), PotTurn(1600, {"K_dial": 0.6}))
+    expected = played(4500, changes, 2 * RATE_HZ)[500:]
     seen = computer.run(4000)
     assert np.array_equal(seen[:, 0], expected[:, 0])
     assert np.abs(seen - expected)[600:].max() < 1e-6

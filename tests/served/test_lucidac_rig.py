@@ -80,7 +80,7 @@ def test_thesis_has_the_verdict_of_the_emulated_rig(served: Served, tmp_path: Pa
     """On 20 seeds: analogrig compare-rigs emulator lucidac --plays 20."""
     verdicts = [judge(played(rig, served.address)) for rig in (served.lucidac_file(tmp_path), "emulator")]
     assert [verdict.outcome for verdict in verdicts] == ["passed", "passed"]
-    latencies = [[change.latency_n for change in verdict.tweaks] for verdict in verdicts]
+    latencies = [[change.latency_n for change in verdict.changes] for verdict in verdicts]
     assert np.abs(np.diff(np.array(latencies, np.float64), axis=0)).max() <= MOST_LATENCY_N
 
 
@@ -94,7 +94,7 @@ def test_run_says_which_parameters_the_steps_of_the_coefficients_moved_with_a_ch
 ) -> None:
     """A mass acts on three coefficients, a spring on one. So "several" is no wrong name for a change of the mass."""
     changes = (PotChange(600, {"M": 92.0}), PotChange(900, {"K": 19600.0}))
-    scenario = dataclasses.replace(Scenario.load("thesis"), samples=1200, tweaks=changes)
+    scenario = dataclasses.replace(Scenario.load("thesis"), samples=1200, changes=changes)
     address = served.address
     with open_rig(served.lucidac_file(tmp_path), allow=[address], self_test=False) as rig, open_dut("inproc") as dut:
         run = Bench(rig, dut).play(scenario, seed=7)
@@ -102,7 +102,7 @@ def test_run_says_which_parameters_the_steps_of_the_coefficients_moved_with_a_ch
     run = Run.load(tmp_path / "run.npz")
     assert [each.also for each in run.conditions.segments] == [(), ("B", "K"), ()]
     several = dataclasses.replace(run, diagnosis_change=np.full_like(run.diagnosis_change, Change.SEVERAL))
-    diagnoses = [change.diagnosis for change in judge(several).tweaks]
+    diagnoses = [change.diagnosis for change in judge(several).changes]
     assert [each is not None and each.right for each in diagnoses] == [True, False]
 
 

@@ -28,14 +28,14 @@ RATE_HZ = 20e3
 
 def played(
     samples: int = BUFFER_N,
-    tweaks: tuple[PotTurn, ...] = (),
+    changes: tuple[PotTurn, ...] = (),
     *,
     per_sample: int = 1,
     excitation: Excitation = EXCITATION,
 ) -> NDArray[np.float64]:
     """Force and displacement of the emulator itself, several points per sample of the instrument."""
     computer = front(RATE_HZ * per_sample)
-    return np.concatenate(list(computer.play(excitation, samples * per_sample, tweaks)))[:, :2]
+    return np.concatenate(list(computer.play(excitation, samples * per_sample, changes)))[:, :2]
 
 
 @pytest.fixture
@@ -298,8 +298,8 @@ def test_scheduled_changes_follow_each_trigger_of_the_generator(ask: Ask) -> Non
     say(ask, ["POT:SCHedule 3,0.638,0.1", "POT:SCH 2,0.8152,0.3"])
     say(ask, POINT_SAMPLES)
     assert ask("POT:SCH:COUN?") == "2"
-    tweaks = (PotTurn(2000, {"K_dial": 0.638}), PotTurn(6000, {"B_dial": 0.8152}))
-    assert np.abs(record(ask) - played(tweaks=tweaks)).max() < ROUNDED_V
+    changes = (PotTurn(2000, {"K_dial": 0.638}), PotTurn(6000, {"B_dial": 0.8152}))
+    assert np.abs(record(ask) - played(changes=changes)).max() < ROUNDED_V
     say(ask, ["POT:SCHedule:CLEar"])
     assert ask("POT:SCH:COUN?") == "0"
 
@@ -441,5 +441,5 @@ def test_record_in_real_time_takes_its_time_and_shows_a_pot_set_meanwhile() -> N
     assert ask("ACQ:TRig:FILL?") == "0"
     hands.now_s = (BUFFER_N + 0.5) / RATE_HZ
     assert ask("ACQ:TRig:FILL?") == "1"
-    looks = played(tweaks=(PotTurn(8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
+    looks = played(changes=(PotTurn(8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
     assert np.abs(record(ask) - looks[::8]).max() < ROUNDED_V

@@ -64,7 +64,7 @@ def detect(scenario_name: str, rig_name: str, seeds: Iterable[int]) -> Detection
         latencies_n=_by_change(verdicts, "latency_n"),
         bounds_n=_by_change(verdicts, "bound_n"),
         errors=np.array([[_errors(segment) for segment in verdict.estimates] for verdict in verdicts]),
-        missed=sum(tweak.missed for verdict in verdicts for tweak in verdict.tweaks),
+        missed=sum(change.missed for verdict in verdicts for change in verdict.changes),
         false_alarms=sum(len(verdict.false_alarms) for verdict in verdicts),
         inconclusive=sum(not verdict.valid for verdict in verdicts),
         runs=len(verdicts),
@@ -76,4 +76,4 @@ def _errors(segment: SegmentEstimate) -> list[float]:
 
 
 def _by_change(verdicts: list[Verdict], field: str) -> NDArray[np.float64]:
-    return np.array([[getattr(tweak, field) for tweak in verdict.tweaks] for verdict in verdicts], dtype=np.float64)
+    return np.array([[getattr(change, field) for change in verdict.changes] for verdict in verdicts], dtype=np.float64)

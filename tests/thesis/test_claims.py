@@ -741,7 +741,7 @@ def test_recording_plays_again_through_another_device(tmp_path: Path, capsys: py
     status = main(["replay", str(shipped), "--dut", str(device), "--out", str(tmp_path), "--json"])
     answer = json.loads(capsys.readouterr().out)
     assert status == 0
-    assert len(answer["tweaks"]) == 4
+    assert len(answer["changes"]) == 4
 
 
 def test_folder_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

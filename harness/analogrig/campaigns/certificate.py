@@ -104,7 +104,7 @@ class Question:
                 return f"{name} must be {least} to {most}, not {value:g}"
         if not self.datasheet.alarms:
             return "the device has no trigger: it raises no alarm, whatever comes"
-        if self.scenario.tweaks:
+        if self.scenario.changes:
             return "the scenario changes the plant, and this is about alarms while nothing changes"
         return ""
 

@@ -233,11 +233,11 @@ class Plan:
         start = {**base.set, **{starts[axis]: value for axis, value in values.items() if axis in starts}}
         before = Plant.of(base.program, start).parameters()
         changed = {factors[axis]: value * before[factors[axis]] for axis, value in values.items() if axis in factors}
-        tweaks = (*base.tweaks, PotChange(self.spec.change_at, changed)) if changed else base.tweaks
+        changes = (*base.changes, PotChange(self.spec.change_at, changed)) if changed else base.changes
         expect = base.expect
         if self.spec.false_alarms is not None:
             expect = dataclasses.replace(expect, false_alarms=self.spec.false_alarms)
-        return dataclasses.replace(base, set=start, tweaks=tweaks, expect=expect)
+        return dataclasses.replace(base, set=start, changes=changes, expect=expect)
 
     def _check(self) -> None:
         spec = self.spec
@@ -256,8 +256,10 @@ class Plan:
                     f"{where}: unknown axis {axis[:40]!r}{config.suggest(axis, known)} (known: {named}, and each"
                     " parameter with _factor)"
                 )
-        if axes & set(self._factors) and self.scenario.get("tweaks"):
-            raise ConfigurationError(f"{where}: the scenario {spec.scenario} has tweaks of its own: no factors besides")
+        if axes & set(self._factors) and self.scenario.get("changes"):
+            raise ConfigurationError(
+                f"{where}: the scenario {spec.scenario} has changes of its own: no factors besides"
+            )
         if NOISE in axes and any("card" not in table for table in self.rigs):
             raise ConfigurationError(f"{where}: noise_lsb is for emulated rigs")
         for cell in self.cells():

@@ -100,7 +100,7 @@ class RepeatedRig(EmulatorRig):
 
     def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
         """Prepared data of the scenario; the last set is reused for the same key."""
-        key = (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
+        key = (scenario.samples, scenario.plant, scenario.changes, scenario.excitation)
         if self._last_prepared is None or self._last_prepared.key != key:
             computer, excitation, changes = self.set_up(scenario, seed)
             card = self.card(scenario.program)

@@ -23,11 +23,11 @@ class Change(NamedTuple):
     late: bool
 
     @classmethod
-    def of(cls, tweak: ChangeVerdict) -> Change:
+    def of(cls, change: ChangeVerdict) -> Change:
         """Change at its likeliest instant; one that was not found in the samples is recorded as not detectable."""
-        if tweak.unseen:
+        if change.unseen:
             return cls(None, None, missed=False, late=False)
-        return cls(tweak.latency_n, tweak.bound_n, tweak.missed, tweak.late)
+        return cls(change.latency_n, change.bound_n, change.missed, change.late)
 
 
 def changes(row: Row) -> list[Change]:
@@ -50,7 +50,7 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
         samples=run.samples,
         armed=verdict.armed_n,
         false_alarms=len(verdict.false_alarms),
-        changes=[list(Change.of(tweak)) for tweak in verdict.tweaks],
+        changes=[list(Change.of(change)) for change in verdict.changes],
         errors=_errors(verdict),
         theta=(verdict.theta_hash or verdict.alarm_hash)[:16],
     )

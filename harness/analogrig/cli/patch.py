@@ -142,7 +142,7 @@ def _performance(program: Program, rig: str) -> tuple[Performance, float]:
     with open_rig(rig) as opened:
         if not is_emulated(opened):
             raise ConfigurationError(f"--rig {rig}: is not emulated; name an emulated rig, such as emulator")
-        played = opened.perform(dataclasses.replace(Scenario.of_program(program), tweaks=()), 0)
+        played = opened.perform(dataclasses.replace(Scenario.of_program(program), changes=()), 0)
         computer = opened.description()["computer"]
         measured = (computer["values"] or {}).get("offset_v", {}).values()
         return played, max(computer["offset_v"], *map(abs, measured), 0.0)

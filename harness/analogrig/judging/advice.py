@@ -193,11 +193,11 @@ def _channel_faults(verdict: Verdict) -> Iterator[str]:
 
 
 def _wrong_diagnoses(verdict: Verdict) -> Iterator[str]:
-    for tweak in verdict.tweaks:
-        if tweak.diagnosis is not None and not tweak.diagnosis.right:
+    for change in verdict.changes:
+        if change.diagnosis is not None and not change.diagnosis.right:
             yield (
-                f"the device named {tweak.diagnosis.named} where {tweak.what} changed at {tweak.sample}: this does not"
-                " fail the run, since one diagnosis in twenty may be wrong; isolates() of a test judges diagnoses"
+                f"the device named {change.diagnosis.named} where {change.what} changed at {change.sample}: this does"
+                " not fail the run, since one diagnosis in twenty may be wrong; isolates() of a test judges diagnoses"
             )
 
 
@@ -246,10 +246,10 @@ def _warm_up(run: Run) -> Iterator[str]:
 
 def _changes_in_warm_up(run: Run, verdict: Verdict) -> Iterator[str]:
     sheet = run.datasheet
-    for tweak in verdict.tweaks:
-        if tweak.sample < sheet.warm_up_n and not sheet.armed:
+    for change in verdict.changes:
+        if change.sample < sheet.warm_up_n and not sheet.armed:
             yield (
-                f"{tweak.what} at {tweak.sample} changes within the device's warm-up of"
+                f"{change.what} at {change.sample} changes within the device's warm-up of"
                 f" {number_of(sheet.warm_up_n, 'sample')}, which raises no alarm: change it later"
             )
 
@@ -268,16 +268,16 @@ def _edge_instants(run: Run, excitation: Excitation) -> NDArray[np.float64]:
 
 
 def _false_alarm_rate(verdict: Verdict) -> Iterator[str]:
-    if len(verdict.false_alarms) > max(2, len(verdict.tweaks)):
+    if len(verdict.false_alarms) > max(2, len(verdict.changes)):
         yield "with so many false alarms, an alarm soon after a change may be coincidence; ignore its latency"
 
 
 def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
-    for tweak in verdict.tweaks:
-        if tweak.bound_n is None and tweak.is_bounded and not tweak.unseen:
-            yield f"{tweak.what} at {tweak.sample} is not judged: not detectable before the next change or the end"
-        elif tweak.is_cut and tweak.latency_n is None:
-            yield f"{tweak.what} at {tweak.sample} is not judged: the run ends before an alarm would be late"
+    for change in verdict.changes:
+        if change.bound_n is None and change.is_bounded and not change.unseen:
+            yield f"{change.what} at {change.sample} is not judged: not detectable before the next change or the end"
+        elif change.is_cut and change.latency_n is None:
+            yield f"{change.what} at {change.sample} is not judged: the run ends before an alarm would be late"
 
 
 def _implausible_estimates(run: Run, verdict: Verdict) -> Iterator[str]:

@@ -251,13 +251,13 @@ class ChangeVerdict:
         return self.latency_n is not None and self.deadline_n is not None and self.latency_n > self.deadline_n
 
 
-def _result_at_instant(tweak: ChangeVerdict) -> Result:
-    """Result of the change if ``tweak.sample`` is its true instant."""
-    if tweak.missed:
+def _result_at_instant(change: ChangeVerdict) -> Result:
+    """Result of the change if ``change.sample`` is its true instant."""
+    if change.missed:
         return "missed"
-    if tweak.late:
+    if change.late:
         return "late"
-    return "unseeable" if tweak.latency_n is None else "detected"
+    return "unseeable" if change.latency_n is None else "detected"
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ class Verdict:
     outcome: Outcome
     reasons: tuple[str, ...]
     """Reasons for any outcome but ``passed``; empty if passed."""
-    tweaks: tuple[ChangeVerdict, ...]
+    changes: tuple[ChangeVerdict, ...]
     false_alarms: tuple[int, ...]
     """Sample indices of the alarms that are false under all hypotheses."""
     estimates: tuple[SegmentEstimate, ...]
@@ -388,7 +388,7 @@ def judge_with(
     return Verdict(
         outcome="inconclusive" if invalid else outcome,
         reasons=(*invalid, *reasons),
-        tweaks=_merge_hypotheses(results),
+        changes=_merge_hypotheses(results),
         false_alarms=tuple(sorted(certain)),
         doubtful_alarms=tuple(sorted(possible - certain)),
         estimates=estimates,
@@ -480,23 +480,23 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "outcome": verdict.outcome,
         "valid": verdict.valid,
         "reasons": list(verdict.reasons),
-        "tweaks": [
+        "changes": [
             {
-                "sample": tweak.sample,
-                "what": tweak.what,
-                "from": dict(tweak.before),
-                "to": dict(tweak.after),
-                "between": list(tweak.between),
-                "result": tweak.result,
-                "latency": tweak.latency_n,
-                "latencies": None if tweak.latencies_n is None else list(tweak.latencies_n),
-                "bound": tweak.bound_n,
-                "deadline": tweak.deadline_n,
-                "missed": tweak.result == "missed",
-                "unseen": tweak.unseen,
-                "diagnosis": None if tweak.diagnosis is None else dataclasses.asdict(tweak.diagnosis),
+                "sample": change.sample,
+                "what": change.what,
+                "from": dict(change.before),
+                "to": dict(change.after),
+                "between": list(change.between),
+                "result": change.result,
+                "latency": change.latency_n,
+                "latencies": None if change.latencies_n is None else list(change.latencies_n),
+                "bound": change.bound_n,
+                "deadline": change.deadline_n,
+                "missed": change.result == "missed",
+                "unseen": change.unseen,
+                "diagnosis": None if change.diagnosis is None else dataclasses.asdict(change.diagnosis),
             }
-            for tweak in verdict.tweaks
+            for change in verdict.changes
         ],
         "false_alarms": list(verdict.false_alarms),
         "doubtful_alarms": list(verdict.doubtful_alarms),
@@ -531,7 +531,7 @@ def _with_cure(found: MisfitPeriod | ChannelFault) -> dict[str, Any]:
 class _HypothesisResult:
     """Result of a run under one hypothesis about the instants of its changes."""
 
-    tweaks: tuple[ChangeVerdict, ...]
+    changes: tuple[ChangeVerdict, ...]
     false_alarms: tuple[int, ...]
     failures: tuple[str, ...]
 
@@ -543,18 +543,18 @@ def _evaluate_hypotheses(run: Run, model: Model | None, expect: Expectations, le
         runs += [run.with_change_instants(Segment.earliest), run.with_change_instants(Segment.latest)]
     out = []
     for supposed in runs:
-        tweaks, false_alarms = _attribute_alarms(supposed, model, expect, level)
-        out.append(_HypothesisResult(tweaks, false_alarms, tuple(_failure_reasons(tweaks, false_alarms, expect))))
+        changes, false_alarms = _attribute_alarms(supposed, model, expect, level)
+        out.append(_HypothesisResult(changes, false_alarms, tuple(_failure_reasons(changes, false_alarms, expect))))
     return out
 
 
 def _decide_outcome(results: Sequence[_HypothesisResult], expect: Expectations) -> tuple[Outcome, list[str]]:
     """Outcome of a valid run, with the reasons unless it is ``passed``."""
-    tweaks = _merge_hypotheses(results)
-    unseen = [f"{tweak.what} at {tweak.sample} is not judged: {tweak.unseen}" for tweak in tweaks if tweak.unseen]
+    changes = _merge_hypotheses(results)
+    unseen = [f"{change.what} at {change.sample} is not judged: {change.unseen}" for change in changes if change.unseen]
     if _fails_under_all_hypotheses(results, expect):
         return "failed", [*results[0].failures, *unseen]
-    undecided = [_undecided_reason(tweak) for tweak in tweaks if tweak.result == "undecided"]
+    undecided = [_undecided_reason(change) for change in changes if change.result == "undecided"]
     counts = sorted(len(each.false_alarms) for each in results)
     if counts[0] <= expect.false_alarms < counts[-1]:
         undecided.append(
@@ -567,16 +567,16 @@ def _decide_outcome(results: Sequence[_HypothesisResult], expect: Expectations) 
 
 def _shows_no_change(results: Sequence[_HypothesisResult]) -> bool:
     """True if there are changes, and the bounds are known and permit the detection of none."""
-    tweaks = [tweak for each in results for tweak in each.tweaks]
-    return bool(tweaks) and all(tweak.is_bounded and tweak.bound_n is None for tweak in tweaks)
+    changes = [change for each in results for change in each.changes]
+    return bool(changes) and all(change.is_bounded and change.bound_n is None for change in changes)
 
 
 def _permits_silence(results: Sequence[_HypothesisResult]) -> bool:
     """True if there are changes, none was detected, and no silence of the device would count as a miss."""
-    tweaks = [tweak for each in results for tweak in each.tweaks]
-    return bool(tweaks) and not any(
-        tweak.missed or (tweak.bound_n is not None and tweak.latency_n is not None) or not tweak.is_bounded
-        for tweak in tweaks
+    changes = [change for each in results for change in each.changes]
+    return bool(changes) and not any(
+        change.missed or (change.bound_n is not None and change.latency_n is not None) or not change.is_bounded
+        for change in changes
     )
 
 
@@ -586,27 +586,27 @@ def _fails_under_all_hypotheses(results: Sequence[_HypothesisResult], expect: Ex
     A change that is late under one hypothesis and missed under another does not count: at the true instant it may be
     neither.
     """
-    by_change = list(zip(*(each.tweaks for each in results), strict=True))
-    missed = sum(all(tweak.missed and not tweak.unseen for tweak in each) for each in by_change)
-    late = any(all(tweak.late and not tweak.unseen for tweak in each) for each in by_change)
+    by_change = list(zip(*(each.changes for each in results), strict=True))
+    missed = sum(all(change.missed and not change.unseen for change in each) for each in by_change)
+    late = any(all(change.late and not change.unseen for change in each) for each in by_change)
     return late or missed > expect.missed or min(len(each.false_alarms) for each in results) > expect.false_alarms
 
 
-def _undecided_reason(tweak: ChangeVerdict) -> str:
+def _undecided_reason(change: ChangeVerdict) -> str:
     """Message that the result of a change depends on its instant."""
-    low, high = tweak.between
-    results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in tweak.hypotheses))
-    return f"{tweak.what} between {low} and {high} was {results}, depending on its instant"
+    low, high = change.between
+    results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in change.hypotheses))
+    return f"{change.what} between {low} and {high} was {results}, depending on its instant"
 
 
 def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[ChangeVerdict, ...]:
     """Verdicts at the likeliest instants, each with the differing verdicts of the other hypotheses."""
-    likeliest, *others = (each.tweaks for each in results)
+    likeliest, *others = (each.changes for each in results)
     if not others:
         return likeliest
     return tuple(
-        dataclasses.replace(tweak, alternatives=tuple(each[i] for each in others if each[i] != tweak))
-        for i, tweak in enumerate(likeliest)
+        dataclasses.replace(change, alternatives=tuple(each[i] for each in others if each[i] != change))
+        for i, change in enumerate(likeliest)
     )
 
 
@@ -615,7 +615,7 @@ def _attribute_alarms(
 ) -> tuple[tuple[ChangeVerdict, ...], tuple[int, ...]]:
     """Verdict on each change, and the samples of the false alarms."""
     by_start = {segment.start: segment for segment in run.conditions.segments}
-    tweaks = []
+    changes = []
     diagnosed, is_bounded = run.conditions.program.diagnosed, information.is_bounded(run)
     isolates = len(run.diagnosis_index) and diagnosed
     model = model or information.model_of(run)
@@ -633,7 +633,7 @@ def _attribute_alarms(
         changed = before.changes_to(after)
         late = first_at_level(gathered, expect.late_information_ratio * level)
         bound_n = first_at_level(gathered, level)
-        tweaks.append(
+        changes.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
                 sample=start,
@@ -650,7 +650,7 @@ def _attribute_alarms(
                 else _judge_diagnosis(run, by_start[start], (detection, end), changed, isolation_bound_n),
             )
         )
-    return tuple(tweaks), _unexplained(run, alarms)
+    return tuple(changes), _unexplained(run, alarms)
 
 
 def unexplained_alarms(run: Run) -> tuple[int, ...]:
@@ -769,22 +769,22 @@ def _loss_reasons(run: Run) -> list[str]:
 
 
 def _failure_reasons(
-    tweaks: tuple[ChangeVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations
+    changes: tuple[ChangeVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations
 ) -> list[str]:
     """Violated expectations under one hypothesis; empty if there are none."""
     reasons = []
-    judged = [tweak for tweak in tweaks if not tweak.unseen]
-    missed = [tweak for tweak in judged if tweak.missed]
+    judged = [change for change in changes if not change.unseen]
+    missed = [change for change in judged if change.missed]
     if len(missed) > expect.missed:
-        names = "; ".join(f"{tweak.what} at {tweak.sample}" for tweak in missed)
+        names = "; ".join(f"{change.what} at {change.sample}" for change in missed)
         of = number_of(len(judged), "change")
         reasons.append(f"missed {len(missed)} of {of} ({names}), at most {expect.missed} expected")
     reasons += [
-        f"{tweak.what} at {tweak.sample} was detected after {number_of(tweak.latency_n or 0, 'sample')},"
-        f" later than its deadline of {number_of(tweak.deadline_n or 0, 'sample')} (bound {tweak.bound_n}; [expect]"
+        f"{change.what} at {change.sample} was detected after {number_of(change.latency_n or 0, 'sample')},"
+        f" later than its deadline of {number_of(change.deadline_n or 0, 'sample')} (bound {change.bound_n}; [expect]"
         f" late_information_ratio = {expect.late_information_ratio:g}, late_slack_n = {expect.late_slack_n})"
-        for tweak in judged
-        if tweak.late
+        for change in judged
+        if change.late
     ]
     if len(false_alarms) > expect.false_alarms:
         reasons.append(f"{number_of(len(false_alarms), 'false alarm')}, at most {expect.false_alarms} expected")

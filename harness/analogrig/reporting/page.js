@@ -100,7 +100,7 @@
   const lit = marked(run.overloads);
   const noticed = marked(run.alarms.filter((alarm) => !alarm.false));
   const wrong = marked(run.alarms.filter((alarm) => alarm.false));
-  const marks = { changes: marked(run.tweaks), noticed, wrong };
+  const marks = { changes: marked(run.changes), noticed, wrong };
 
   // Lit lamps with the names of their amplifiers, inside the plot. Those of one sample are stacked.
   function lamps(u, ink) {

@@ -145,7 +145,7 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
         "pieces": shown,
         "columns": [{"name": name, "type": each.dtype.name, **_units(run, name)} for name, each in values.items()],
         "deflated": deflate(values.values()),
-        "tweaks": [{"sample": tweak.sample, "label": _direction(tweak)} for tweak in verdict.tweaks],
+        "changes": [{"sample": change.sample, "label": _direction(change)} for change in verdict.changes],
         "alarms": [
             {"sample": index, "false": is_false}
             for index, is_false in sorted([*((each, False) for each in detections), *((each, True) for each in false)])
@@ -182,7 +182,7 @@ def _alarms(run: Run, verdict: Verdict) -> tuple[list[int], list[int]]:
 def _pieces(run: Run, verdict: Verdict) -> tuple[Piece, ...]:
     """Pieces with every sample near the start, the changes, the lamps and the first alarms."""
     detections, false = _alarms(run, verdict)
-    changes = (tweak.sample for tweak in verdict.tweaks)
+    changes = (change.sample for change in verdict.changes)
     return pieces(run.samples, (0, *changes, *detections, *verdict.overloads.values(), *false))
 
 
@@ -216,9 +216,9 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _direction(tweak: ChangeVerdict) -> str:
+def _direction(change: ChangeVerdict) -> str:
     """Label of a change in a plot: ``B ↓, K ↑``."""
-    return ", ".join(f"{name} {'↑' if tweak.after[name] > old else '↓'}" for name, old in tweak.before.items())
+    return ", ".join(f"{name} {'↑' if change.after[name] > old else '↓'}" for name, old in change.before.items())
 
 
 def _signals(run: Run, shown: Sequence[Piece]) -> dict[str, NDArray[Any]]:

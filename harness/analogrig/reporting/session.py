@@ -140,7 +140,7 @@ def _read(parent: Path, folder: Path, start: Path) -> Entry | None:
 
 
 def _entry(table: Mapping[str, Any], parent: Path, folder: Path, start: Path) -> Entry:
-    by, changes = table["recorded_by"] or {}, table["tweaks"]
+    by, changes = table["recorded_by"] or {}, table["changes"]
     exact = [each for each in changes if each["latency"] is not None and each["bound"]]
     latency, bound = (math.fsum(float(each[key]) for each in exact) for key in ("latency", "bound"))
     if table["outcome"] not in SIGNS or not math.isfinite(latency + bound):

@@ -32,10 +32,10 @@ def summary(run: Run, verdict: Verdict) -> str:
         f" over {conditions.link}, seed {conditions.seed}: {verdict.outcome.upper()}"
     )
     lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]
-    if verdict.tweaks:
+    if verdict.changes:
         lines += ["  sample  change                                       latency  bound  (samples)"]
-        lines += [line for tweak in verdict.tweaks for line in _change_lines(tweak, conditions.program)]
-    diagnoses = [(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
+        lines += [line for change in verdict.changes for line in _change_lines(change, conditions.program)]
+    diagnoses = [(change.sample, change.diagnosis) for change in verdict.changes if change.diagnosis]
     if diagnoses:
         width = max(len("several"), *(len(diagnosis.named) for _, diagnosis in diagnoses))
         lines += [
@@ -98,19 +98,19 @@ def _alarms(samples: Sequence[int]) -> str:
     return f"{len(samples)} (at {', '.join(map(str, samples[:SHOWN_ALARMS]))}{more})"
 
 
-def _change_lines(tweak: ChangeVerdict, program: Program) -> list[str]:
-    bound = bound_text(tweak)
-    out = [f"  {tweak.sample:6}  {change_text(tweak, program):43}  {tweak.latency_text:>7}  {bound:>5}"]
-    low, high = tweak.between
+def _change_lines(change: ChangeVerdict, program: Program) -> list[str]:
+    bound = bound_text(change)
+    out = [f"  {change.sample:6}  {change_text(change, program):43}  {change.latency_text:>7}  {bound:>5}"]
+    low, high = change.between
     if low < high:
-        out += [f"          between {low} and {high} (the likeliest instant is shown): {tweak.result}"]
+        out += [f"          between {low} and {high} (the likeliest instant is shown): {change.result}"]
     return out
 
 
-def change_text(tweak: ChangeVerdict, program: Program) -> str:
+def change_text(change: ChangeVerdict, program: Program) -> str:
     """Parameters before and after a change: ``K 24500 -> 18000 N/m``."""
     return ", ".join(
-        f"{name} {old:g} -> {tweak.after[name]:g} {program.unit(name)}".rstrip() for name, old in tweak.before.items()
+        f"{name} {old:g} -> {change.after[name]:g} {program.unit(name)}".rstrip() for name, old in change.before.items()
     )
 
 
@@ -119,9 +119,9 @@ def response_text(found: StepResponse) -> str:
     return "unstable" if found.error is None else f"{found.error:.2%} of the static gain"
 
 
-def bound_text(tweak: ChangeVerdict) -> str:
+def bound_text(change: ChangeVerdict) -> str:
     """Information bound of a change: ``3``, ``none`` if it is not detectable, ``?`` if it is unknown."""
-    return "?" if not tweak.is_bounded else "none" if tweak.bound_n is None else str(tweak.bound_n)
+    return "?" if not change.is_bounded else "none" if change.bound_n is None else str(change.bound_n)
 
 
 def _estimates_head(program: Program) -> str:

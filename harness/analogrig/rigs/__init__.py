@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-CAPABILITIES = ("excite", "tweak")
+CAPABILITIES = ("excite", "change")
 """Optional capabilities of a rig beyond sampling, for ``Rig.capabilities``."""
 
 if TYPE_CHECKING:

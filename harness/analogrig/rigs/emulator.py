@@ -304,7 +304,7 @@ class SetUp(NamedTuple):
 class EmulatorRig(Rig):
     """The emulated analogue computer and its card."""
 
-    capabilities = frozenset({"tweak", "excite"})
+    capabilities = frozenset({"change", "excite"})
     computes_circuit = True
 
     def __init__(self, description: EmulatorDescription, block_samples: int = BLOCK_SAMPLES) -> None:
@@ -337,12 +337,12 @@ class EmulatorRig(Rig):
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         changes: list[PotTurn] = []
         plant = scenario.plant
-        for i, tweak in enumerate(scenario.tweaks):
-            plant = plant.changed(tweak.set)
-            with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = self.pot_settings(plant, tweak.set)
-                computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
-            changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
+        for i, change in enumerate(scenario.changes):
+            plant = plant.changed(change.set)
+            with emulator_errors(f"scenario {scenario.name}: changes[{i}] at sample {change.sample}: "):
+                settings = self.pot_settings(plant, change.set)
+                computer.dials_for(**settings)  # refuses here what play() would, so that the change can be named
+            changes.append(PotTurn(change.sample, settings, change.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
 
     def courses(self, scenario: Scenario, seed: int, samples: int) -> Courses:

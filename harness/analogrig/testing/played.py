@@ -92,18 +92,18 @@ class Played:
         :param within: and not later than ``within`` times its information bound, rounded, plus one sample (for the
             sample of the bound itself); None: not later than the scenario's ``[expect]`` allows.
         """
-        if not self.verdict.tweaks:
+        if not self.verdict.changes:
             return Finding(holds=False, why="nothing has changed, so nothing could be detected")
         seeable = [
-            tweak
-            for tweak in self.verdict.tweaks
-            if (tweak.bound_n is not None or not tweak.is_bounded) and not tweak.unseen
+            change
+            for change in self.verdict.changes
+            if (change.bound_n is not None or not change.is_bounded) and not change.unseen
         ]
         if not seeable:
             return Finding(holds=False, why="no change could be seen: none carried enough information before the next")
-        wrong = [why for tweak in seeable if (why := _detection_failure(tweak, within))]
+        wrong = [why for change in seeable if (why := _detection_failure(change, within))]
         latencies = ", ".join(
-            f"{tweak.what} after {tweak.latency_text} (bound {bound_text(tweak)})" for tweak in seeable
+            f"{change.what} after {change.latency_text} (bound {bound_text(change)})" for change in seeable
         )
         return Finding(not wrong, "; ".join(wrong) or latencies)
 
@@ -124,12 +124,12 @@ class Played:
         """Finding: every parameter diagnosed as changed has changed. A missing diagnosis is allowed."""
         if DIAGNOSES in self.verdict.not_judged:
             return Finding(holds=False, why="not judged: no diagnoses of the program's parameters")
-        judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
-        said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
-        wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
+        judged = [change for change in self.verdict.changes if not change.unseen]
+        said = [(change, change.diagnosis) for change in judged if change.diagnosis is not None]
+        wrong = [f"{change.what} at {change.sample} was called {diagnosis.named}" for change, diagnosis in said
                  if not diagnosis.right]  # fmt: skip
         return Finding(
-            not wrong, "; ".join(wrong) or f"{len(said)} of {len(self.verdict.tweaks)} changes named, rightly"
+            not wrong, "; ".join(wrong) or f"{len(said)} of {len(self.verdict.changes)} changes named, rightly"
         )
 
     @_statement
@@ -214,29 +214,29 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[np.float64]:
 _UNKNOWN = "it depends on when the change came, which is not known better"
 
 
-def _detection_failure(tweak: ChangeVerdict, within: float | None) -> str:
+def _detection_failure(change: ChangeVerdict, within: float | None) -> str:
     """Reason why a detectable change was not detected in time under any hypothesis of its instant; empty if it was."""
-    reasons = [_failure_at_instant(each, within) for each in tweak.hypotheses]
+    reasons = [_failure_at_instant(each, within) for each in change.hypotheses]
     if all(reasons):
-        return _failure_at_instant(tweak, within)
-    low, high = tweak.between
-    return f"INCONCLUSIVE: {tweak.what} between {low} and {high}: {_UNKNOWN}" if any(reasons) else ""
+        return _failure_at_instant(change, within)
+    low, high = change.between
+    return f"INCONCLUSIVE: {change.what} between {low} and {high}: {_UNKNOWN}" if any(reasons) else ""
 
 
-def _failure_at_instant(tweak: ChangeVerdict, within: float | None) -> str:
+def _failure_at_instant(change: ChangeVerdict, within: float | None) -> str:
     """Reason why a change at a known instant was missed or late; empty if it was detected in time."""
-    if tweak.latency_n is None and not tweak.missed:
+    if change.latency_n is None and not change.missed:
         return ""
-    if tweak.latency_n is None:
-        return f"{tweak.what} at {tweak.sample} was missed (bound {bound_text(tweak)})"
-    if within is None or not tweak.is_bounded:
-        late, allowed = tweak.late, f"{tweak.deadline_n}"
+    if change.latency_n is None:
+        return f"{change.what} at {change.sample} was missed (bound {bound_text(change)})"
+    if within is None or not change.is_bounded:
+        late, allowed = change.late, f"{change.deadline_n}"
     else:
-        bound_n = tweak.bound_n or 0
+        bound_n = change.bound_n or 0
         limit_n = round(within * bound_n) + 1
-        late, allowed = tweak.latency_n > limit_n, f"{limit_n} ({within:g} x bound {bound_n} + 1)"
-    latency = number_of(tweak.latency_n or 0, "sample")
-    return f"{tweak.what} at {tweak.sample}: {latency}, allowed {allowed}" if late else ""
+        late, allowed = change.latency_n > limit_n, f"{limit_n} ({within:g} x bound {bound_n} + 1)"
+    latency = number_of(change.latency_n or 0, "sample")
+    return f"{change.what} at {change.sample}: {latency}, allowed {allowed}" if late else ""
 
 
 def rate_below(

@@ -324,21 +324,21 @@ def scenarios(
     """
     plant = draw(suspensions() if program is None else plants(program))
     excitation = draw(excitations(free=free)) if program is None else Scenario.of_program(program).excitation
-    tweaks: list[PotChange] = []
+    drawn: list[PotChange] = []
     sample, now, passed = FIRST_CHANGE_N, plant, [plant]
     for _ in range(draw(st.integers(min(1, most_changes), most_changes))):
         sample += draw(st.integers(0, 60))
-        tweak = draw(changes(now, sizes=sizes, at=st.just(sample), together=together, longest_ramp_n=longest_ramp_n))
-        tweaks.append(tweak)
-        now = now.changed(tweak.set)
+        change = draw(changes(now, sizes=sizes, at=st.just(sample), together=together, longest_ramp_n=longest_ramp_n))
+        drawn.append(change)
+        now = now.changed(change.set)
         passed.append(now)
-        sample += tweak.ramp_n + BETWEEN_CHANGES_N
+        sample += change.ramp_n + BETWEEN_CHANGES_N
     return Scenario(
-        samples=sample if tweaks else QUIET_N,
+        samples=sample if drawn else QUIET_N,
         excitation=_within_range(excitation, passed) if program is None else excitation,
         program=plant.program,
         set=plant.overrides,
-        tweaks=tuple(tweaks),
+        changes=tuple(drawn),
         expect=expect or Expectations(),
         name="drawn",
     )

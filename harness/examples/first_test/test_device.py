@@ -18,7 +18,7 @@ def test_a_scenario_of_our_own(hil_play):
         name="softer",
         samples=900,
         excitation=Excitation(shape="square", low_v=0.1, high_v=9.9, frequency_hz=200.0),
-        tweaks=(PotChange(sample=600, set={"K": 20000.0}),),
+        changes=(PotChange(sample=600, set={"K": 20000.0}),),
         expect=Expectations(missed=0, false_alarms=0),
     )
     assert hil_play(scenario, seed=1).passes()

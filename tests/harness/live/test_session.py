@@ -77,12 +77,12 @@ def test_recording_names_the_sample_of_every_turn(recorded: LiveSession) -> None
     run = Run.load(saved.run)
     assert run.samples == saved.samples == 32 * BLOCK_N - BLOCK_N
     scenario = Scenario.load(str(saved.scenario))
-    assert [(each.sample % BLOCK_N, each.set, each.ramp_n) for each in scenario.tweaks] == [
+    assert [(each.sample % BLOCK_N, each.set, each.ramp_n) for each in scenario.changes] == [
         (BLOCK_N - 1, {"K": 18000.0}, 0),
         (BLOCK_N - 1, {"B": 3453.0}, 100),
         (BLOCK_N - 1, {"M": 60.0}, 0),
     ]
-    assert [segment.start for segment in run.conditions.segments] == [0, *(each.sample for each in scenario.tweaks)]
+    assert [segment.start for segment in run.conditions.segments] == [0, *(each.sample for each in scenario.changes)]
 
 
 def test_scenario_of_a_recording_plays_the_same_codes_on_the_emulator(recorded: LiveSession, tmp_path: Path) -> None:
@@ -105,8 +105,8 @@ def test_replay_and_judge_find_the_alarms_that_were_seen_live(
         assert Run.load(tmp_path / command / "run.npz").alarm_index.tolist() == list(seen)
         live = [alarm for alarm in recorded.notes.alarms if alarm.what]
         first = {alarm.change: alarm for alarm in reversed(live)}
-        assert [(each["latency"], each["bound"]) for each in found["tweaks"]] == [
-            (first[each["sample"]].latency_n, first[each["sample"]].bound_n) for each in found["tweaks"]
+        assert [(each["latency"], each["bound"]) for each in found["changes"]] == [
+            (first[each["sample"]].latency_n, first[each["sample"]].bound_n) for each in found["changes"]
         ]
 
 
@@ -119,8 +119,8 @@ def test_alarm_of_any_program_has_the_latency_and_the_bound_of_its_recording(pro
     assert list(session.knobs) == list(scenario.program.parameters)
     assert not session.notes.estimates()  # these programs state none
     alarm = next(alarm for alarm in session.notes.alarms if alarm.what)
-    (tweak,) = judge(Run.load(session.saved[0].run)).tweaks
-    assert (alarm.what, alarm.latency_n, alarm.bound_n) == (name, tweak.latency_n, tweak.bound_n)
+    (change,) = judge(Run.load(session.saved[0].run)).changes
+    assert (alarm.what, alarm.latency_n, alarm.bound_n) == (name, change.latency_n, change.bound_n)
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_turn_that_the_rig_cannot_make_is_refused_and_the_rig_plays_on(tmp_path:
 
     class FixedPotsRig(RecordsRig):
         def perform(self, scenario: Scenario, seed: int) -> Performance:
-            if scenario.tweaks:
+            if scenario.changes:
                 raise ConfigurationError("the pots of this rig cannot be changed")
             return super().perform(scenario, seed)
 
@@ -521,7 +521,7 @@ def test_recording_ends_by_itself_at_its_limits(
     session = scripted_session(script, tmp_path, on_saved=saved.append)
     assert session.notices[0][1] == f"the recording has reached its limit of {text}"
     assert len(saved) == 1
-    recorded = {"MOST_RECORDED_N": saved[0].samples, "MAX_CHANGES": len(Scenario.load(str(saved[0].scenario)).tweaks)}
+    recorded = {"MOST_RECORDED_N": saved[0].samples, "MAX_CHANGES": len(Scenario.load(str(saved[0].scenario)).changes)}
     assert recorded[limit] == value
     assert not session.is_recording
     assert session.values["K"] == turns[-1][1].value

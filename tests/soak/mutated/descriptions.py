@@ -30,7 +30,7 @@ SCENARIO: dict[str, Any] = {
     },
     "program": "front",
     "set": {"M": 115.0, "B": 3021.0, "K": 24500.0},
-    "tweaks": [{"sample": 200, "set": {"K": 18000.0}, "ramp_n": 20}, {"sample": 250, "set": {"M": 60.0}}],
+    "changes": [{"sample": 200, "set": {"K": 18000.0}, "ramp_n": 20}, {"sample": 250, "set": {"M": 60.0}}],
     "expect": {
         "missed": 9,
         "false_alarms": 9,

@@ -40,7 +40,7 @@ class Stimulus:
         """Samples of the emulated computer, whose plant changes after the warm-up of most devices."""
         scenario = Scenario.load("healthy")
         changes = (PotChange(CHANGE_AT, {"M": 60.0, "K": 18_000.0}),)
-        scenario = dataclasses.replace(scenario, samples=SAMPLES_N, tweaks=changes)
+        scenario = dataclasses.replace(scenario, samples=SAMPLES_N, changes=changes)
         with open_rig("emulator") as rig:
             performance = rig.perform(scenario, seed)
             parts = [block.samples() for block in performance.blocks]

@@ -51,8 +51,8 @@ def play_properties(played: Played) -> Iterator[tuple[str, Any]]:
     yield "theta_hash", verdict.theta_hash
     yield "alarm_hash", verdict.alarm_hash
     yield "not_judged", ", ".join(verdict.not_judged)
-    yield "latency_n", " ".join(map(latency_property, verdict.tweaks))
-    yield "bound_n", " ".join(str(tweak.bound_n) for tweak in verdict.tweaks)
+    yield "latency_n", " ".join(map(latency_property, verdict.changes))
+    yield "bound_n", " ".join(str(change.bound_n) for change in verdict.changes)
     yield "false_alarms", len(verdict.false_alarms)
     yield "unarmed_alarms", len(verdict.unarmed_alarms)
     yield "armed_n", verdict.armed_n
@@ -63,11 +63,11 @@ def play_properties(played: Played) -> Iterator[tuple[str, Any]]:
         yield from dict(_identity_properties(conditions.identity)).items()
 
 
-def latency_property(tweak: ChangeVerdict) -> str:
+def latency_property(change: ChangeVerdict) -> str:
     """``4``, or ``1..9`` where the instant of the change is not known better; ``None`` without an alarm."""
-    if tweak.latencies_n is None or not tweak.alternatives:
-        return str(tweak.latency_n)
-    return "{}..{}".format(*tweak.latencies_n)
+    if change.latencies_n is None or not change.alternatives:
+        return str(change.latency_n)
+    return "{}..{}".format(*change.latencies_n)
 
 
 @functools.cache

@@ -81,11 +81,11 @@ _SHIFTED = dataclasses.replace(FREE, phase=0.133)
 def scenario_of(name: str, excitation: Excitation, samples: int = 640, **changed: float) -> Scenario:
     """Scenario of ``PLANT`` that changes at sample 420."""
     changes = (PotChange(420, changed),) if changed else ()
-    return Scenario(samples=samples, excitation=excitation, set=PLANT, tweaks=changes, name=name)
+    return Scenario(samples=samples, excitation=excitation, set=PLANT, changes=changes, name=name)
 
 
 SOFTER = scenario_of("softer", _SHIFTED, K=19_600.0)
-SOFTER_LATER = dataclasses.replace(SOFTER, samples=720, tweaks=(PotChange(640, {"K": 19_600.0}),))
+SOFTER_LATER = dataclasses.replace(SOFTER, samples=720, changes=(PotChange(640, {"K": 19_600.0}),))
 LOCKED = scenario_of("softer, one clock", SQUARE, K=19_600.0)
 HEALTHY = scenario_of("healthy", _SHIFTED, 420)
 FAULTY = scenario_of("healthy", _SHIFTED, 520)
@@ -97,7 +97,7 @@ DISPLACED_LATER = scenario_of("edges displaced later", dataclasses.replace(_SHIF
 RARE_EDGES = scenario_of("rare edges", dataclasses.replace(_SHIFTED, frequency_hz=40.0), 560)
 SUCCESSION = dataclasses.replace(
     scenario_of("small changes in close succession", _SHIFTED, 800),
-    tweaks=tuple(PotChange(200 + 100 * n, {"K": 24_500.0 if n % 2 else 23_700.0}) for n in range(6)),
+    changes=tuple(PotChange(200 + 100 * n, {"K": 24_500.0 if n % 2 else 23_700.0}) for n in range(6)),
 )
 
 CHANGES: Mapping[str, dict[str, float]] = {
@@ -407,7 +407,7 @@ def drawn(number: int) -> PlayedCase:
         for each in spoils:
             each(codes, missing)
 
-    scenario = Scenario(samples, excitation, set=plant, tweaks=tuple(changes), name=f"drawn {number}")
+    scenario = Scenario(samples, excitation, set=plant, changes=tuple(changes), name=f"drawn {number}")
     return PlayedCase(scenario, settings, spoil if spoils else None)
 
 

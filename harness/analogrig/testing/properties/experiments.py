@@ -223,10 +223,10 @@ def changes_are_noticed_soon_and_rightly_named(
         return Finding(holds=False, why=why, run=missed[0].run)
     ratio = _latency_over_bound(every)
     if ratio > latency:
-        slowest = max(every, key=lambda played: sum(tweak.latency_n or 0 for tweak in played.verdict.tweaks))
+        slowest = max(every, key=lambda played: sum(change.latency_n or 0 for change in played.verdict.changes))
         why = f"mean latency is {ratio:.2f} times the mean bound in {len(every)} plays, allowed {latency:g}"
         return Finding(holds=False, why=why, run=slowest.run)
-    diagnoses = [tweak.diagnosis for each in every for tweak in each.verdict.tweaks if tweak.diagnosis is not None]
+    diagnoses = [change.diagnosis for each in every for change in each.verdict.changes if change.diagnosis is not None]
     wrong_n = sum(not diagnosis.right for diagnosis in diagnoses)
     if diagnoses and lower_rate(wrong_n, len(diagnoses), confidence) > 1.0 - right:
         first = _first_wrong_diagnosis(every)
@@ -236,9 +236,9 @@ def changes_are_noticed_soon_and_rightly_named(
 
 
 def _latency_over_bound(plays: Sequence[Played]) -> float:
-    tweaks = [tweak for played in plays for tweak in played.verdict.tweaks if tweak.bound_n is not None]
-    bounds_n = sum(tweak.bound_n or 0 for tweak in tweaks)
-    return sum(tweak.latency_n or 0 for tweak in tweaks) / bounds_n if bounds_n else math.inf
+    changes = [change for played in plays for change in played.verdict.changes if change.bound_n is not None]
+    bounds_n = sum(change.bound_n or 0 for change in changes)
+    return sum(change.latency_n or 0 for change in changes) / bounds_n if bounds_n else math.inf
 
 
 def _first_wrong_diagnosis(plays: Sequence[Played]) -> Finding:
@@ -266,7 +266,7 @@ def single_changes_are_rightly_named(
     every: list[Played] = []
     for number in range(most_plays):
         played = _play_valid(play, scenario, seed + number)
-        right = [tweak.diagnosis.right for tweak in played.verdict.tweaks if tweak.diagnosis is not None]
+        right = [change.diagnosis.right for change in played.verdict.changes if change.diagnosis is not None]
         every.append(played)
         test.add(len(right), right.count(False))
         if test.decision is not Decision.OPEN or (number + 1 >= silent and not test.trials):

@@ -25,19 +25,19 @@ def computes(play: Play, case: str) -> Finding:
     return computes_what_it_describes(play, case_of(case).scenario, SEED, case=case)
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 @pytest.mark.parametrize("case", CASES)
 def test_device_computes_what_it_describes(hil_play: Play, case: str) -> None:
     assert computes(hil_play, case)
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 @pytest.mark.parametrize("number", range(DRAWN_N))
 def test_drawn_cases_are_computed_as_described(hil_play: Play, number: int) -> None:
     assert computes(hil_play, str(number))
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 @pytest.mark.parametrize("disturbance", MISFITS)
 def test_device_states_misfits_as_described(hil_play: Play, disturbance: str) -> None:
     assert computes(hil_play, disturbance)
@@ -66,18 +66,18 @@ LONG = dataclasses.replace(
     SHORT,
     name="claimed-beyond-2-16",
     samples=WRAP_N + 1200,
-    tweaks=(PotChange(WRAP_N - 400, {"K": 20_000.0}), PotChange(WRAP_N + 300, {"K": 24_500.0})),
+    changes=(PotChange(WRAP_N - 400, {"K": 20_000.0}), PotChange(WRAP_N + 300, {"K": 24_500.0})),
 )
 """The plant changes before and after the counters wrap."""
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 @pytest.mark.parametrize("gaps", [False, True], ids=["whole", "with gaps"])
 def test_answers_are_those_of_the_bundled_library(hil_play: Play, *, gaps: bool) -> None:
     assert answers_as_claimed(hil_play, SHORT, CLAIM_SEED, plays=PLAYS_N, gaps=gaps)
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 def test_answers_beyond_65536_samples_are_those_of_the_bundled_library(hil_play: Play) -> None:
     assert answers_as_claimed(hil_play, LONG, CLAIM_SEED, plays=1)
 
@@ -88,7 +88,7 @@ ENDS_N = 15
 """One more than the samples of a block."""
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 @pytest.mark.parametrize("option", OPTIONS)
 def test_option_has_its_effect_and_loses_it(hil_play: Play, option: str) -> None:
     assert option_comes_and_goes(hil_play, OPTIONS[option].case.scenario, SEED, option=option)

@@ -58,13 +58,13 @@ SINGLY = Scenario(
     samples=FIRST_CHANGE_N + _EACH_N * len(_SETTINGS),
     excitation=Excitation(low_v=0.1, high_v=9.0),
     random_phase=True,
-    tweaks=tuple(PotChange(FIRST_CHANGE_N + _EACH_N * i, setting) for i, setting in enumerate(_SETTINGS)),
+    changes=tuple(PotChange(FIRST_CHANGE_N + _EACH_N * i, setting) for i, setting in enumerate(_SETTINGS)),
     name="singly",
     description="front suspension: one parameter at a time, by 20 % and back; K does not rise, for want of pot",
 )
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 @profile()
 @given(scenario=scenarios(expect=PATIENT), seed=seeds())
 def test_every_change_that_can_be_seen_is_found_once(
@@ -86,7 +86,7 @@ def test_a_plant_that_does_not_change_raises_no_alarm(
     assert with_some_seed(hil_play, scenario, seed, Played.stays_quiet)
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 def test_changes_are_noticed_soon_and_rightly_named(hil_play: Play) -> None:
     assert changes_are_noticed_soon_and_rightly_named(
         hil_play,
@@ -101,7 +101,7 @@ def test_changes_are_noticed_soon_and_rightly_named(hil_play: Play) -> None:
     )
 
 
-@pytest.mark.hil_needs("tweak", "excite")
+@pytest.mark.hil_needs("change", "excite")
 def test_a_single_change_is_rightly_named(hil_play: Play) -> None:
     needs_reported(hil_play, DIAGNOSES)
     assert single_changes_are_rightly_named(
