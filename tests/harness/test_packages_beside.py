@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,14 +15,21 @@ CORE = "analogrig"
 BESIDE = sorted(folder.name for folder in HARNESS.glob("analogrig_*") if folder.is_dir())
 
 
-def imports(package: str) -> Iterator[tuple[str, str, str]]:
+@functools.cache
+def imports(package: str) -> list[tuple[str, str, str]]:
     """File, module and name of every import of a package; the name is empty for ``import module``."""
+    return list(_imports(package))
+
+
+def _imports(package: str) -> Iterator[tuple[str, str, str]]:
     for path in sorted((HARNESS / package).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            where = f"{path.relative_to(HARNESS)}:{getattr(node, 'lineno', 0)}"
+            if not isinstance(node, ast.Import | ast.ImportFrom):
+                continue
+            where = f"{path.relative_to(HARNESS)}:{node.lineno}"
             if isinstance(node, ast.Import):
                 yield from ((where, alias.name, "") for alias in node.names)
-            elif isinstance(node, ast.ImportFrom):
+            else:
                 assert node.level == 0, where
                 yield from ((where, str(node.module), alias.name) for alias in node.names)
 
