@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from analogrig.run import Conditions, Run
     from analogrig.scenario import Expectations, PotChange, Scenario
     from analogrig.testing import strategies
-    from analogrig.testing.played import Played, rate_below
+    from analogrig.testing.one_play import Played, rate_below
     from analogrig.testing.statement import Finding, Play, with_some_seed
     from analogrig_emulator import EmulatorError, Excitation
 
@@ -87,7 +87,7 @@ else:
         "analogrig.rigs.rig": "Rig",
         "analogrig.run": "Conditions Run",
         "analogrig.scenario": "Expectations Scenario PotChange",
-        "analogrig.testing.played": "Played rate_below",
+        "analogrig.testing.one_play": "Played rate_below",
         "analogrig.testing.statement": "Finding Play with_some_seed",
         "analogrig_emulator": "EmulatorError Excitation",
     }

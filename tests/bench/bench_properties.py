@@ -23,7 +23,7 @@ from analogrig.judging.statistics import upper_rate
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig.testing.properties.experiments import is_playable
 from analogrig.testing.properties.test_detection import (
     DOUBTFUL_LATENCY,

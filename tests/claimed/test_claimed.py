@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.claims.comparison import ClaimCheck, claimed_estimator, compare_with_library
+from analogrig.claims.claim_check import ClaimCheck, claimed_estimator, compare_with_library
 from analogrig.claims.feed import Feed, Library
 from analogrig.devices.device import Device
 from analogrig.rigs.description import open_rig

@@ -16,7 +16,7 @@ from analogrig.judging.verdict import as_json, judge
 from analogrig.plant import Plant
 from analogrig.run import UNARMED, Run
 from analogrig.scenario import Expectations
-from analogrig.testing.played import Played, rate_below
+from analogrig.testing.one_play import Played, rate_below
 from analogrig.testing.plugin.junit import play_properties
 from tests.harness.runs import made_run
 

@@ -11,7 +11,7 @@ from analogrig.judging.verdict import CHANNEL_FAULTS, DIAGNOSABLE, FAULT_CURES, 
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
 from analogrig.run import Run
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig.testing.plugin.junit import play_properties
 from tests.harness.runs import made_run
 

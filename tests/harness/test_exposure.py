@@ -17,7 +17,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import LOST, Run
 from analogrig.scenario import Scenario
-from analogrig.testing.played import Played, rate_below
+from analogrig.testing.one_play import Played, rate_below
 from analogrig_emulator import CHANNELS
 from tests.harness.runs import ESTIMATOR, made_run
 

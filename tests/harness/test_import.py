@@ -29,7 +29,7 @@ from analogrig.reporting.measured import mode_of
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig_emulator import CHANNELS, parse_unit
 from analogrig_imports import column_reader, columns, text_columns
 from analogrig_imports.column_names import ColumnError, unit_in_name

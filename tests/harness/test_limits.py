@@ -18,7 +18,7 @@ from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import Verdict, judge
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import PotChange, Scenario
-from analogrig.testing.played import Played, rate_below
+from analogrig.testing.one_play import Played, rate_below
 from analogrig.testing.statement import with_some_seed
 from tests.harness.plants import front
 from tests.harness.runs import made_run

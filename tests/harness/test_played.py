@@ -9,7 +9,7 @@ import pytest
 
 from analogrig.catalogue import Cause
 from analogrig.judging.verdict import CURES
-from analogrig.testing.played import Played, rate_below
+from analogrig.testing.one_play import Played, rate_below
 from tests.harness.runs import ESTIMATOR, made_run
 
 from .plants import front

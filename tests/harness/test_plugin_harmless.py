@@ -211,7 +211,7 @@ def test_start_loads_only_the_modules_of_the_plugin() -> None:
 
 def test_every_name_of_the_plugin_carries_its_prefix() -> None:
     from analogrig.testing import plugin
-    from analogrig.testing.plugin.settings import OPTIONS
+    from analogrig.testing.plugin.hil_options import OPTIONS
 
     fixtures = {
         name for name, value in vars(plugin).items() if type(value).__name__ == "FixtureFunctionDefinition"

@@ -222,7 +222,7 @@ def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) ->
     )
     result = run(user, "-rs")
     result.assert_outcomes(passed=1, skipped=1)
-    result.stdout.fnmatch_lines(["*rig recording:*run.npz cannot excite and change (it can nothing but play)*"])
+    result.stdout.fnmatch_lines(["*rig recording:*run.npz cannot change and excite (it can nothing but play)*"])
 
 
 def recorded(folder: Path) -> Path:

@@ -16,7 +16,7 @@ from analogrig.reporting import summary
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 
 SEED = 7
 

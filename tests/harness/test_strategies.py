@@ -24,7 +24,7 @@ from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.scenario import PotChange, Scenario
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig.testing.strategies import (
     BETWEEN_CHANGES_N,
     DAMPING_RATIO,

@@ -18,7 +18,7 @@ from analogrig.plant import Segment
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
 from analogrig.run import Run
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig.testing.plugin.junit import latency_property
 from tests.harness.runs import made_run
 

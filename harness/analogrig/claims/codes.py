@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.claims.feed import Feed
-from analogrig.claims.inputs import Mask, Suspect, following, on, previous, previous_or_zero, treat_as_missing
+from analogrig.claims.sample_faults import Mask, Suspect, following, on, previous, previous_or_zero, treat_as_missing
 from analogrig.run import Channel
 
 Codes = NDArray[np.float32]

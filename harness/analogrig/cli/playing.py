@@ -161,7 +161,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _compare(arguments: argparse.Namespace) -> int:
     """Compare the recorded answers, or those of a new play, with the bundled library. Nothing is written."""
     from analogrig.bench import Bench, raise_if_interrupted
-    from analogrig.claims.comparison import compare_with_library
+    from analogrig.claims.claim_check import compare_with_library
     from analogrig.devices.registry import open_dut
     from analogrig.rigs.recording import RecordingRig
 

@@ -1,6 +1,6 @@
 """Statements: assertions about plays, with names and limits, so that the file of a counterexample can repeat them.
 
-A statement about one play is a method of ``analogrig.testing.played.Played``. An experiment makes as many plays of a
+A statement about one play is a method of ``analogrig.testing.one_play.Played``. An experiment makes as many plays of a
 scenario as it takes. Both return a Finding. A statement in a file is judged by the function that found it violated.
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from analogrig.devices.device import Device
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run
-    from analogrig.testing.played import Played
+    from analogrig.testing.one_play import Played
 
 Arguments = ParamSpec("Arguments")
 

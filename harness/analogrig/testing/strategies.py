@@ -22,7 +22,7 @@ from analogrig.plant import Plant
 from analogrig.program import Program
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
 from analogrig.scenario import DEFAULT_PROGRAM, Expectations, PotChange, Scenario
-from analogrig.testing.plugin.settings import EXAMPLES, current_profile
+from analogrig.testing.plugin.hil_options import EXAMPLES, current_profile
 from analogrig_emulator import Excitation, ProgramParameter
 
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}

@@ -135,7 +135,7 @@ def _left_after_rounds(order: Mapping[str, Any], tell: Any) -> list[str]:
 
 def _play(order: Mapping[str, Any], tell: Any) -> None:
     from analogrig.devices.registry import recorded
-    from analogrig.testing.conformance.records import Stimulus, play
+    from analogrig.testing.conformance.stimulus import Stimulus, play
 
     tell(step="connecting")
     with recorded(order["device"]).connect() as device:

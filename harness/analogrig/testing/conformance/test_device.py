@@ -21,9 +21,9 @@ from analogrig.devices.registry import recorded, trusted
 from analogrig.errors import AnalogrigError, ConfigurationError, DeviceRefused, TimeLimitReached
 from analogrig.run import LOST, UNARMED
 from analogrig.testing.conformance.alone import Alone, play_alone
-from analogrig.testing.conformance.records import SAMPLES_N, Answered, Stimulus, begin, finish, play, settle
+from analogrig.testing.conformance.stimulus import SAMPLES_N, Answered, Stimulus, begin, finish, play, settle
 from analogrig.testing.plugin.devices import DEVICES
-from analogrig.testing.plugin.settings import DUT, time_limit_s, trust_of
+from analogrig.testing.plugin.hil_options import DUT, time_limit_s, trust_of
 
 LIMIT_S = 60.0
 """Longest time of one play, by default."""

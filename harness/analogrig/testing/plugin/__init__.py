@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from analogrig.rigs import CAPABILITIES
-from analogrig.testing.plugin import devices, junit, player, scenarios, settings
-from analogrig.testing.plugin.settings import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
+from analogrig.testing.plugin import devices, hil_options, junit, player, scenarios
+from analogrig.testing.plugin.hil_options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    settings.add_options(parser)
+    hil_options.add_options(parser)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
-    settings.check_allow(early_config, early_config.known_args_namespace.hil_allow)
+    hil_options.check_allow(early_config, early_config.known_args_namespace.hil_allow)
 
 
 _PROFILE = pytest.StashKey[Callable[[], str]]()
@@ -46,11 +46,11 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", f"hil_needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
     )
-    settings.check_command_line(config)
+    hil_options.check_command_line(config)
     junit.begin(config)
     profile: Callable[[], str] = functools.partial(_collection_profile, config)
     config.stash[_PROFILE] = profile
-    settings.begin_profile(profile)
+    hil_options.begin_profile(profile)
     config.stash[devices.DEVICES] = devices.Devices()
     devices.assign_owner(config)
     scenarios.add_folder(config)
@@ -60,7 +60,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
     if (open_devices := config.stash.get(devices.DEVICES, None)) is not None:
         open_devices.close()
     if (profile := config.stash.get(_PROFILE, None)) is not None:
-        settings.end_profile(profile)
+        hil_options.end_profile(profile)
 
 
 def _collection_profile(config: pytest.Config) -> str:
@@ -122,7 +122,7 @@ def hil_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     devices.check_owner(request.node)
     setting = RIG.of_fixture(request)
     with player.in_one_line(setting.by):
-        rig = open_rig(setting.value, allow=settings.trust_of(request.config))
+        rig = open_rig(setting.value, allow=hil_options.trust_of(request.config))
     with rig:
         _skip_unless_able(request.node, rig, setting.value)
         yield rig
@@ -142,7 +142,7 @@ def hil_dut(request: pytest.FixtureRequest) -> Device:
     devices.check_owner(request.node)
     setting = DUT.of_fixture(request)
     with player.in_one_line(setting.by):
-        return request.config.stash[devices.DEVICES].lease(setting.value, settings.trust_of(request.config))
+        return request.config.stash[devices.DEVICES].lease(setting.value, hil_options.trust_of(request.config))
 
 
 @pytest.fixture

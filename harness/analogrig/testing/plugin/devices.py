@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from analogrig.testing.plugin.settings import DUT, RIG
+from analogrig.testing.plugin.hil_options import DUT, RIG
 
 if TYPE_CHECKING:
     from analogrig.devices.device import Device

@@ -14,7 +14,7 @@ import pytest
 if TYPE_CHECKING:
     from analogrig.identity import DeviceFile, Identity
     from analogrig.judging.verdict import ChangeVerdict
-    from analogrig.testing.played import Played
+    from analogrig.testing.one_play import Played
 
 _STARTED = pytest.StashKey[str]()
 

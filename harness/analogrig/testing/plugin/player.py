@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from analogrig.testing.plugin import junit
-from analogrig.testing.plugin.settings import DUT, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
+from analogrig.testing.plugin.hil_options import DUT, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
     from analogrig.scenario import Scenario
     from analogrig.testing.counterexample import Counterexample
-    from analogrig.testing.played import Played
+    from analogrig.testing.one_play import Played
     from analogrig.testing.statement import Finding
 
 
@@ -115,7 +115,7 @@ class Player:
         from analogrig.errors import AnalogrigError
         from analogrig.scenario import DEFAULT_SEED, Scenario
         from analogrig.testing.counterexample import command_of
-        from analogrig.testing.played import Played
+        from analogrig.testing.one_play import Played
 
         with in_one_line():
             recorded, recorded_seed = self.bench.rig.recorded or (None, None)

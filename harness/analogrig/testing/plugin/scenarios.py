@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from analogrig.testing.plugin.devices import DEVICES, check_owner
+from analogrig.testing.plugin.hil_options import DUT, RIG, SCENARIO_DIR, Option, time_limit_s, trust_of
 from analogrig.testing.plugin.player import Player
-from analogrig.testing.plugin.settings import DUT, RIG, SCENARIO_DIR, Option, time_limit_s, trust_of
 
 if TYPE_CHECKING:
     from analogrig.testing.statement import Finding
@@ -127,7 +127,7 @@ class ScenarioItem(pytest.Item):
             pytest.fail(f"{self.path}: {finding.why}", pytrace=False)
 
     def _judge(self) -> Finding:
-        import analogrig.testing.played
+        import analogrig.testing.one_play
         import analogrig.testing.properties.claimed
         import analogrig.testing.properties.conversed
         import analogrig.testing.properties.experiments  # noqa: F401 - each registers what a file can state

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from analogrig.claims.comparison import ClaimCheck, compare_with_library
+from analogrig.claims.claim_check import ClaimCheck, compare_with_library
 from analogrig.devices.catalogue_device import has_our_estimator
 from analogrig.devices.device import Device
 from analogrig.errors import ConfigurationError, DeviceRefused

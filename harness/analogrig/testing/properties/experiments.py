@@ -32,7 +32,7 @@ from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
-from analogrig.testing.played import Played, rate_below
+from analogrig.testing.one_play import Played, rate_below
 from analogrig.testing.statement import Finding, Inconclusive, Play, experiment
 
 LONGEST_TIMEOUT_S = 1.0
@@ -104,7 +104,7 @@ def rate_of_plays_below(
     *,
     or_misfit: bool = False,
 ) -> Finding:
-    """Finding of ``analogrig.testing.played.rate_below`` for a given number of plays."""
+    """Finding of ``analogrig.testing.one_play.rate_below`` for a given number of plays."""
     played = _play_all(play, scenario, seed, plays)
     return rate_below(rate, played, confidence=confidence, burst=burst, or_misfit=or_misfit)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from analogrig.judging.bursts import Design
 from analogrig.scenario import Scenario
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig.testing.properties.experiments import (
     device_with_faults,
     false_alarms_at_most,

@@ -14,8 +14,8 @@ from analogrig.scenario import PotChange, Scenario
 from analogrig.testing.properties.cases import CASES, DRAWN_N, HEALTHY, MISFITS, case_of
 from analogrig.testing.properties.claimed import answers_as_claimed, computes_what_it_describes
 from analogrig.testing.properties.conversed import PORTS, converses_as_catalogued
-from analogrig.testing.properties.options import OPTIONS, option_comes_and_goes, record_may_end_anywhere
 from analogrig.testing.properties.scripts import SCRIPTS, is_for
+from analogrig.testing.properties.switches import OPTIONS, option_comes_and_goes, record_may_end_anywhere
 from analogrig.testing.statement import Finding, Play
 
 SEED = 1

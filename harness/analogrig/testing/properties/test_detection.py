@@ -16,7 +16,7 @@ from analogrig.judging.information import detectable
 from analogrig.judging.verdict import DIAGNOSES
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Expectations, PotChange, Scenario
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig.testing.properties.experiments import (
     changes_are_noticed_soon_and_rightly_named,
     is_playable,

@@ -9,7 +9,7 @@ from analogrig.judging.verdict import ESTIMATES
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Expectations, Scenario
-from analogrig.testing.played import Played
+from analogrig.testing.one_play import Played
 from analogrig.testing.properties.experiments import (
     alarms_keep_hold_off_and_warm_up,
     answers_with_numbers,

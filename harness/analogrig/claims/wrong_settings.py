@@ -12,7 +12,7 @@ import numpy as np
 
 from analogrig.claims.answered import DeviceAnswers
 from analogrig.claims.feed import Feed, Library, library_of
-from analogrig.claims.inputs import Suspect
+from analogrig.claims.sample_faults import Suspect
 from analogrig.estimator_config import EstimatorConfig
 
 _VALUES: Mapping[str, Sequence[Any]] = {

@@ -20,9 +20,9 @@ from analogrig.claims.answered import ULP, DeviceAnswers
 from analogrig.claims.codes import code_hypotheses, unit_hypotheses
 from analogrig.claims.events import Edit, find_events
 from analogrig.claims.feed import INNOVATION, Feed, Library, Matrix, library_of
-from analogrig.claims.inputs import Suspect, input_hypotheses
 from analogrig.claims.outputs import explain_outputs
-from analogrig.claims.settings import fitted, setting_hypotheses
+from analogrig.claims.sample_faults import Suspect, input_hypotheses
+from analogrig.claims.wrong_settings import fitted, setting_hypotheses
 from analogrig.devices.catalogue_device import has_our_estimator
 from analogrig.devices.estimator import REPORTED
 from analogrig.devices.inproc import InprocDevice
