@@ -24,8 +24,8 @@ from analogrig.rigs.emulator import CardDescription, ComputerDescription, Measur
 from analogrig.scenario import Scenario
 from analogrig_emulator.machine.compiler import load_patch
 from analogrig_imports.imported import ImportDescription
+from analogrig_instruments.rig_wiring import RealDescription
 from analogrig_instruments.simulator.served import ServedDescription
-from analogrig_instruments.wiring import RealDescription
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "harness" / "docs"

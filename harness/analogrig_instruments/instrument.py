@@ -2,7 +2,8 @@
 
 A driver is a subclass of ``Instrument`` and an entry point of ``analogrig.instruments``, named like the scheme of its
 URLs. tests/harness/test_instruments.py tests all drivers.
-Volts are those at the instrument's connectors. ``analogrig_instruments.wiring`` describes the stages to the computer.
+Volts are those at the instrument's connectors. ``analogrig_instruments.rig_wiring`` describes the stages to the
+computer.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from analogrig_instruments.lock import lock_instrument
 from analogrig_instruments.self_test import self_test
 
 if TYPE_CHECKING:
-    from analogrig_instruments.wiring import RealDescription
+    from analogrig_instruments.rig_wiring import RealDescription
 
 SELF_TEST_SEED = 0
 

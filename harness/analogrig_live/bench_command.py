@@ -23,7 +23,7 @@ from analogrig.cli import (
 
 if TYPE_CHECKING:
     from analogrig import Device
-    from analogrig_live.session import LiveSession, Saved
+    from analogrig_live.live_session import LiveSession, Saved
 
 TOKEN_VARIABLE = "ANALOGRIG_BENCH_TOKEN"  # noqa: S105 - the name of a variable
 """Environment variable with the token of the address; by default a random one."""
@@ -79,7 +79,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     from analogrig import ConfigurationError
     from analogrig.identity import Identity
-    from analogrig_live.session import LiveSession
+    from analogrig_live.live_session import LiveSession
 
     if arguments.real_time is not None:
         raise ConfigurationError("--real-time: the page sets the time factor")
@@ -130,7 +130,7 @@ async def _serve(session: LiveSession, arguments: argparse.Namespace) -> int:
     import webbrowser
 
     from analogrig.signals import signal_future
-    from analogrig_live.server import BenchServer
+    from analogrig_live.bench_server import BenchServer
 
     ended = signal_future()
     server = BenchServer(session, token=os.environ.get(TOKEN_VARIABLE, ""), origins=arguments.origin)

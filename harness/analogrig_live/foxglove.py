@@ -27,7 +27,7 @@ from analogrig_live.scope import read_signal, signals_of
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
-    from analogrig_live.session import LiveSession
+    from analogrig_live.live_session import LiveSession
 
 SUBPROTOCOL = "foxglove.websocket.v1"
 

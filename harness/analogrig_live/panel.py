@@ -12,6 +12,7 @@ from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
 from analogrig_emulator.machine.patching import patches
 from analogrig_live.commands import Mode
 from analogrig_live.faults import LINE_LABELS
+from analogrig_live.live_session import LiveSession, Saved
 from analogrig_live.scope import (
     LEAST_COLUMNS,
     LEAST_WINDOW_N,
@@ -20,7 +21,6 @@ from analogrig_live.scope import (
     MOST_WINDOW_N,
     signals_of,
 )
-from analogrig_live.session import LiveSession, Saved
 
 
 def bench_table(session: LiveSession) -> dict[str, Any]:

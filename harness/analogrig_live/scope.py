@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.config import check_range
+from analogrig_live.live_session import LiveSession
 from analogrig_live.ring import RING_N
-from analogrig_live.session import LiveSession
 
 MOST_SIGNALS = 16
 LEAST_WINDOW_N, MOST_WINDOW_N = 16, RING_N // 2

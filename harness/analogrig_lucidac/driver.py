@@ -34,8 +34,8 @@ from analogrig_instruments import (
     tcp_place,
 )
 from analogrig_lucidac.connection import LucidacConnection
+from analogrig_lucidac.linear_patch import LinearPatch, coefficients_of, module_of
 from analogrig_lucidac.messages import PORT
-from analogrig_lucidac.patching import LinearPatch, coefficients_of, module_of
 
 if TYPE_CHECKING:
     from analogrig_instruments import TcpServer

@@ -27,7 +27,7 @@ from analogrig.devices.registry import KINDS
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.emulator import EmulatorDescription
 from analogrig.scenario import Scenario
-from analogrig_instruments.wiring import RealDescription
+from analogrig_instruments.rig_wiring import RealDescription
 
 ROOT = Path(__file__).parents[2]
 CATALOGUE = ROOT / "estimator_c" / "catalogue" / "analogrig.dbc"

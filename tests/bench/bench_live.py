@@ -35,7 +35,7 @@ from websockets.exceptions import WebSocketException
 from analogrig.run import Run
 from analogrig_live.commands import Tempo, Turn
 from analogrig_live.foxglove import SUBPROTOCOL
-from analogrig_live.session import LiveSession
+from analogrig_live.live_session import LiveSession
 from tests import tools
 from tests.harness.live.benches import Action, scripted_session
 from tests.harness.processes import descendants, marked

@@ -22,7 +22,7 @@ from analogrig.run import Run
 from analogrig_emulator import CHANNELS, PatchedProgram, load_patch
 from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.program_file import parse_program
-from analogrig_instruments.calibration.recorded import RecordedPlant, fit_program
+from analogrig_instruments.calibration.recorded_plant import RecordedPlant, fit_program
 
 from .figure import Figure
 from .silverbox import GROWTH_END, RATE_HZ, find_file, import_record

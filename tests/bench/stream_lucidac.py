@@ -11,7 +11,7 @@ import time
 
 from analogrig_emulator.lucidac.configuration import Configuration, Integrator, LucidacLane
 from analogrig_lucidac.connection import LucidacConnection
-from analogrig_lucidac.patching import module_of
+from analogrig_lucidac.linear_patch import module_of
 from analogrig_lucidac.served_machine import MAC
 from tests.served.serving import serving
 

@@ -17,7 +17,7 @@ from analogrig.config import fixtures
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import Excitation, Multiplier, RecordedExcitation, SuspensionComputer, load_patch
-from analogrig_instruments.calibration.recorded import SETTLING_N, RecordedPlant, _determined
+from analogrig_instruments.calibration.recorded_plant import SETTLING_N, RecordedPlant, _determined
 
 RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0, "rc-battery": 1.0}
 SAMPLES = 2000

@@ -17,9 +17,9 @@ from analogrig_instruments.instrument import DRIVERS, DialChange, InputRecord, I
 from analogrig_instruments.ni_daqmx import NiDaqmx
 from analogrig_instruments.red_pitaya import RedPitaya
 from analogrig_instruments.scpi_connection import ScpiConnection
+from analogrig_instruments.simulator.acquisition_buffer import AcquisitionFaults
+from analogrig_instruments.simulator.analogue_inputs import InputFaults
 from analogrig_instruments.simulator.computer import Amplifier, Booster, Wiring
-from analogrig_instruments.simulator.inputs import InputFaults
-from analogrig_instruments.simulator.records import AcquisitionFaults
 from analogrig_instruments.simulator.scpi import Interpreter
 from analogrig_instruments.simulator.served import InstrumentDescription, ServedRedPitaya
 from tests.harness.ni_stand_in import Card, library

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser
 from analogrig.config import locate
 from analogrig.judging.verdict import judge
 from analogrig.output import REPORT_FILE, OutputFolder
-from analogrig.reporting import effects, write_report
+from analogrig.reporting import effects_page, write_report
 from analogrig.reporting.campaign_page import write_page
 from analogrig.reporting.session import find_session, write_session
 from analogrig_emulator.effects import Effect
@@ -57,7 +57,7 @@ def campaign_with_drawn_values(path: Path) -> None:
 
 def effects_picture(path: Path) -> None:
     table = {name: [Effect("offset <of all>", 3.0, 4.0, 5), Effect("noise", 0.02, 0.03, 5)] for name in ("a", "b")}
-    effects.write_picture(table, path.with_suffix(".svg"))
+    effects_page.write_picture(table, path.with_suffix(".svg"))
     embed(path)
 
 

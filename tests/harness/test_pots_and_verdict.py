@@ -23,7 +23,7 @@ from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
 from analogrig_instruments.instrument import InputRecord, Instrument
 from analogrig_instruments.ni_daqmx import NiDaqmx
 from analogrig_instruments.real import RealRig
-from analogrig_instruments.wiring import RealDescription
+from analogrig_instruments.rig_wiring import RealDescription
 from tests.harness.allowed import open_allowed
 from tests.served.serving import serving
 

@@ -30,7 +30,7 @@ from analogrig_emulator import Excitation
 from analogrig_instruments.instrument import DialChange, PotBox
 from analogrig_instruments.real import LEAD_N, RealRig, split_records
 from analogrig_instruments.red_pitaya import RedPitaya
-from analogrig_instruments.wiring import RealDescription
+from analogrig_instruments.rig_wiring import RealDescription
 from tests.harness.allowed import open_allowed
 from tests.harness.processes import LONG_S
 from tests.served.serving import RIG, ROOT, Served, serving, serving_in_thread

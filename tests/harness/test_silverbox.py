@@ -15,7 +15,7 @@ from analogrig.judging.verdict import judge
 from analogrig.reporting.measured import mode_of
 from analogrig.rigs.emulator import ComputerDescription
 from analogrig_emulator import load_patch
-from analogrig_instruments.calibration.recorded import RecordedPlant, fit_program
+from analogrig_instruments.calibration.recorded_plant import RecordedPlant, fit_program
 from tests.bench import bench_silverbox, silverbox
 
 EXAMPLES = Path(__file__).parents[2] / "harness" / "examples"

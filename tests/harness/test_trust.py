@@ -46,7 +46,7 @@ from analogrig.testing.counterexample import Counterexample
 from analogrig.trust import FiledName, Thing, Trust, resolve_name
 from analogrig_instruments.instrument import DRIVERS
 from analogrig_instruments.pots import InstrumentPots, PotsDescription
-from analogrig_instruments.wiring import Input, RealDescription
+from analogrig_instruments.rig_wiring import Input, RealDescription
 from tests.served.serving import serving
 
 pytestmark = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io:pytest.PytestUnraisableExceptionWarning")

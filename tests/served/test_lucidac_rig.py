@@ -31,13 +31,13 @@ from analogrig_instruments.calibration.averages import record, scenarios
 from analogrig_instruments.calibration.fit import calibrate
 from analogrig_instruments.instrument import DialChange
 from analogrig_instruments.real import RealRig
+from analogrig_instruments.rig_wiring import RealDescription
 from analogrig_instruments.self_test import self_test
-from analogrig_instruments.wiring import RealDescription
 from analogrig_lucidac import connection as lucidac_connection
 from analogrig_lucidac.connection import LucidacConnection
 from analogrig_lucidac.driver import LucidacInstrument
+from analogrig_lucidac.linear_patch import LinearPatch
 from analogrig_lucidac.messages import FrameReader, frame, protocol
-from analogrig_lucidac.patching import LinearPatch
 from analogrig_lucidac.served_machine import specimen
 from tests.served.serving import Served, serving
 

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig_emulator import Excitation, PotTurn, SuspensionComputer
+from analogrig_instruments.simulator.acquisition_buffer import BUFFER_N, MIDDLE_N, AcquisitionFaults
+from analogrig_instruments.simulator.analogue_inputs import InputFaults
 from analogrig_instruments.simulator.computer import Amplifier, Booster, Wiring
-from analogrig_instruments.simulator.inputs import InputFaults
-from analogrig_instruments.simulator.records import BUFFER_N, MIDDLE_N, AcquisitionFaults
 from analogrig_instruments.simulator.scpi import DropOut, Interpreter
 from analogrig_instruments.simulator.served import MOST_SCHEDULED, InstrumentDescription, ServedRedPitaya
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from analogrig_instruments.simulator.records import AcquisitionFaults
+from analogrig_instruments.simulator.acquisition_buffer import AcquisitionFaults
 from analogrig_instruments.simulator.scpi import Call, Command, Response
 from analogrig_instruments.simulator.served import InstrumentDescription, ServedRedPitaya
 from analogrig_instruments.simulator.server import Servable, Server

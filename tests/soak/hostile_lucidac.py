@@ -17,8 +17,8 @@ import time
 from typing import Any
 
 from analogrig_emulator.lucidac.configuration import Configuration, LucidacLane
+from analogrig_lucidac.linear_patch import module_of
 from analogrig_lucidac.messages import MOST_FRAME_BYTES, FrameReader, frame, protocol
-from analogrig_lucidac.patching import module_of
 from analogrig_lucidac.served_machine import MAC
 from tests.served.serving import ServedByProcess, serving
 from tests.soak.hostile import Attack, Stop, connect_often, ignore_disconnection, survive_all

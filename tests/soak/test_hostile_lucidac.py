@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from analogrig.scenario import DEFAULT_SEED
 from analogrig_emulator.lucidac.configuration import Configuration, Integrator, LucidacLane
 from analogrig_lucidac.connection import LucidacConnection
-from analogrig_lucidac.patching import module_of
+from analogrig_lucidac.linear_patch import module_of
 from analogrig_lucidac.served_machine import MAC, specimen
 from tests.harness.processes import LONG_S
 from tests.served.serving import ServedByProcess, ended, serving

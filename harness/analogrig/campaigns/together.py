@@ -22,7 +22,7 @@ from analogrig.devices.device import DeviceDescription
 from analogrig.judging import information
 from analogrig.judging.courses import Model, Trajectory, Values
 from analogrig.judging.exposure import exposures
-from analogrig.judging.played import PREFIX, Machine, is_played, machine_of, recorded_rig
+from analogrig.judging.machine_model import PREFIX, Machine, is_played, machine_of, recorded_rig
 from analogrig.judging.verdict import Verdict, expectations_of, is_exact, judge_with, segment_estimates
 from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
 from analogrig.rigs.rig import Block, Performance, Rig

@@ -103,18 +103,18 @@ def _netlist(arguments: argparse.Namespace) -> int:
 def _effects(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError
     from analogrig.output import move_aside
-    from analogrig.reporting import effects
+    from analogrig.reporting import effects_page
 
     if arguments.out is not None:
         if arguments.out.suffix != ".svg":
             raise ConfigurationError(f"{arguments.out}: the file's name must end with .svg")
         move_aside(arguments.out)
     with show_work("playing each fault"):
-        table = effects.measure([arguments.set] if arguments.set else ["shock", "front"])
+        table = effects_page.measure([arguments.set] if arguments.set else ["shock", "front"])
     if arguments.out is not None:
-        effects.write_picture(table, arguments.out)
+        effects_page.write_picture(table, arguments.out)
     if arguments.json:
-        show_result(effects.as_json(table), arguments)
+        show_result(effects_page.as_json(table), arguments)
     else:
-        show(effects.text(table))
+        show(effects_page.text(table))
     return PASSED

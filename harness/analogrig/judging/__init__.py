@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from analogrig.judging.estimates import trajectory
     from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2, information_of, weights
     from analogrig.judging.linear import LinearPlant
-    from analogrig.judging.played import Machine
+    from analogrig.judging.machine_model import Machine
     from analogrig.judging.statistics import mean_interval, upper_rate
     from analogrig.judging.verdict import DIAGNOSABLE, unexplained_alarms
 else:
@@ -24,7 +24,7 @@ else:
             "analogrig.judging.estimates": "trajectory",
             "analogrig.judging.information": "QUANTISATION_VARIANCE_LSB2 information_of weights",
             "analogrig.judging.linear": "LinearPlant",
-            "analogrig.judging.played": "Machine",
+            "analogrig.judging.machine_model": "Machine",
             "analogrig.judging.statistics": "mean_interval upper_rate",
             "analogrig.judging.verdict": "DIAGNOSABLE unexplained_alarms",
         },

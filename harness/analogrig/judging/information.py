@@ -12,8 +12,8 @@ after the change. It depends on the phase of the excitation, so it is computed f
 Isolation: the changed parameter is known with 95 % confidence once I(n) between the true plant and its best rival
 reaches ln 20. A rival is a plant with one other parameter changed.
 
-The courses y come from a noise-free play of the machine of the run (played.py). Runs of a rig without one, such as a
-real rig or a CAN log, use the program under the measured input if it is linear (linear.py).
+The courses y come from a noise-free play of the machine of the run (machine_model.py). Runs of a rig without one, such
+as a real rig or a CAN log, use the program under the measured input if it is linear (linear.py).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
-from analogrig.judging import isolation, played
+from analogrig.judging import isolation, machine_model
 from analogrig.judging.courses import Model, PlantChange, changes_between, first_at_level
 from analogrig.judging.linear import LinearPlant
 from analogrig.run import CHUNK_SAMPLES, Run
@@ -55,7 +55,7 @@ def change_information(run: Run, model: Model | None = None) -> list[NDArray[np.
 
 def is_bounded(run: Run) -> bool:
     """True if the information in ``run`` is known: a machine played it, or its program is linear."""
-    return played.is_played(run) or run.conditions.program.is_linear
+    return machine_model.is_played(run) or run.conditions.program.is_linear
 
 
 def isolation_bounds(run: Run, model: Model | None = None) -> list[int | None]:
@@ -101,7 +101,7 @@ def predicted_bounds(
     level = _level(arl0)
     scenario = Scenario.load(scenario) if isinstance(scenario, str) else scenario
     scenario = scenario if program is None else scenario.on_program(program)
-    model, output = played.predicted(scenario, rig)
+    model, output = machine_model.predicted(scenario, rig)
     weight = np.full(scenario.samples, _per_lsb2(output.noise_lsb))
     segments = scenario.segments()
     ends = [*(segment.start for segment in segments[1:]), scenario.samples]
@@ -125,7 +125,7 @@ def model_of(run: Run) -> Model | None:
 
     :raises ConfigurationError: as ``change_information``.
     """
-    machine = played.machine_of(run)
+    machine = machine_model.machine_of(run)
     if machine is None and run.conditions.program.is_linear:
         return LinearPlant.of(run)
     return machine

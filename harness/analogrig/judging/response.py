@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.datasheet import ModelOrders
-from analogrig.judging import played
+from analogrig.judging import machine_model
 from analogrig.plant import Plant, exponentials
 from analogrig.run import Run
 from analogrig_emulator import LinearMode
@@ -51,7 +51,7 @@ def step_responses(run: Run) -> tuple[StepResponse, ...]:
     if not conditions.program.is_linear or model is None or not run.theta.shape[1]:
         return ()
     unseen = {segment.start for segment in conditions.segments if segment.unseen}
-    machine, out = played.machine_of(run), []
+    machine, out = machine_model.machine_of(run), []
 
     @functools.lru_cache(maxsize=8)  # of 320 kB each
     def true_step(plant: Plant, samples: int) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from analogrig.cli import FAILED, PASSED, show, show_result, show_work
 
 if TYPE_CHECKING:
     from analogrig import Program, Run
-    from analogrig_instruments.calibration.recorded import (
+    from analogrig_instruments.calibration.recorded_plant import (
         FittedParameter,
         ProgramTwin,
         Reconstruction,
@@ -73,7 +73,7 @@ def _plant(program: Program, run: Run, arguments: argparse.Namespace) -> Recorde
     from analogrig import ConfigurationError
     from analogrig.rigs import ComputerDescription, emulator_errors
     from analogrig_emulator import compile_program
-    from analogrig_instruments.calibration.recorded import RecordedPlant
+    from analogrig_instruments.calibration.recorded_plant import RecordedPlant
 
     if arguments.pots is not None:
         raise ConfigurationError("--pots is for a rig with front or shock: the pots of this twin are continuous")
@@ -84,7 +84,7 @@ def _plant(program: Program, run: Run, arguments: argparse.Namespace) -> Recorde
 
 
 def _settling_n(arguments: argparse.Namespace) -> int:
-    from analogrig_instruments.calibration.recorded import SETTLING_N
+    from analogrig_instruments.calibration.recorded_plant import SETTLING_N
 
     return SETTLING_N if arguments.settle is None else int(arguments.settle)
 
@@ -102,7 +102,7 @@ def _fit(
     :param reconstruction: default course of the input between its samples; None: the one that fits better.
     """
     from analogrig.storage import replace_file
-    from analogrig_instruments.calibration.recorded import fit_program
+    from analogrig_instruments.calibration.recorded_plant import fit_program
 
     fixed = dict(_fixed(text, plant.program.values) for text in arguments.fix)
     chosen = arguments.reconstruction or reconstruction
@@ -151,7 +151,7 @@ def _parameter_line(each: FittedParameter) -> str:
 
 
 def _reconstruction_line(twin: ProgramTwin, unit: str) -> str:
-    from analogrig_instruments.calibration.recorded import RECONSTRUCTIONS
+    from analogrig_instruments.calibration.recorded_plant import RECONSTRUCTIONS
 
     line = f"input between the samples: {twin.reconstruction}"
     if twin.other_rms is None:
@@ -234,7 +234,7 @@ def _words(difference: Residual, unit: str) -> str:
 
 def _span(arguments: argparse.Namespace, option: str, samples: int) -> tuple[int, int]:
     from analogrig import ConfigurationError
-    from analogrig_instruments.calibration.recorded import span_of
+    from analogrig_instruments.calibration.recorded_plant import span_of
 
     text = getattr(arguments, option)
     try:

@@ -34,9 +34,7 @@ from analogrig.links import Clock
 from analogrig.rigs import EmulatorDescription, Stream, emulator_errors
 from analogrig_emulator import CHANNELS, Card, EmulatorError, Excitation, SuspensionComputer
 from analogrig_instruments.instrument import DialChange
-from analogrig_instruments.simulator.computer import MEASURED_AT, WiredComputer, Wiring
-from analogrig_instruments.simulator.inputs import RANGES_V, Codes, InputFaults, Inputs
-from analogrig_instruments.simulator.records import (
+from analogrig_instruments.simulator.acquisition_buffer import (
     BUFFER_N,
     CLOCK_HZ,
     LEAST_DECIMATION,
@@ -47,6 +45,8 @@ from analogrig_instruments.simulator.records import (
     Acquisition,
     AcquisitionFaults,
 )
+from analogrig_instruments.simulator.analogue_inputs import RANGES_V, Codes, InputFaults, Inputs
+from analogrig_instruments.simulator.computer import MEASURED_AT, WiredComputer, Wiring
 from analogrig_instruments.simulator.scpi import HERTZ, VOLTS, Call, Command, DropOut, Response, ScpiError
 
 MOST_SCHEDULED = 64

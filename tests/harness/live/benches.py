@@ -22,9 +22,9 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.scenario import Scenario
 from analogrig_live.bench_command import NO_FAULTS, REPORT_INTERVAL_N
+from analogrig_live.bench_server import BenchServer
 from analogrig_live.commands import Command
-from analogrig_live.server import BenchServer
-from analogrig_live.session import LiveSession, Saved
+from analogrig_live.live_session import LiveSession, Saved
 
 SEED = 7
 

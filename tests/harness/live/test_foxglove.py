@@ -15,7 +15,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection
 
 from analogrig_live import foxglove
-from analogrig_live.server import BenchServer
+from analogrig_live.bench_server import BenchServer
 from tests.harness.live.benches import LiveBench
 from tests.harness.live.test_server import open_client, played
 

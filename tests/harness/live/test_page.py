@@ -14,8 +14,8 @@ from analogrig import cli
 from analogrig.program import Program
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_live.bench_server import BenchServer
 from analogrig_live.commands import Restart, SetPlaying, Step
-from analogrig_live.server import BenchServer
 from tests.browser import COUNT_PIXELS, Watched
 from tests.harness.live.benches import LiveBench, benched, linked
 from tests.served.serving import serving

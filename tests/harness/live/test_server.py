@@ -23,9 +23,9 @@ from websockets.http11 import USER_AGENT
 
 from analogrig.errors import ConfigurationError
 from analogrig.run import Run
+from analogrig_live.bench_server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from analogrig_live.foxglove import SUBPROTOCOL
 from analogrig_live.scope import unpacked
-from analogrig_live.server import MOST_CLIENTS, MOST_MESSAGE_BYTES, MOST_SOCKETS, BenchServer
 from tests.harness.live.benches import LiveBench
 
 TIMEOUT_S = 600.0  # only if something is broken, also under a load of ten

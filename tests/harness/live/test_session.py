@@ -47,9 +47,9 @@ from analogrig_live.commands import (
 )
 from analogrig_live.desk import RECORD_N, SteppedDesk
 from analogrig_live.faults import LINE_LABELS
+from analogrig_live.live_session import ANOTHER_MODE, BLOCK_S, MOST_WAITING, LiveSession, Saved
 from analogrig_live.panel import bench_table, state_table
 from analogrig_live.scope import Screen, Trigger, View, read_signal, signals_of, unpacked
-from analogrig_live.session import ANOTHER_MODE, BLOCK_S, MOST_WAITING, LiveSession, Saved
 from analogrig_live.take import MOST_KEPT_CHANGES, Take
 from tests import tools
 from tests.harness.live.benches import SEED, Action, RecordsRig, linked, scripted_session
@@ -510,7 +510,7 @@ def test_turned_pots_of_an_unrecorded_take_need_bounded_memory(tmp_path: Path) -
 def test_recording_ends_by_itself_at_its_limits(
     limit: str, value: int, text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(f"analogrig_live.session.{limit}", value)
+    monkeypatch.setattr(f"analogrig_live.live_session.{limit}", value)
     turns = [(0.02 * k, Turn("K", 18000.0 + 50.0 * k)) for k in range(1, 9)]
     saved: list[Saved] = []
     script: tuple[tuple[float, Action], ...] = (

@@ -58,7 +58,7 @@ from analogrig_live.panel import bench_table, state_table
 from analogrig_live.scope import Screen, View, signals_of
 
 if TYPE_CHECKING:
-    from analogrig_live.session import LiveSession
+    from analogrig_live.live_session import LiveSession
 
 MOST_CLIENTS = 16
 MOST_SOCKETS = 4 * MOST_CLIENTS

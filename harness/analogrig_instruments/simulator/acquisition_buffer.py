@@ -15,7 +15,7 @@ import numpy as np
 
 from analogrig.config import check_range
 from analogrig.links import Clock
-from analogrig_instruments.simulator.inputs import Codes, Inputs, Volts
+from analogrig_instruments.simulator.analogue_inputs import Codes, Inputs, Volts
 from analogrig_instruments.simulator.scpi import ScpiError
 
 CLOCK_HZ = 125_000_000

@@ -1,4 +1,4 @@
-"""Live session: a rig and a device that run while a hand operates them. It serves no page: ``server.py`` does.
+"""Live session: a rig and a device that run while a hand operates them. It serves no page: ``bench_server.py`` does.
 
 One thread calls ``run``, which plays one take after another through the bench. Any other thread passes commands and
 reads the ring and the state. Commands take effect between two blocks; the session knows the sample.
