@@ -5,20 +5,9 @@ Start with SuspensionComputer, Excitation and Sampler.
 
 from analogrig_emulator.card.acquisition import acquired, ahead_ticks, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.card.recorded import RecordedExcitation
 from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels, sample_plays
-from analogrig_emulator.circuit.circuit import (
-    Capacitor,
-    Circuit,
-    CurrentSource,
-    DiodeLimiter,
-    Element,
-    OpAmp,
-    Pot,
-    Resistor,
-    Switch,
-    VoltageSource,
-)
+from analogrig_emulator.card.smooth import RecordedExcitation
+from analogrig_emulator.circuit.circuit import Circuit, Element
 from analogrig_emulator.circuit.components import (
     COMPONENTS,
     DIELECTRICS,
@@ -33,6 +22,16 @@ from analogrig_emulator.circuit.components import (
     OpAmpGrade,
     PotGrade,
 )
+from analogrig_emulator.circuit.elements import (
+    Capacitor,
+    CurrentSource,
+    DiodeLimiter,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+)
 from analogrig_emulator.circuit.nodal import piecewise_linear
 from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
@@ -40,7 +39,7 @@ from analogrig_emulator.circuit.pot import PotModel, PotTurn
 from analogrig_emulator.circuit.spice import Deck, to_spice
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
-from analogrig_emulator.errors import (
+from analogrig_emulator.exceptions import (
     CircuitError,
     EmulatorError,
     EngineError,
@@ -50,12 +49,19 @@ from analogrig_emulator.errors import (
     ProgramError,
     SamplerError,
 )
+from analogrig_emulator.machine.channel_courses import (
+    Course,
+    Courses,
+    LinearMode,
+    Moment,
+    RepeatedCourses,
+    WideProgram,
+    Wired,
+)
 from analogrig_emulator.machine.compiler import PatchedProgram, circuit_of, compile_program, load_patch
-from analogrig_emulator.machine.courses import Course, Courses, Moment, RepeatedCourses, WideProgram, Wired
-from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
-from analogrig_emulator.machine.modes import LinearMode
+from analogrig_emulator.machine.computer import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import ABSOLUTE_ZERO_C, CircuitNoise, NoisySuspension, Supply
-from analogrig_emulator.machine.program import (
+from analogrig_emulator.machine.program_circuit import (
     CHANNELS,
     SOURCE,
     ForceLaw,
@@ -67,7 +73,7 @@ from analogrig_emulator.machine.program import (
 )
 from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts, SuspensionProgram
-from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
+from analogrig_emulator.machine.repeated_plays import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
 from analogrig_emulator.machine.units import Unit, parse_unit
 from analogrig_emulator.streams import NormalStream, normals, uniforms

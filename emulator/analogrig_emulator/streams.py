@@ -14,21 +14,21 @@ import numpy as np
 from numpy.random import _generator
 from numpy.typing import NDArray
 
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 
 
 def uniforms(seeds: Sequence[int], stream: int, count: int) -> NDArray[np.float64]:
     """Uniform numbers from 0 to 1, as of random(count): (seeds, count)."""
-    if not library.has_streams():
+    if not binding.has_streams():
         return np.array([each.random(count) for each in _generators(seeds, stream)]).reshape(len(seeds), count)
     states, out = _states(seeds, stream), np.empty((len(seeds), count))
-    library.load().engine_draw(*out.shape, states.ctypes.data, out.ctypes.data)
+    binding.load().engine_draw(*out.shape, states.ctypes.data, out.ctypes.data)
     return out
 
 
 def normals(seeds: Sequence[int], stream: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Standard normal numbers, as of standard_normal(shape): (seeds, *shape)."""
-    if not library.has_streams():
+    if not binding.has_streams():
         numbers = [each.standard_normal(shape) for each in _generators(seeds, stream)]
         return np.array(numbers).reshape(len(seeds), *shape)
     return _next_normals(_states(seeds, stream), shape)
@@ -43,7 +43,7 @@ class NormalStream:
     """Standard normal numbers of one seed, in a third of the time of numpy's generator."""
 
     def __init__(self, seed: int, stream: int) -> None:
-        self._generator = None if library.has_streams() else _generators([seed], stream)[0]
+        self._generator = None if binding.has_streams() else _generators([seed], stream)[0]
         self._states = np.empty((0, 4), np.uint64) if self._generator else _states([seed], stream)
 
     def standard_normal(self, size: tuple[int, ...], /) -> NDArray[np.float64]:
@@ -57,7 +57,7 @@ def _next_normals(states: NDArray[np.uint64], shape: tuple[int, ...]) -> NDArray
     """The next numbers of each stream, (streams, *shape); the states are then those after them."""
     out, (normal, width, limit) = np.empty((len(states), *shape)), _ziggurat()
     table = (normal, width.ctypes.data, limit.ctypes.data)
-    library.load().engine_normals(*table, len(states), math.prod(shape), states.ctypes.data, out.ctypes.data)
+    binding.load().engine_normals(*table, len(states), math.prod(shape), states.ctypes.data, out.ctypes.data)
     return out
 
 
@@ -70,12 +70,12 @@ def _ziggurat() -> tuple[int, NDArray[np.float64], NDArray[np.uint64]]:
     function = ctypes.CDLL(_generator.__file__).random_standard_normal
     address = ctypes.cast(function, ctypes.c_void_p).value or 0
     width, limit = np.empty(256), np.empty(256, np.uint64)
-    library.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
+    binding.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
     return address, width, limit
 
 
 def _states(seeds: Sequence[int], stream: int) -> NDArray[np.uint64]:
     """State and increment of each stream, high and low half: (seeds, 4)."""
     words, states = np.array(seeds, np.uint64), np.empty((len(seeds), 4), np.uint64)
-    library.load().engine_seed(words.size, words.ctypes.data, stream, states.ctypes.data)
+    binding.load().engine_seed(words.size, words.ctypes.data, stream, states.ctypes.data)
     return states

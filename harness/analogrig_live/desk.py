@@ -21,7 +21,7 @@ from analogrig.rigs import Block, EmulatorRig, Performance, emulator_errors, is_
 from analogrig.run import OUTPUT
 from analogrig_emulator import Mode as Relays
 from analogrig_emulator import Moment, SuspensionComputer, probes_per_sample
-from analogrig_emulator.machine.patching import patches
+from analogrig_emulator.machine.patch_panel import patches
 from analogrig_live.commands import Fault, Mode
 from analogrig_live.faults import ChannelFaults, labels
 from analogrig_live.knobs import Knob, knobs_of

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from analogrig.wording import counter_text
 from analogrig_emulator import Capacitor, Excitation, Pot, Resistor
-from analogrig_emulator.machine.patching import patches
+from analogrig_emulator.machine.patch_panel import patches
 from analogrig_live.commands import Mode
 from analogrig_live.faults import LINE_LABELS
 from analogrig_live.live_session import LiveSession, Saved

@@ -21,7 +21,7 @@ from analogrig import ConfigurationError, Program, RigError
 from analogrig.links import Clock
 from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
 from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
-from analogrig_emulator.lucidac.wiring import FULL_SCALE, UNIT_V
+from analogrig_emulator.lucidac.lucidac_circuit import FULL_SCALE, UNIT_V
 from analogrig_instruments import (
     DialChange,
     InputRecord,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 from analogrig_emulator.lucidac.configuration import (
     ADC_CHANNELS,
     FIRST_PORT_LANE,

@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from analogrig.config import build
 from analogrig.links import Clock
 from analogrig_emulator import EmulatorError
+from analogrig_emulator.lucidac.lucidac_circuit import LucidacParts
 from analogrig_emulator.lucidac.machine import Lucidac
-from analogrig_emulator.lucidac.wiring import LucidacParts
 from analogrig_instruments import (
     IDLE_S,
     SLOW_S,

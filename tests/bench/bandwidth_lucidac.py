@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from analogrig.scenario import DEFAULT_SEED
+from analogrig_emulator.lucidac.lucidac_circuit import LucidacParts
 from analogrig_emulator.lucidac.machine import Lucidac
-from analogrig_emulator.lucidac.wiring import LucidacParts
 from analogrig_lucidac.served_machine import specimen
 from tests.served.lucidac_deviations import calibrated_deviation, deviation, play, read_configuration, run_examples
 from tests.served.lucidac_examples import EXAMPLES

@@ -19,7 +19,7 @@ from analogrig_emulator import (
     Circuit,
     Multiplier,
 )
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.program_file import parse_program
 from tests.emulator.random_programs import random_program

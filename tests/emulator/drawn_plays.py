@@ -17,7 +17,7 @@ from typing import Any
 
 from analogrig import AnalogrigError, Program, Scenario, open_rig
 from analogrig.program import MOST_CHANNELS
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 from tests.emulator.random_programs import random_program
 from tests.emulator.test_tried_advice import advised
 

@@ -23,7 +23,7 @@ from analogrig_emulator import (
     SuspensionComputer,
 )
 from analogrig_emulator.circuit.nodal import piecewise_linear
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 from analogrig_emulator.machine.compiler import INPUT_OHM, MACHINE_V, PatchedProgram, compile_program
 from analogrig_emulator.machine.program_file import parse_program
 from analogrig_emulator.machine.sheet import dials

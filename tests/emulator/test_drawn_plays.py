@@ -7,7 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from analogrig_emulator.errors import ProgramError, UnfitError
+from analogrig_emulator.exceptions import ProgramError, UnfitError
 from analogrig_emulator.machine.compiler import compile_program, compile_unadvised
 from analogrig_emulator.machine.program_file import equations_of
 from tests.emulator.drawn_plays import RIGS, failures, scenario_of, table_of

@@ -21,7 +21,7 @@ from analogrig_emulator import (
     PotTurn,
     SuspensionComputer,
 )
-from analogrig_emulator.effects import FRONT_CHANGES, SAMPLES, Effect, hardening, measure_effects
+from analogrig_emulator.nonidealities import FRONT_CHANGES, SAMPLES, Effect, hardening, measure_effects
 
 REFERENCE_LSB = {
     "R 1 %, C 5 %, not calibrated": (47.0, 60.0),

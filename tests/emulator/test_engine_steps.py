@@ -27,7 +27,7 @@ from analogrig_emulator import (
     piecewise_linear,
     sample_plays,
 )
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 from tests.emulator.programs import circuit_of
 
 Volts = NDArray[np.float64]
@@ -114,10 +114,10 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., CDLL]:
 
     def compile_with(*options: str) -> CDLL:
         product = tmp_path_factory.mktemp("engine") / "_engine.so"
-        sources = sorted(Path(library.__file__).parent.rglob("*.c"))
+        sources = sorted(Path(binding.__file__).parent.rglob("*.c"))
         fixed = ("-std=c99", "-shared", "-fPIC", "-ffp-contract=off")
         subprocess.run(["cc", *options, *fixed, "-o", product, *sources], check=True)
-        return library.load_from(product)
+        return binding.load_from(product)
 
     return compile_with
 
@@ -151,5 +151,5 @@ def test_bits_do_not_depend_on_the_width_of_registers_or_the_compilers_options(
 
     usual = all_bits()
     other = compiled(*options)
-    monkeypatch.setattr(library, "load", lambda: other)
+    monkeypatch.setattr(binding, "load", lambda: other)
     assert all_bits() == usual

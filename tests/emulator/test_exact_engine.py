@@ -18,11 +18,11 @@ RUN = """
 import sys
 from pathlib import Path
 import pytest
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 
-exact = library.load_from(Path(sys.argv[1]))
-assert not any(hasattr(exact, name) for name in library.FAST)
-library.load = lambda: exact
+exact = binding.load_from(Path(sys.argv[1]))
+assert not any(hasattr(exact, name) for name in binding.FAST)
+binding.load = lambda: exact
 sys.exit(pytest.main(sys.argv[2:]))
 """
 

@@ -19,8 +19,8 @@ from analogrig_emulator.lucidac.configuration import (
     LucidacLane,
     SignalGenerator,
 )
+from analogrig_emulator.lucidac.lucidac_circuit import LucidacParts
 from analogrig_emulator.lucidac.machine import Lucidac
-from analogrig_emulator.lucidac.wiring import LucidacParts
 from tests.emulator.conftest import NgSpice
 from tests.emulator.ideal_lucidac import ideal_solution
 from tests.emulator.lucidac_decks import ngspice_error_lsb

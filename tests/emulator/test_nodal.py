@@ -24,7 +24,7 @@ from analogrig_emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from analogrig_emulator.circuit.circuit import _TwoEnded
+from analogrig_emulator.circuit.elements import _TwoEnded
 from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
 from analogrig_emulator.engine.system import Kink

@@ -22,7 +22,7 @@ from analogrig_emulator import (
     preset,
 )
 from analogrig_emulator.circuit.circuit import Element
-from analogrig_emulator.machine.patching import Patch, patches
+from analogrig_emulator.machine.patch_panel import Patch, patches
 
 Change = Callable[[list[Element]], Iterable[Element]]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analogrig_emulator import NormalStream, normals, uniforms
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 
 SEEDS = [0, 1, 1995, 2**32 - 1, 2**32, 2**40 + 5, 2**63 - 1]
 
@@ -40,8 +40,8 @@ def test_a_function_that_makes_numbers_otherwise_is_asked_for_each() -> None:
     normal = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p)(lambda _: 0.25)
     address = ctypes.cast(normal, ctypes.c_void_p)
     width, limit, states, out = np.empty(256), np.ones(256, np.uint64), np.array([1, 2, 3, 5], np.uint64), np.empty(9)
-    library.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
+    binding.load().engine_learn(address, width.ctypes.data, limit.ctypes.data)
     assert not limit.any()
     table = (address, width.ctypes.data, limit.ctypes.data)
-    library.load().engine_normals(*table, 1, 9, states.ctypes.data, out.ctypes.data)
+    binding.load().engine_normals(*table, 1, 9, states.ctypes.data, out.ctypes.data)
     assert (out == 0.25).all()

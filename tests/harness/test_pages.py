@@ -16,9 +16,9 @@ from analogrig.output import REPORT_FILE, OutputFolder
 from analogrig.reporting import effects_page, write_report
 from analogrig.reporting.campaign_page import write_page
 from analogrig.reporting.session import find_session, write_session
-from analogrig_emulator.effects import Effect
 from analogrig_emulator.machine.compiler import load_patch
 from analogrig_emulator.machine.drawing import patch_drawing
+from analogrig_emulator.nonidealities import Effect
 from tests.browser import VIEWS, Watched
 from tests.harness.reported import empty_run, reported_run, reported_verdict
 from tests.harness.test_campaign_page import drawn_results, results

@@ -26,7 +26,7 @@ from analogrig.rigs.description import describe
 from analogrig.scenario import DEFAULT_SEED, PotChange
 from analogrig_emulator import Capacitor, Excitation, PotTurn, SuspensionComputer
 from analogrig_emulator.lucidac.configuration import Configuration, SignalGenerator
-from analogrig_emulator.lucidac.wiring import FAST_FARAD
+from analogrig_emulator.lucidac.lucidac_circuit import FAST_FARAD
 from analogrig_instruments.calibration.averages import record, scenarios
 from analogrig_instruments.calibration.fit import calibrate
 from analogrig_instruments.instrument import DialChange

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card
 from analogrig_emulator.circuit.pot import PotTurn
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
-from analogrig_emulator.errors import SamplerError
+from analogrig_emulator.exceptions import SamplerError
 
 JITTERS = 4.0
 """Standard deviations of a jitter without delay that the later voltages cover; beyond, the straight line goes on."""
@@ -139,7 +139,7 @@ def _take_samples(
         late += card.aperture_delay_s * per_s
         volts = np.empty_like(late)
         addresses = [array.ctypes.data for array in (before, probes, late, volts)]
-        library.load().engine_take(*late.shape, count, rows.ctypes.data, ahead, *addresses)
+        binding.load().engine_take(*late.shape, count, rows.ctypes.data, ahead, *addresses)
         before = probes[-1].copy()
         yield volts
 

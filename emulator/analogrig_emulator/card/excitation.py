@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.smooth import MOST_HARMONIC, MOST_V, multisine, sine, sweep_turns
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, EdgeRows, Edges
-from analogrig_emulator.errors import ExcitationError
+from analogrig_emulator.exceptions import ExcitationError
 
 _MOST_TICKS = 2.0**53
 """Whole numbers of ticks up to here are exact in float64."""
@@ -240,7 +240,7 @@ class Excitation:
         ticks, counts = np.empty(periods.shape, np.int64), np.empty(len(phases), np.int64)
         grid = TICKS_PER_SAMPLE if self.clock == "card" else 1
         addresses = [array.ctypes.data for array in (periods, levels_v, ticks, counts)]
-        library.load().engine_edges(*periods.shape, grid, max(start_tick, 0), stop_tick, *addresses)
+        binding.load().engine_edges(*periods.shape, grid, max(start_tick, 0), stop_tick, *addresses)
         return EdgeRows(counts, ticks, levels_v)
 
     def _bit_levels_v(self, index: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -20,9 +20,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 from analogrig_emulator.engine.system import is_integer
-from analogrig_emulator.errors import SamplerError
+from analogrig_emulator.exceptions import SamplerError
 
 _MAX_BITS = 16
 
@@ -252,7 +252,7 @@ def _see(
         held_v = (volts[:, 0] if held_v is None else held_v).copy()
     seen_lsb, held = np.empty_like(volts), None if held_v is None else held_v.ctypes.data
     converted = (card.analogue.ctypes.data, residual, volts.ctypes.data, normals.ctypes.data, held)
-    if not library.load().engine_see(*volts.shape, *converted, seen_lsb.ctypes.data):
+    if not binding.load().engine_see(*volts.shape, *converted, seen_lsb.ctypes.data):
         at = tuple(np.argwhere(~np.isfinite(volts))[0])
         raise SamplerError(f"sample {at[1]} of the block, channel {at[2]}: the voltage must be finite, got {volts[at]}")
     return seen_lsb, held_v
@@ -265,7 +265,7 @@ def _convert(card: Card, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint
     levels = None if card.levels is None else card.levels.ctypes.data
     converter = (card.bits, levels, card.stuck_high, card.stuck_low)
     addresses = [array.ctypes.data for array in (seen_lsb, codes, clipped)]
-    library.load().engine_convert(seen_lsb.size, *converter, *addresses)
+    binding.load().engine_convert(seen_lsb.size, *converter, *addresses)
     return codes, clipped
 
 

@@ -26,24 +26,23 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.circuit.circuit import (
+from analogrig_emulator.circuit.circuit import Element, unknown_kind_error
+from analogrig_emulator.circuit.elements import (
+    GROUND,
     Capacitor,
     CurrentSource,
     DiodeLimiter,
-    Element,
     OpAmp,
     Pot,
     Resistor,
     Switch,
     VoltageSource,
-    unknown_kind_error,
 )
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel
-from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotModel
 from analogrig_emulator.engine.system import Law
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 
 REFERENCE_C = 25.0
 """Temperature in Celsius at which components have their marked values."""

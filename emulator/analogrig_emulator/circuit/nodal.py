@@ -26,9 +26,10 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.circuit.circuit import (
+from analogrig_emulator.circuit.circuit import Circuit, element_error
+from analogrig_emulator.circuit.elements import (
+    GROUND,
     Capacitor,
-    Circuit,
     CurrentSource,
     DiodeLimiter,
     OpAmp,
@@ -36,15 +37,13 @@ from analogrig_emulator.circuit.circuit import (
     Resistor,
     Switch,
     VoltageSource,
-    element_error,
 )
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
-from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 from analogrig_emulator.engine.system import Kink, Matrix, PiecewiseLinear, solve_in_place
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 
 
 def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
@@ -252,11 +251,11 @@ class Nodal:
 
     def _check_size(self) -> None:
         sizes = (
-            ("states", len(self._state), library.MAX_STATES),
-            ("multipliers", len(self._multipliers), library.MAX_PRODUCTS),
-            ("inputs and multipliers", len(self._inputs) + len(self._multipliers), library.MAX_INPUTS),
-            ("limits, diode limiters, bends and inputs of multipliers", len(self._kinks), library.MAX_KINKS),
-            ("nodes and branches", self._unknowns, library.MAX_UNKNOWNS),
+            ("states", len(self._state), binding.MAX_STATES),
+            ("multipliers", len(self._multipliers), binding.MAX_PRODUCTS),
+            ("inputs and multipliers", len(self._inputs) + len(self._multipliers), binding.MAX_INPUTS),
+            ("limits, diode limiters, bends and inputs of multipliers", len(self._kinks), binding.MAX_KINKS),
+            ("nodes and branches", self._unknowns, binding.MAX_UNKNOWNS),
         )
         for what, count, limit in sizes:
             if count > limit:

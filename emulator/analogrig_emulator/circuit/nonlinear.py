@@ -19,10 +19,10 @@ from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import ClassVar
 
+from analogrig_emulator.circuit.elements import GROUND, CircuitPart
 from analogrig_emulator.circuit.opamp import OutputStage
-from analogrig_emulator.circuit.part import GROUND, CircuitPart
 from analogrig_emulator.engine.system import Kink, Law, Product
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 
 _CUBIC = 1.5 * math.sqrt(3.0)
 """Factor that makes the largest p (1 - p^2) on 0..1 one."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.engine.system import is_integer
-from analogrig_emulator.errors import CircuitError, PotError
+from analogrig_emulator.exceptions import CircuitError, PotError
 
 _PLACES = 5000
 """Number of places with a noise of their own on a continuous track."""

@@ -20,12 +20,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.circuit.circuit import (
+from analogrig_emulator.circuit.circuit import Circuit, Element
+from analogrig_emulator.circuit.elements import (
     Capacitor,
-    Circuit,
     CurrentSource,
     DiodeLimiter,
-    Element,
     OpAmp,
     Pot,
     Resistor,
@@ -38,7 +37,7 @@ from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
 from analogrig_emulator.circuit.pot import END_FRACTION, PotTurn
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Law
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 
 STEP_S = 1e-12
 """Rise time of every step in a deck, far below anything the circuits resolve."""

@@ -14,9 +14,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, EdgeRows, Edges, PiecewiseLinear
-from analogrig_emulator.errors import EngineError
+from analogrig_emulator.exceptions import EngineError
 
 _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
 """Ticks, inputs and levels of all edges, in time order."""
@@ -84,18 +84,18 @@ class Engine:
         self._outputs = tuple(outputs)
         self._ahead_ticks = ahead_ticks
         self._names = (system.states, system.inputs)
-        self._library = library.load()
+        self._library = binding.load()
         if not 0 < sample_rate_hz < math.inf:
             raise EngineError(f"sample_rate_hz must be positive and finite, got {sample_rate_hz!r}")
-        if len(self._outputs) > library.MAX_OUTPUTS:
+        if len(self._outputs) > binding.MAX_OUTPUTS:
             raise EngineError(
-                f"{len(self._outputs)} nodes are to be recorded; the engine takes at most {library.MAX_OUTPUTS}"
+                f"{len(self._outputs)} nodes are to be recorded; the engine takes at most {binding.MAX_OUTPUTS}"
             )
         inputs, products = len(system.inputs) + len(system.products), len(system.products)
-        if products > library.MAX_PRODUCTS:
+        if products > binding.MAX_PRODUCTS:
             raise EngineError(
                 f"{products - len(drives)} multipliers and {len(drives)} inputs that move all the time; "
-                f"the engine takes at most {library.MAX_PRODUCTS} together"
+                f"the engine takes at most {binding.MAX_PRODUCTS} together"
             )
         sizes = (len(system.states), inputs, products, len(system.kinks), len(self._outputs))
         kind = (self._library, (*sizes, 1.0 / sample_rate_hz, events_per_sample))
@@ -123,7 +123,7 @@ class Engine:
     @property
     def counts(self) -> EngineCounts:
         """Counters of samples, events, steps and modes."""
-        counts = library.Counts()
+        counts = binding.Counts()
         self._library.engine_get_counts(self._handle, ctypes.byref(counts))
         return EngineCounts(counts.samples, counts.events, counts.steps, counts.quiet, counts.modes_built)
 
@@ -161,8 +161,8 @@ class Engine:
         """Replace drives by those of the coming samples, from the one last recorded on. Raises EngineError."""
         for name, drive in drives.items():
             terms = drive.terms
-            if terms.shape != (len(terms), library.DRIVE_TERMS) or not (len(terms) and np.isfinite(terms).all()):
-                raise EngineError(f"a drive needs rows of {library.DRIVE_TERMS} finite coefficients")
+            if terms.shape != (len(terms), binding.DRIVE_TERMS) or not (len(terms) and np.isfinite(terms).all()):
+                raise EngineError(f"a drive needs rows of {binding.DRIVE_TERMS} finite coefficients")
             placed = (drive.first, len(terms), terms.ctypes.data)
             self._check(self._library.engine_drive(self._handle, self._driven[name], *placed))
             self._drives[name] = drive
@@ -203,7 +203,7 @@ class Engine:
         volts = self._allocate(samples)
         drives = tuple(self._drives)
         layouts = [self._layout, *(system.driven(drives).layout(self._outputs) for _, system in changes)]
-        circuits = (library.System * len(layouts))(*(layout.circuit for layout in layouts))
+        circuits = (binding.System * len(layouts))(*(layout.circuit for layout in layouts))
         lasts = [*(sample for sample, _ in changes), self._recorded + samples - 1]
         until = np.array(lasts, np.int64) * TICKS_PER_SAMPLE
         trains = self._merge(edges or {})
@@ -403,10 +403,10 @@ class CircuitSchedule:
         places = [abc + (pole + 1) * width if kink is None else cde + (kink + 1) * width for pole, kink in varied]
         self._places = np.array(places, np.int64)
         self._blocks = np.stack([layout.block for layout in layouts])
-        circuits = (library.System * len(systems))(
-            *(library.System(*(row.ctypes.data + start for start in starts)) for row in self._blocks)
+        circuits = (binding.System * len(systems))(
+            *(binding.System(*(row.ctypes.data + start for start in starts)) for row in self._blocks)
         )
-        self.struct = library.Schedule(
+        self.struct = binding.Schedule(
             turns=len(systems),
             circuit=circuits,
             until=self.until_ticks.ctypes.data,

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.engine import library
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.engine import binding
+from analogrig_emulator.exceptions import CircuitError
 
 TICKS_PER_SAMPLE = 1 << 22
 """Ticks per sample period: the unit of time of edges and relays, 12 ps at 20 kHz."""
@@ -155,7 +155,7 @@ class Drive:
         row = np.minimum(at.astype(np.int64) - self.first, len(self.terms) - 1)
         since = np.minimum(at - (row + self.first), 1.0)
         level = np.zeros(at.shape)
-        for power in reversed(range(library.DRIVE_TERMS)):
+        for power in reversed(range(binding.DRIVE_TERMS)):
             level *= since
             level += self.terms[row, power]
         return level
@@ -258,7 +258,7 @@ class Layout(NamedTuple):
 
     block: Matrix
     starts: tuple[int, ...]
-    circuit: library.System
+    circuit: binding.System
 
     @classmethod
     def of(cls, system: PiecewiseLinear, outputs: tuple[str, ...]) -> Layout:
@@ -280,7 +280,7 @@ class Layout(NamedTuple):
     @classmethod
     def _placed(cls, block: Matrix, starts: tuple[int, ...]) -> Layout:
         start_of_block = block.ctypes.data
-        return cls(block, starts, library.System(*(start_of_block + start for start in starts)))
+        return cls(block, starts, binding.System(*(start_of_block + start for start in starts)))
 
 
 @functools.lru_cache(maxsize=64)
@@ -298,7 +298,7 @@ def _kink_row(lower: float, upper: float, slopes: tuple[float, float, float]) ->
 @functools.lru_cache(maxsize=64)
 def _product_table(products: tuple[Product, ...]) -> Matrix:
     """Rows of engine_product_t: (products, 2 MAX_FACTOR_TERMS + 1)."""
-    second = library.MAX_FACTOR_TERMS
+    second = binding.MAX_FACTOR_TERMS
     table = np.zeros((len(products), 2 * second + 1))
     for row, product in zip(table, products, strict=True):
         row[: len(product.x)], row[second : second + len(product.y)] = product.x, product.y
@@ -458,4 +458,4 @@ def solve_in_place(left: Matrix, solution: Matrix) -> int:
     solution: contiguous, with at least as many rows as left.
     """
     matrix = left.copy(order="C")
-    return int(library.load().engine_solve(len(left), solution.shape[1], matrix.ctypes.data, solution.ctypes.data))
+    return int(binding.load().engine_solve(len(left), solution.shape[1], matrix.ctypes.data, solution.ctypes.data))

@@ -19,7 +19,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 
 INTEGRATORS = 8
 MULTIPLIERS = 4

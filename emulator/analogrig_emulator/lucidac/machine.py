@@ -13,9 +13,9 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.nodal import piecewise_linear
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, PiecewiseLinear
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 from analogrig_emulator.lucidac.configuration import ADC_CHANNELS, Configuration, SignalGenerator
-from analogrig_emulator.lucidac.wiring import UNIT_V, LucidacCircuit, LucidacParts, Trims, calibrated
+from analogrig_emulator.lucidac.lucidac_circuit import UNIT_V, LucidacCircuit, LucidacParts, Trims, calibrated
 
 WATCH_HZ = 100e3
 """Least rate at which the overload flags look at the elements."""

@@ -19,15 +19,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import assert_never
 
-from analogrig_emulator.circuit.circuit import Capacitor, DiodeLimiter, Element, OpAmp, Pot, Resistor, VoltageSource
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.circuit.elements import GROUND, Capacitor, DiodeLimiter, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
-from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.engine.system import Law
-from analogrig_emulator.errors import Edit, PotError, ProgramError, UnfitError
+from analogrig_emulator.exceptions import Edit, PotError, ProgramError, UnfitError
 from analogrig_emulator.machine.formula import suggestion
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
-from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scale, Scales
+from analogrig_emulator.machine.program_circuit import SOURCE, PotRow, ProgramCircuit, Scale, Scales
 from analogrig_emulator.machine.program_file import Equations, read_program
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.rehearsal import rehearsed, unfit
@@ -250,7 +250,7 @@ def compile_program(equations: Equations) -> PatchedProgram:
 
     Raises ProgramError naming the term that cannot be patched, and what to change.
     """
-    from analogrig_emulator.machine.advice import advising  # which compiles what it advises
+    from analogrig_emulator.machine.tried_edits import advising  # which compiles what it advises
 
     with advising(equations.table):
         return compile_unadvised(equations)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from analogrig_emulator.errors import Edit, ProgramError
+from analogrig_emulator.exceptions import Edit, ProgramError
 from analogrig_emulator.machine.units import NUMBER, Unit
 
 _MOST_CHARACTERS = 1000

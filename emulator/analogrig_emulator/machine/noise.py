@@ -31,15 +31,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.circuit.circuit import Circuit, OpAmp, Pot, Resistor
+from analogrig_emulator.circuit.circuit import Circuit
 from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
+from analogrig_emulator.circuit.elements import GROUND, OpAmp, Pot, Resistor
 from analogrig_emulator.circuit.nodal import analyse
 from analogrig_emulator.circuit.nonlinear import Multiplier
-from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
-from analogrig_emulator.engine import library
+from analogrig_emulator.engine import binding
 from analogrig_emulator.engine.system import PiecewiseLinear
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 from analogrig_emulator.machine.suspension import BLOCK_SAMPLES, SuspensionComputer
 
 BOLTZMANN_J_PER_K = 1.380649e-23
@@ -178,8 +178,8 @@ class _Sources:
         corners_hz = [(amp.name, hz) for amp in self._amps for hz in _FLICKER_HZ if conditions.flicker_v > 0]
         n, hums = len(circuit), 2 if conditions.hum_v > 0 else 0
         size = n + len(corners_hz) + hums
-        if size > library.MAX_NOISE_STATES:
-            raise CircuitError(f"the noise has {size} states; the engine takes at most {library.MAX_NOISE_STATES}")
+        if size > binding.MAX_NOISE_STATES:
+            raise CircuitError(f"the noise has {size} states; the engine takes at most {binding.MAX_NOISE_STATES}")
         a, inputs = np.zeros((size, size)), np.zeros(size)
         a[:n, :n] = circuit
         for i, (name, hz) in enumerate(corners_hz, n):
@@ -266,14 +266,14 @@ class CircuitNoise:
             self._x = self._sources.initial(self._conditions, len(self.transition), rng)
         stretches, begun = [], 0
         for row, dials in turns:
-            stretches.append(library.Noise(row - begun, *self._propagation.addresses))
+            stretches.append(binding.Noise(row - begun, *self._propagation.addresses))
             self.turn(dials)
             begun = row
-        stretches.append(library.Noise(len(volts) - begun, *self._propagation.addresses))
+        stretches.append(binding.Noise(len(volts) - begun, *self._propagation.addresses))
         normal = rng.standard_normal((len(volts), len(self._x)))
         addresses = [array.ctypes.data for array in (signs, normal, self._x, volts)]
-        array_of_stretches = (library.Noise * len(stretches))(*stretches)
-        library.load().engine_noise_add(len(self._x), len(signs), len(stretches), array_of_stretches, *addresses)
+        array_of_stretches = (binding.Noise * len(stretches))(*stretches)
+        binding.load().engine_noise_add(len(self._x), len(signs), len(stretches), array_of_stretches, *addresses)
 
 
 class NoisySuspension:
@@ -357,7 +357,7 @@ def _linear_matrix(system: PiecewiseLinear) -> Matrix:
 def _propagate(a: Matrix, intensity: Matrix, period_s: float) -> tuple[Matrix, Matrix, Matrix]:
     """exp(A T), the covariance accumulated over T, and its Cholesky factor."""
     arrays = (np.ascontiguousarray(a), intensity, *(np.empty_like(intensity) for _ in range(3)))
-    if not library.load().engine_noise_gather(len(a), period_s, *(array.ctypes.data for array in arrays)):
+    if not binding.load().engine_noise_gather(len(a), period_s, *(array.ctypes.data for array in arrays)):
         raise CircuitError("the noise of this circuit has no bound: the circuit is unstable")
     return arrays[2], arrays[3], arrays[4]
 

@@ -39,7 +39,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 from analogrig_emulator.machine.formula import (
     CONSTANTS,
     FUNCTIONS,
@@ -234,7 +234,7 @@ def _parsed(data: bytes) -> Equations:
 
 def equations_of(table: Mapping[str, Any]) -> Equations:
     """Program of a file's tables. Raises ProgramError that names the place and the cure."""
-    from analogrig_emulator.machine.advice import advising  # which compiles what it advises
+    from analogrig_emulator.machine.tried_edits import advising  # which compiles what it advises
 
     with advising(table):
         return unadvised_equations(table)

@@ -17,17 +17,10 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from analogrig_emulator.circuit.circuit import (
-    Capacitor,
-    Element,
-    OpAmp,
-    Pot,
-    Resistor,
-    VoltageSource,
-)
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.circuit.elements import GROUND, Capacitor, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.opamp import OpAmpModel
-from analogrig_emulator.circuit.part import GROUND
-from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, ProgramCircuit, Scale, Scales
+from analogrig_emulator.machine.program_circuit import SOURCE, ForceLaw, Mass, Parameter, ProgramCircuit, Scale, Scales
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.components import COMPONENTS, NOMINAL
-from analogrig_emulator.errors import EngineError, UnfitError
+from analogrig_emulator.exceptions import EngineError, UnfitError
 from analogrig_emulator.machine.suspension import SuspensionComputer
 from analogrig_emulator.machine.trial import Reach
 

@@ -16,7 +16,7 @@ from typing import Any, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 from analogrig_emulator.machine.formula import (
     CONSTANTS,
     Formula,

@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.card.recorded import RecordedExcitation
+from analogrig_emulator.card.smooth import RecordedExcitation
 from analogrig_emulator.circuit.circuit import Circuit
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
 from analogrig_emulator.engine.system import Edges, Law, is_integer
-from analogrig_emulator.errors import CircuitError, EngineError, PotError
-from analogrig_emulator.machine.machine import AnalogComputer, Mode
-from analogrig_emulator.machine.program import SOURCE, ProgramCircuit, Scales
+from analogrig_emulator.exceptions import CircuitError, EngineError, PotError
+from analogrig_emulator.machine.computer import AnalogComputer, Mode
+from analogrig_emulator.machine.program_circuit import SOURCE, ProgramCircuit, Scales
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 
 PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 from analogrig_emulator.machine.compiler import INPUT_OHM, PatchedElement, PatchedProgram
 from analogrig_emulator.machine.sheet import inverters, signed, table
 from analogrig_emulator.machine.stages import StageKind

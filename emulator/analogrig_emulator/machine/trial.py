@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 from analogrig_emulator.machine.program_file import Equations, at_place
 from analogrig_emulator.machine.stages import StageKind, Stages
 

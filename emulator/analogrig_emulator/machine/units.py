@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from analogrig_emulator.errors import ProgramError
+from analogrig_emulator.exceptions import ProgramError
 
 _BASE = ("kg", "m", "s", "A", "K", "mol", "cd")
 _MOST_CHARACTERS = 60

@@ -218,7 +218,7 @@ def _sample_lines(played: Performance, rig: str, offset_v: float) -> list[str]:
 
 def _notes(program: Program) -> list[str]:
     """Reasons to choose another speed, which only a run would show: as failures of the device."""
-    from analogrig_emulator.machine.advice import played_edit, text_of
+    from analogrig_emulator.machine.tried_edits import played_edit, text_of
 
     period_s = 1.0 / _CARD_RATE_HZ
     if program.settling_s is None:

@@ -9,8 +9,8 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 from analogrig.storage import replace_file
-from analogrig_emulator.effects import SAMPLES, Effect, measure_effects
 from analogrig_emulator.machine.drawing import PALETTE
+from analogrig_emulator.nonidealities import SAMPLES, Effect, measure_effects
 
 EffectsBySet = Mapping[str, Sequence[Effect]]
 """Effects by parameter set; each set has the same effects in the same order."""

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
-from analogrig_emulator.circuit.circuit import OpAmp
+from analogrig_emulator.circuit.elements import OpAmp
 from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.engine.engine import CircuitSchedule, Engine
-from analogrig_emulator.machine.machine import lamp_samples
-from analogrig_emulator.machine.program import SOURCE
+from analogrig_emulator.machine.computer import lamp_samples
+from analogrig_emulator.machine.program_circuit import SOURCE
 from analogrig_emulator.machine.suspension import SuspensionComputer
 
 

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.acquisition import on_card_clock, probe_of_channel, probes_per_sample
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card
-from analogrig_emulator.circuit.circuit import Element, Resistor
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.circuit.elements import Resistor
 from analogrig_emulator.circuit.nodal import analyse
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.engine.engine import CircuitSchedule, Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
-from analogrig_emulator.errors import PotError
-from analogrig_emulator.machine.modes import LinearMode, linear_mode
-from analogrig_emulator.machine.program import SOURCE, PotRow, ProgramCircuit, Scales
+from analogrig_emulator.exceptions import CircuitError, PotError
+from analogrig_emulator.machine.program_circuit import SOURCE, PotRow, ProgramCircuit, Scales
 from analogrig_emulator.machine.suspension import SuspensionComputer
 
 Matrix = NDArray[np.float64]
@@ -33,6 +33,31 @@ _WIDE_GAIN = 10.0
 
 _MOST_STEPS = 256
 """Steps in which pots turn during a ramp; a step is at least a sample long, and shows its middle."""
+
+
+class LinearMode(NamedTuple):
+    """State space from one input of a circuit to a node: dx/dt = flow x + driven u, v = reading x + direct u."""
+
+    flow: Matrix  # (n, n) 1/s
+    driven: Matrix  # (n,) 1/s
+    reading: Matrix  # (n,)
+    direct: float
+
+
+def linear_mode(circuit: PiecewiseLinear, source: str, node: str, sign: float) -> LinearMode:
+    """State space of the circuit with every kink in its middle piece; sign: of the node in the output.
+
+    Raises CircuitError for a circuit with multipliers.
+    """
+    if circuit.products:
+        raise CircuitError("a circuit with multipliers has no linear mode")
+    n, (row,) = len(circuit.states), circuit.rows([node])
+    slopes = np.array([kink.slopes[1] for kink in circuit.kinks])
+    phi = slopes[:, None] * np.linalg.solve(np.eye(len(slopes)) - circuit.w_phi * slopes, circuit.cde)
+    flow = circuit.abc + circuit.g @ phi
+    reading = sign * (circuit.lmn[row] + circuit.v_phi[row] @ phi)
+    at = n + circuit.inputs.index(source)
+    return LinearMode(flow[:, :n], flow[:, at], reading[:n], float(reading[at]))
 
 
 class Wired(NamedTuple):

@@ -7,7 +7,7 @@ import functools
 from ctypes import POINTER, c_double, c_int, c_int64, c_uint, c_uint32, c_void_p
 from pathlib import Path
 
-from analogrig_emulator.errors import EngineError
+from analogrig_emulator.exceptions import EngineError
 
 # The limits of engine/engine.h.
 MAX_STATES = 96

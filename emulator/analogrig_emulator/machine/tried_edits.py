@@ -19,8 +19,8 @@ import numpy as np
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.components import COMPONENTS
 from analogrig_emulator.circuit.nonlinear import MULTIPLIERS
-from analogrig_emulator.errors import Edit, EmulatorError, ProgramError, UnfitError
-from analogrig_emulator.machine.program import ProgramCircuit
+from analogrig_emulator.exceptions import Edit, EmulatorError, ProgramError, UnfitError
+from analogrig_emulator.machine.program_circuit import ProgramCircuit
 from analogrig_emulator.machine.program_file import unadvised_equations
 
 if TYPE_CHECKING:

@@ -25,26 +25,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.circuit.circuit import (
-    Capacitor,
-    Circuit,
-    Element,
-    OpAmp,
-    Pot,
-    Resistor,
-    Switch,
-    VoltageSource,
-    label,
-)
+from analogrig_emulator.circuit.circuit import Circuit, Element, label
 from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
+from analogrig_emulator.circuit.elements import GROUND, Capacitor, OpAmp, Pot, Resistor, Switch, VoltageSource
 from analogrig_emulator.circuit.nodal import Nodal, analyse
 from analogrig_emulator.circuit.nonlinear import Multiplier
-from analogrig_emulator.circuit.part import GROUND
 from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Kink, Law, PiecewiseLinear
-from analogrig_emulator.errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
-from analogrig_emulator.machine.patching import Patch, patches
+from analogrig_emulator.exceptions import CircuitError, EmulatorError, EngineError, ModeError, PotError
+from analogrig_emulator.machine.patch_panel import Patch, patches
 
 REFERENCE_V = 10.0
 """Reference voltage at a pot's top while its coefficient is read."""

@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.circuit.circuit import Element, Pot, Resistor
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.circuit.elements import Pot, Resistor
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
-from analogrig_emulator.errors import PotError
+from analogrig_emulator.exceptions import PotError
 
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """Quantities on the card's four channels, in order, for a suspension."""

@@ -17,21 +17,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from analogrig_emulator.circuit.circuit import (
-    Capacitor,
-    Circuit,
-    CurrentSource,
-    Element,
-    OpAmp,
-    Pot,
-    Resistor,
-    VoltageSource,
-)
+from analogrig_emulator.circuit.circuit import Circuit, Element
 from analogrig_emulator.circuit.components import Components, Grade, MultiplierGrade, OpAmpGrade
+from analogrig_emulator.circuit.elements import GROUND, Capacitor, CurrentSource, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Multiplier, MultiplierModel
 from analogrig_emulator.circuit.opamp import OpAmpModel
-from analogrig_emulator.circuit.part import GROUND
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 from analogrig_emulator.lucidac.configuration import (
     COEFFICIENT_STEPS,
     FAST,

@@ -10,22 +10,11 @@ import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from analogrig_emulator.circuit.circuit import (
-    Capacitor,
-    Circuit,
-    CurrentSource,
-    Element,
-    OpAmp,
-    Pot,
-    Ways,
-    label,
-    leads,
-    neighbours,
-)
+from analogrig_emulator.circuit.circuit import Circuit, Element, Ways, label, leads, neighbours
 from analogrig_emulator.circuit.components import is_part_of
+from analogrig_emulator.circuit.elements import GROUND, Capacitor, CurrentSource, OpAmp, Pot
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
-from analogrig_emulator.circuit.part import GROUND
-from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.exceptions import CircuitError
 
 
 @dataclass(frozen=True)
