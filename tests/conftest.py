@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import pytest
 
 from tests import tools
-from tests.wheels import distributions, environment, users_environment, wheel
+from tests.wheels import environment, sdist, users_environment, wheel
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -29,7 +29,7 @@ if not tools.silverbox_file().is_file():
 if "ANALOGRIG_WHEELS" not in os.environ:
     collect_ignore.append("test_manylinux.py")
 
-__all__ = ["distributions", "environment", "users_environment", "wheel"]  # the fixtures of tests/wheels.py
+__all__ = ["environment", "sdist", "users_environment", "wheel"]  # the fixtures of tests/wheels.py
 
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
@@ -68,9 +68,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what each test needs, by its fixtures too; skip those whose tools are missing; the slowest come first."""
+    """Mark what each test needs, by its fixtures too; skip those whose tools are missing; the slowest come first.
+
+    A wheel takes 8 s, so that its tests are heavy.
+    """
     for item in items:
         for fixture in getattr(item, "fixturenames", ()):
+            if fixture == "wheel":
+                item.add_marker(pytest.mark.heavy)
             if fixture in tools.FIXTURES:
                 item.add_marker(pytest.mark.tools(*tools.FIXTURES[fixture]))
         needed = [name for marker in item.iter_markers("tools") for name in marker.args]

@@ -7,6 +7,7 @@ lists the imports between the folders of ``analogrig`` instead. ``--write`` writ
 from __future__ import annotations
 
 import ast
+import functools
 import itertools
 import json
 import re
@@ -84,7 +85,17 @@ class Tree:
         """Path and syntax tree of each Python file of the parts; not of what `analogrig new` writes."""
         for path, text in self.files.items():
             if path.endswith(".py") and path.partition("/")[0] in parts and "/templates/" not in path:
-                yield path, ast.parse(text)
+                yield path, _parsed(text)
+
+
+@functools.cache
+def _parsed(text: str) -> ast.Module:
+    return ast.parse(text)
+
+
+@functools.cache
+def _nodes(module: ast.Module) -> Sequence[ast.AST]:
+    return list(ast.walk(module))
 
 
 def read(commit: str | None) -> Tree:
@@ -207,7 +218,7 @@ def class_depths(tree: Tree) -> dict[str, int]:
     bases = {
         node.name: [ast.unparse(base).partition("[")[0].rpartition(".")[2] for base in node.bases]
         for _, module in tree.python(*PRODUCT)
-        for node in ast.walk(module)
+        for node in _nodes(module)
         if isinstance(node, ast.ClassDef)
     }
 
@@ -226,9 +237,9 @@ def called_once(tree: Tree) -> list[str]:
     """Private functions of at most FEW lines, without docstring, whose name stands once beside its definition."""
     found = []
     for path, module in tree.python(*PRODUCT):
-        names = Counter(node.id for node in ast.walk(module) if isinstance(node, ast.Name))
-        names += Counter(node.attr for node in ast.walk(module) if isinstance(node, ast.Attribute))
-        for node in ast.walk(module):
+        names = Counter(node.id for node in _nodes(module) if isinstance(node, ast.Name))
+        names += Counter(node.attr for node in _nodes(module) if isinstance(node, ast.Attribute))
+        for node in _nodes(module):
             if isinstance(node, ast.FunctionDef) and node.name.startswith("_") and not node.name.startswith("__"):
                 body = node.body[1:] if ast.get_docstring(node) else node.body
                 lines = (node.end_lineno or 0) - (body[0].lineno if body else node.lineno) + 2
@@ -261,7 +272,7 @@ def _public(tree: Tree) -> Iterator[str]:
 def doubled(tree: Tree) -> list[str]:
     """Names of classes of the product that are defined more than once."""
     classes = [
-        node.name for _, module in tree.python(*PRODUCT) for node in ast.walk(module) if isinstance(node, ast.ClassDef)
+        node.name for _, module in tree.python(*PRODUCT) for node in _nodes(module) if isinstance(node, ast.ClassDef)
     ]
     return sorted(name for name, times in Counter(classes).items() if times > 1)
 
@@ -276,7 +287,7 @@ def isinstances(tree: Tree) -> int:
     return sum(
         1
         for _, module in tree.python(*PRODUCT)
-        for node in ast.walk(module)
+        for node in _nodes(module)
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id == "isinstance"
@@ -288,7 +299,7 @@ def _docstrings(tree: Tree) -> list[str]:
     """Docstrings of modules, classes and functions, and the texts below attributes."""
     found = []
     for _, module in tree.python(*PRODUCT):
-        for node in ast.walk(module):
+        for node in _nodes(module):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 found.append(ast.get_docstring(node) or "")
             body = getattr(node, "body", [])
@@ -346,7 +357,7 @@ def _folder(module: str) -> str:
 
 def _imported(module: ast.Module, root: str, modules: Mapping[str, ast.Module]) -> Iterator[str]:
     """Modules of the package that a module imports."""
-    for node in ast.walk(module):
+    for node in _nodes(module):
         if isinstance(node, ast.Import):
             for each in node.names:
                 if each.name.startswith(f"{root}."):
@@ -366,12 +377,16 @@ def upward(found: Arrows) -> list[tuple[str, str]]:
 
 def circles(found: Arrows) -> list[set[str]]:
     """Sets of folders that import each other, directly or through others."""
+    targets: dict[str, set[str]] = {}
+    for a, b in found:
+        targets.setdefault(a, set()).add(b)
     reached: dict[str, set[str]] = {}
-    for start, _ in found:
-        reached[start], ahead = set(), {b for a, b in found if a == start}
+    for start in targets:
+        reached[start], ahead = set(), [start]
         while ahead:
-            reached[start] |= ahead
-            ahead = {b for a, b in found if a in ahead} - reached[start]
+            new = targets.get(ahead.pop(), set()) - reached[start]
+            reached[start] |= new
+            ahead += new
     of = {a: {b for b in reached[a] if a in reached.get(b, ())} for a in reached}
     return [set(each) for each in sorted({frozenset(circle) for circle in of.values() if circle}, key=sorted)]
 

@@ -81,17 +81,16 @@ def test_blocks_of_the_pages_are_found() -> None:
     assert {language: n for language, n in found.items() if n < LEAST_BLOCKS[language]} == {}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_command_of_a_page_is_understood(page: Path) -> None:
+def test_every_command_of_a_page_is_understood() -> None:
     parser = command_line.make_parser()
-    for command in commands(page):
-        words = shlex.split(command, comments=True)[1:]
+    lost = []
+    for name, command in [(page.name, command) for page in PAGES for command in commands(page)]:
         try:
-            parser.parse_args(words)
+            parser.parse_args(shlex.split(command, comments=True)[1:])
         except SystemExit as ended:  # --help ends with 0
-            if ended.code == 0:
-                continue
-            pytest.fail(f"{page.name}: {command}")
+            if ended.code != 0:
+                lost.append(f"{name}: {command}")
+    assert lost == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -124,15 +123,13 @@ def test_every_toml_file_of_a_page_is_accepted(page: Path, tmp_path: Path) -> No
             Scenario.load(str(path))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_python_example_of_a_page_runs(page: Path, tmp_path: Path) -> None:
-    texts = blocks(page, "python")
-    if not texts or page.stem in RUN_BY_ANOTHER_TEST:
-        return
-    for i, text in enumerate(texts):
-        (tmp_path / f"test_example_{i}.py").write_text(
-            text if "def test_" in text else f"def test_it():\n{_indented(text)}"
-        )
+def test_every_python_example_of_a_page_runs(tmp_path: Path) -> None:
+    """Each in a module of its own, of one session."""
+    for page in PAGES:
+        for i, text in enumerate(blocks(page, "python") if page.stem not in RUN_BY_ANOTHER_TEST else ()):
+            (tmp_path / f"test_{page.stem}_{i}.py").write_text(
+                text if "def test_" in text else f"def test_it():\n{_indented(text)}"
+            )
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hil-dut", "inproc", str(tmp_path)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -162,8 +159,11 @@ def test_page_has_every_key(page: str, described: type) -> None:
     assert [key for key in keys if not re.search(rf"\b{key}\b", text)] == []
 
 
-@pytest.mark.parametrize("page", PROSE, ids=lambda page: str(page.relative_to(ROOT)))
-def test_sentences_cells_and_lines_are_short(page: Path) -> None:
+def test_sentences_cells_and_lines_are_short() -> None:
+    assert [f"{page.relative_to(ROOT)}: {text}" for page in PROSE for text in long_texts(page)] == []
+
+
+def long_texts(page: Path) -> list[str]:
     text = BLOCKS.sub("", page.read_text(encoding="utf-8"))
     prose = NO_PROSE.sub("", text)
     sentences = re.split(r"(?<=[.!?:])\s+|\n\n|\n *- |\n\d+\. ", prose)
@@ -171,19 +171,18 @@ def test_sentences_cells_and_lines_are_short(page: Path) -> None:
     long = [sentence for sentence in sentences if len(sentence.split()) > MOST_WORDS]
     long += [cell for cell in cells if len(cell.strip("| ").split()) > MOST_CELL_WORDS]
     long += [line for line in prose.splitlines() if len(line) > MOST_COLUMNS]
-    assert long == []
+    return long
 
 
-def test_every_page_of_a_key_is_written_from_the_dataclass_that_reads_it(tmp_path: Path) -> None:
+def test_page_of_the_keys_of_a_scenario_is_written_from_the_dataclass_that_reads_it() -> None:
+    """The test of the site writes every other page too."""
     sys.path.insert(0, str(DOCS))
     try:
-        from generated import write_reference
+        from generated import FILES, _file
     finally:
         sys.path.remove(str(DOCS))
-    write_reference(tmp_path)
-    page = (tmp_path / "scenario-files.md").read_text(encoding="utf-8")
-    for key in Scenario.__dataclass_fields__:
-        assert key == "name" or f"`{key}`" in page
+    page = "\n".join(_file(*FILES["scenario-files"]))
+    assert [key for key in Scenario.__dataclass_fields__ if key != "name" and f"`{key}`" not in page] == []
     assert config.names("scenarios")
 
 

@@ -56,22 +56,24 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
     assert not [name for name in held if name.startswith("tests/")]
 
 
-@pytest.mark.parametrize("kind", ["wheel", "sdist"])
-def test_every_source_of_estimator_and_device_is_shipped(kind: str, wheel: Path, distributions: Path) -> None:
+def shipped() -> set[str]:
+    """Sources of estimator and device, and every scenario, rig and device, by their paths in this checkout."""
     parts = ("core", "isolation", "fit", "device", "ports", "catalogue")
-    tracked = [
-        str(path.relative_to(CHECKOUT))
-        for part in parts
-        for path in (CHECKOUT / "estimator_c" / part).rglob("*")
-        if path.is_file() and path.suffix != ".pyc"
-    ]
-    assert len([name for name in tracked if name.endswith(".c")]) > 10
-    if kind == "wheel":
-        held = {name.removeprefix("analogrig/") for name in zipfile.ZipFile(wheel).namelist()}
-    else:
-        with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
-            held = {name.partition("/")[2] for name in sdist.getnames()}
-    assert held >= set(tracked)
+    sources = [path for part in parts for path in (CHECKOUT / "estimator_c" / part).rglob("*")]
+    fixtures = list(CHECKOUT.glob("fixtures/*/*.toml"))
+    assert fixtures
+    assert len([path for path in sources if path.suffix == ".c"]) > 10
+    files = [path for path in (*sources, *fixtures) if path.is_file() and path.suffix != ".pyc"]
+    return {str(path.relative_to(CHECKOUT)) for path in files}
+
+
+def test_sdist_holds_sources_and_fixtures(sdist: Path) -> None:
+    with tarfile.open(sdist) as files:
+        assert {name.partition("/")[2] for name in files.getnames()} >= shipped()
+
+
+def test_wheel_holds_sources_and_fixtures(wheel: Path) -> None:
+    assert set(zipfile.ZipFile(wheel).namelist()) >= {f"analogrig/{name}" for name in shipped()}
 
 
 def test_licence_is_in_the_metadata(wheel: Path) -> None:
@@ -108,14 +110,6 @@ def test_codec_that_is_generated_from_the_shipped_catalogue_is_the_shipped_one(
     names = {path.name for path in generated.iterdir()}
     assert names == {path.name for path in (tmp_path / "c").iterdir()}
     assert filecmp.cmpfiles(generated, tmp_path / "c", sorted(names), shallow=False)[0] == sorted(names)
-
-
-def test_every_scenario_rig_and_device_is_shipped(distributions: Path, wheel: Path) -> None:
-    fixtures = {str(path.relative_to(CHECKOUT)) for path in CHECKOUT.glob("fixtures/*/*.toml")}
-    assert fixtures
-    with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
-        assert {name.partition("/")[2] for name in sdist.getnames()} >= fixtures
-    assert set(zipfile.ZipFile(wheel).namelist()) >= {f"analogrig/{fixture}" for fixture in fixtures}
 
 
 def test_command_works_from_the_wheel(environment: Path) -> None:
@@ -170,7 +164,6 @@ def test_users_repository_passes_without_its_bug(users_environment: Path, users_
     assert "2 passed" in run(users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
 
 
-@pytest.mark.heavy
 def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
     users_environment: Path, users_repository: Path
 ) -> None:
@@ -182,18 +175,8 @@ def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
     assert repeat is not None
     again = run(users_environment / "analogrig", *shlex.split(repeat[1]), cwd=users_repository, status=1)
     assert "missed" in again
-    suite = run(
-        users_environment / "python",
-        "-m",
-        "pytest",
-        "-q",
-        "failed",
-        "--hil-scenario-dir",
-        "failed",
-        cwd=users_repository,
-        status=1,
-    )
-    assert "1 failed" in suite
+    words = ("-m", "pytest", "-q", "failed", "--hil-scenario-dir", "failed")
+    assert "1 failed" in run(users_environment / "python", *words, cwd=users_repository, status=1)
 
 
 def test_help_loads_nothing_heavy(environment: Path) -> None:

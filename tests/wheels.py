@@ -62,12 +62,16 @@ def environment_with(folder: Path, *requirements: str | Path, python: str = sys.
     return folder / "bin"
 
 
-def build(folder: Path, *options: str) -> None:
-    """Build an sdist of this checkout, and a wheel from that sdist, into ``folder``."""
+def pack(folder: Path) -> None:
+    """Build an sdist of this checkout into ``folder``."""
     sources = shutil.copytree(CHECKOUT, folder / "sources", ignore=shutil.ignore_patterns(*NOT_SOURCES))
-    words = ("-m", "build", "--no-isolation", "--outdir", str(folder), *options, str(sources))
-    run(sys.executable, *words, cwd=folder, CFLAGS="-O1")  # quickly; make test-wheels tries wheels as they are shipped
+    _build("--sdist", folder, sources)
     shutil.rmtree(sources)
+
+
+def _build(kind: str, folder: Path, sources: Path) -> None:
+    words = ("-m", "build", "--no-isolation", kind, "--outdir", str(folder), str(sources))
+    run(sys.executable, *words, cwd=folder, CFLAGS="-O0")  # quickly; make test-wheels tries wheels as they are shipped
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
@@ -80,21 +84,29 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "complete").exists():
             shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
             make(folder)
             (folder / "complete").touch()
     return folder
 
 
 @pytest.fixture(scope="session")
-def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an sdist of this checkout and the wheel built from that sdist."""
-    return made_once(tmp_path_factory, "distributions", build)
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An sdist of this checkout."""
+    (path,) = made_once(tmp_path_factory, "sdist", pack).glob("*.tar.gz")
+    return path
 
 
 @pytest.fixture(scope="session")
-def wheel(distributions: Path) -> Path:
-    """The wheel for this machine."""
-    (path,) = distributions.glob("*.whl")
+def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel for this machine, built from the sdist. tests/conftest.py marks its tests as heavy."""
+
+    def make(folder: Path) -> None:
+        shutil.unpack_archive(sdist, folder / "sources", filter="data")
+        _build("--wheel", folder, next((folder / "sources").iterdir()))
+        shutil.rmtree(folder / "sources")
+
+    (path,) = made_once(tmp_path_factory, "wheel", make).glob("*.whl")
     return path
 
 
