@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from analogrig.devices.can_dbc import CanDbcDevice
+    from analogrig.devices.device import DeviceDescription
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run
     from analogrig.scenario import Scenario
@@ -268,19 +268,18 @@ def load_capture(arguments: argparse.Namespace) -> Run:
         )
 
 
-def _described_ecu(name: str) -> CanDbcDevice:
+def _described_ecu(name: str) -> DeviceDescription:
     """Device whose messages a CAN log holds. It is only described: nothing is opened.
 
     :raises ConfigurationError: it is of another kind, or its description is wrong.
     """
-    from analogrig.devices.can_dbc import CanDbcDevice
-    from analogrig.devices.registry import describe
+    from analogrig.devices.registry import describe, kinds_that_decode_logs
     from analogrig.errors import ConfigurationError
 
     device = describe(name)
-    if not isinstance(device, CanDbcDevice):
+    if not device.decodes_logs:
         raise ConfigurationError(
             f"{name}: a log of a device of the kind {device.kind} needs no device file: leave it out, or pass one of"
-            f" the kind {CanDbcDevice.kind}"
+            f" the kind {' or '.join(kinds_that_decode_logs())}"
         )
     return device

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -14,7 +15,11 @@ from analogrig.errors import ConfigurationError
 from analogrig.trust import absolute_path
 
 if TYPE_CHECKING:
+    import can
+
+    from analogrig.devices.captured import CaptureDecoding
     from analogrig.devices.ecu_messages import EcuMessages
+    from analogrig.run import Channel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +29,7 @@ class CanDbcDevice(CanPort, DbcDescription):
     kind: ClassVar[str] = "can-dbc"
     usage: ClassVar[str] = "FILE.toml"
     summary: ClassVar[str] = "ECU with messages of its own, which a DBC and a device file describe"
+    decodes_logs: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,6 +69,13 @@ class CanDbcDevice(CanPort, DbcDescription):
         placed = dataclasses.replace(self, dbc=absolute_path(self.dbc, folder))
         placed.messages()
         return placed
+
+    def log_decoder(
+        self, channels: Mapping[str, Channel], frames: Iterable[can.Message], *, most_n: int
+    ) -> CaptureDecoding:
+        from analogrig.recordings.ecu_decoder import EcuDecoder
+
+        return EcuDecoder(self, channels, frames, most_n=most_n)
 
     def open(self) -> Device:
         from analogrig.devices.ecu import EcuDevice

@@ -23,6 +23,9 @@ from analogrig.run import Channel
 from analogrig.trust import Thing
 
 if TYPE_CHECKING:
+    import can
+
+    from analogrig.devices.captured import CaptureDecoding
     from analogrig.links.link import CanListener
     from analogrig.links.wire_faults import FaultyLine
 
@@ -65,6 +68,8 @@ class DeviceDescription:
     """Least and largest value of numbers, by their fields. Those of base classes hold as well."""
     state_types: ClassVar[tuple[type[int | str], ...]] = ()
     """Types of the states that ``alarm_is`` may name; none if the alarm is true or false."""
+    decodes_logs: ClassVar[bool] = False
+    """True if ``log_decoder`` reads CAN logs with messages of the device's own."""
     name: str
     description: str = ""
     """One line for people."""
@@ -184,6 +189,21 @@ class DeviceDescription:
         :raises LinkError, DeviceError: as ``connect``.
         """
         return self.connect()
+
+    def log_decoder(
+        self,
+        channels: Mapping[str, Channel],  # noqa: ARG002
+        frames: Iterable[can.Message],  # noqa: ARG002
+        *,
+        most_n: int,  # noqa: ARG002
+    ) -> CaptureDecoding:
+        """Decode a CAN log with messages of the device's own. Nothing is opened.
+
+        :param channels: scales of ``u`` and ``y``.
+        :param most_n: largest number of samples in a run; another run begins after it.
+        :raises ConfigurationError: the description does not fit its DBC, or this kind of device has no such messages.
+        """
+        raise ConfigurationError(f"device {self.name}: a device of the kind {self.kind} has no messages of its own")
 
     def hint(self, link_name: str) -> str:  # noqa: ARG002
         """Advice for a device that has never answered on the link of that name; may be empty."""

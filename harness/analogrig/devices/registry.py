@@ -122,6 +122,15 @@ def _check_not_compiled(name: str) -> None:
         )
 
 
+def kinds_that_decode_logs() -> list[str]:
+    """Kinds of devices whose description decodes a CAN log with messages of the device's own."""
+    found = []
+    for kind in KINDS:
+        with contextlib.suppress(ConfigurationError):  # of a broken package
+            found += [kind] * KINDS[kind].decodes_logs
+    return found
+
+
 def recorded(description: Mapping[str, Any]) -> DeviceDescription:
     """Description from the record of ``Device.description()``.
 

@@ -12,11 +12,10 @@ import numpy as np
 from analogrig.answers import Answers
 from analogrig.bench import RunBuilder
 from analogrig.datasheet import Datasheet
-from analogrig.devices.can_dbc import CanDbcDevice
+from analogrig.devices.captured import CaptureDecoding, CapturedRun
+from analogrig.devices.device import DeviceDescription
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.recordings.captured import CaptureDecoding, CapturedRun
 from analogrig.recordings.decoder import CaptureDecoder, FrameDictionary
-from analogrig.recordings.ecu_decoder import EcuDecoder
 from analogrig.recordings.files import CapturedFrames
 from analogrig.recordings.measured_runs import scaled_to_program
 from analogrig.recordings.scales import scale_findings
@@ -38,7 +37,7 @@ def import_run(
     rig: Rig,
     *,
     dbc: Path | None = None,
-    device: CanDbcDevice | None = None,
+    device: DeviceDescription | None = None,
     number: int | None = None,
     most_lost_n: int = 0,
     channels: Collection[str] = (),
@@ -49,7 +48,7 @@ def import_run(
     other than input and output are not transmitted: their codes are zero and marked as clipped.
 
     :param dbc: DBC of the log, if it differs from the catalogue of this build.
-    :param device: device with messages of its own, to which the log belongs.
+    :param device: device with messages of its own (``decodes_logs``), to which the log belongs.
     :param number: number of the run in the log, from 1; None: the log holds exactly one.
     :param most_lost_n: largest number of lost samples in a valid run.
     :param channels: channels of the log to read; empty: all.
@@ -97,13 +96,13 @@ def import_run(
 
 
 def _decoder(
-    frames: CapturedFrames, dbc: Path | None, device: CanDbcDevice | None, performance: Performance, most_n: int
+    frames: CapturedFrames, dbc: Path | None, device: DeviceDescription | None, performance: Performance, most_n: int
 ) -> CaptureDecoding:
     """Decoder of a log's messages: the catalogue's, or those of a device with messages of its own."""
     try:
         if device is None:
             return CaptureDecoder(FrameDictionary(dbc), frames)
-        return EcuDecoder(device, performance.of_device, frames, most_n=most_n)
+        return device.log_decoder(performance.of_device, frames, most_n=most_n)
     except RecordingError as error:
         raise RecordingError(f"{frames.path}: {error}") from error
 

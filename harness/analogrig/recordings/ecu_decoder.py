@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from analogrig.answers import AlarmLevel, Answers
 from analogrig.devices.can_dbc import CanDbcDevice
+from analogrig.devices.captured import CapturedRun
 from analogrig.devices.ecu import MISSING, EcuAnswers
 from analogrig.devices.ecu_messages import EcuMessages, SamplePart
 from analogrig.errors import DeviceError
 from analogrig.links.link import Identifier
-from analogrig.recordings.captured import CapturedRun
 from analogrig.run import LOST, Channel
 
 if TYPE_CHECKING:
