@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from analogrig.catalogue import SteppedFlag
 
+__all__ = ["LARGEST_FLOAT32", "AlarmIs", "AlarmLevel"]
+"""Names for packages beside the core."""
+
 LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 """Largest magnitude of a reported quantity."""
 LOST = 0x20

@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar
 
 from analogrig.errors import ConfigurationError
 
-__all__ = ["build", "check_range", "fixtures", "locate", "plain", "read_toml", "to_toml"]
+__all__ = ["build", "check_range", "fixtures", "locate", "plain", "read_toml", "suggest", "to_toml"]
 """Names for packages beside the core."""
 
 T = TypeVar("T")

@@ -34,7 +34,7 @@ from analogrig.program import Program
 from analogrig.scenario import DEFAULT_PROGRAM, program_of
 from analogrig.storage import replace_file
 
-__all__ = ["IMPORTED", "INPUT", "LOST", "OUTPUT", "Channel", "missing_samples"]
+__all__ = ["IMPORTED", "INPUT", "LOST", "MAX_CODES", "OUTPUT", "Channel", "missing_samples"]
 """Names for packages beside the core."""
 
 FORMAT = "analogrig-run"

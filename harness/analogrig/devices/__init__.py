@@ -11,6 +11,7 @@ describe       ``AdaptedDescription`` (base class), ``DeviceDescription``, ``Cap
 state          ``Datasheet``, ``ModelOrders``
 answer         ``Device`` (base class), ``Samples``, ``Answers``, ``RaisedAlarm``, ``ReportedDiagnosis``,
                ``ReportedMisfit``
+log            ``CaptureDecoding``, ``CapturedRun`` (base class): runs in a CAN log with messages of the device's own
 flags          ``SteppedFlag``, ``LOST``, ``UNREPORTED``, ``UNARMED``; ``Cause``, ``Change`` of our catalogue
 ours           ``Estimator``, the core in this process; ``HostDevice``; ``trusted``, a description by its name
 errors         ``DeviceRefused``, ``LinkClosed``, ``TimeLimitReached``; ``analogrig`` has more
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
     from analogrig.catalogue import Cause, Change, SteppedFlag
     from analogrig.datasheet import Datasheet, ModelOrders
+    from analogrig.devices.captured import CaptureDecoding, CapturedRun
     from analogrig.devices.device import AdaptedDescription, Capability, Device, DeviceDescription
     from analogrig.devices.estimator import Estimator
     from analogrig.devices.processes import HostDevice
@@ -45,6 +47,7 @@ else:
             "analogrig.answers": "Answers RaisedAlarm ReportedDiagnosis ReportedMisfit Samples",
             "analogrig.catalogue": "Cause Change SteppedFlag",
             "analogrig.datasheet": "Datasheet ModelOrders",
+            "analogrig.devices.captured": "CaptureDecoding CapturedRun",
             "analogrig.devices.device": "AdaptedDescription Capability Device DeviceDescription",
             "analogrig.devices.estimator": "Estimator",
             "analogrig.devices.processes": "HostDevice",
@@ -62,6 +65,8 @@ __all__ = [
     "AdaptedDescription",
     "Answers",
     "Capability",
+    "CaptureDecoding",
+    "CapturedRun",
     "Cause",
     "Change",
     "Datasheet",

@@ -20,6 +20,9 @@ from analogrig.trust import Thing
 if TYPE_CHECKING:
     from analogrig.links.can_bus import CanBus
 
+__all__ = ["CanPort"]
+"""Names for packages beside the core."""
+
 MOST_BITRATE = 20_000_000
 
 

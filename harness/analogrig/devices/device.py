@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from analogrig.links.link import CanListener
     from analogrig.links.wire_faults import FaultyLine
 
+__all__ = ["Stated"]
+"""Names for packages beside the core."""
+
 KEEPS_MEMORY = "a state left from before the record"
 """Entry of ``Datasheet.cannot_tell`` of a device whose memory outlives a record."""
 

@@ -54,6 +54,9 @@ from analogrig.links.link import Link
 from analogrig.run import LOST, UNREPORTED
 from analogrig.wording import number_of
 
+__all__ = ["MOST_TIMEOUTS"]
+"""Names for packages beside the core."""
+
 LATEST = 32
 """Messages within this distance behind the expected number are repetitions; others follow a loss."""
 

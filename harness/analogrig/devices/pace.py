@@ -9,6 +9,9 @@ from analogrig.errors import ConfigurationError
 from analogrig.links.line import Line
 from analogrig.links.wire import Clock
 
+__all__ = ["Pace"]
+"""Names for packages beside the core."""
+
 
 class Pace:
     """Machine time on a clock: sample k exists k + 1 periods after the start and is not sent earlier."""

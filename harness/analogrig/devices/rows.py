@@ -26,6 +26,9 @@ from analogrig.devices.templates import CHECKSUM, PAD, TemplateField
 from analogrig.errors import DeviceError
 from analogrig.run import LOST, UNARMED, Channel
 
+__all__ = ["AnswerRows"]
+"""Names for packages beside the core."""
+
 
 class AnswerRows:
     """Answers not yet taken, in lists: numpy takes as long for one number as for a hundred."""

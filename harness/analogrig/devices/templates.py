@@ -19,6 +19,9 @@ import anycrc
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = ["checksum_of"]
+"""Names for packages beside the core."""
+
 MOST_TEMPLATE = 4_000
 """Characters of a template."""
 

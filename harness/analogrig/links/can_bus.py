@@ -28,6 +28,9 @@ from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.links.line import CanLine
 from analogrig.links.wire import WRITE_TIMEOUT_S, Clock, Connection
 
+__all__ = ["CanBus", "PythonCanBus"]
+"""Names for packages beside the core."""
+
 RECEIVED_AHEAD_N = 200
 """Received frames that the system buffers at least: half the capacity of a socket buffer of 208 kB."""
 

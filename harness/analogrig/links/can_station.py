@@ -16,6 +16,9 @@ from analogrig.links.can_bus import CanBus
 from analogrig.links.link import CanListener, Identifier
 from analogrig.wording import number_of
 
+__all__ = ["CanStation"]
+"""Names for packages beside the core."""
+
 _REMEMBERED_N = 256
 """Sent frames that are recognised when the interface returns them."""
 

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from analogrig.wording import number_of
 
+__all__ = ["Causes"]
+"""Names for packages beside the core."""
+
 _MOST = 200
 """Causes that are kept; a hostile sender must not fill the memory."""
 

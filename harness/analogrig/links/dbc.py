@@ -11,6 +11,9 @@ from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.links.quiet import silence_logger
 
+__all__ = ["check_layout", "load_dbc"]
+"""Names for packages beside the core."""
+
 MAX_DBC_BYTES = 4_000_000
 """Size that cantools takes some ten seconds to parse."""
 

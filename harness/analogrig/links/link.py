@@ -16,6 +16,9 @@ from analogrig.wording import number_of
 if TYPE_CHECKING:
     import can
 
+__all__ = ["CanListener", "Identifier", "identifier_text"]
+"""Names for packages beside the core."""
+
 CanListener = Callable[["can.Message"], object]
 """Callback for every frame on a CAN bus, such as a log writer of python-can. ``is_rx`` is False for frames of the
 harness; ``timestamp`` is the link's clock."""
