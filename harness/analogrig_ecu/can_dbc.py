@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Self
 
+from analogrig import ConfigurationError
+from analogrig.devices import Capability, Device
 from analogrig.devices.can import CanPort
-from analogrig.devices.dbc_description import DbcDescription
-from analogrig.devices.device import Capability, Device
-from analogrig.errors import ConfigurationError
 from analogrig.trust import absolute_path
+from analogrig_ecu.dbc_description import DbcDescription
 
 if TYPE_CHECKING:
     import can
 
-    from analogrig.devices.captured import CaptureDecoding
-    from analogrig.devices.ecu_messages import EcuMessages
+    from analogrig.devices import CaptureDecoding
     from analogrig.run import Channel
+    from analogrig_ecu.ecu_messages import EcuMessages
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class CanDbcDevice(CanPort, DbcDescription):
 
         :raises ConfigurationError: the DBC is wrong, or the device file does not fit it.
         """
-        from analogrig.devices.ecu_messages import EcuMessages
+        from analogrig_ecu.ecu_messages import EcuMessages
 
         return EcuMessages(self)
 
@@ -73,12 +73,12 @@ class CanDbcDevice(CanPort, DbcDescription):
     def log_decoder(
         self, channels: Mapping[str, Channel], frames: Iterable[can.Message], *, most_n: int
     ) -> CaptureDecoding:
-        from analogrig.recordings.ecu_decoder import EcuDecoder
+        from analogrig_ecu.ecu_decoder import EcuDecoder
 
         return EcuDecoder(self, channels, frames, most_n=most_n)
 
     def open(self) -> Device:
-        from analogrig.devices.ecu import EcuDevice
         from analogrig.links.can_bus import PythonCanBus
+        from analogrig_ecu.ecu import EcuDevice
 
         return EcuDevice(self, PythonCanBus(self.bus_config()))

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from analogrig.answers import AlarmIs
-from analogrig.datasheet import Datasheet
-from analogrig.devices.device import DeviceDescription, Stated
-from analogrig.devices.ecu_checksum import ChecksumSpec
+from analogrig.devices import Datasheet, DeviceDescription
+from analogrig.devices.device import Stated
 from analogrig.run import MAX_CODES, Channel
+from analogrig_ecu.ecu_checksum import ChecksumSpec
 
 Units = tuple[float, float] | Literal["codes", "volts", "physical"]
 """Value of a signal by the code of a sample: (scale, offset) of code * scale + offset; the code itself; the volts at

@@ -9,19 +9,28 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import can
 
-from analogrig.answers import LARGEST_FLOAT32, Answers, RaisedAlarm, Samples
-from analogrig.catalogue import SteppedFlag
-from analogrig.devices.dbc_description import DbcDescription, ReceivedSignals, Request
-from analogrig.devices.device import Device
-from analogrig.devices.ecu_messages import Answer, EcuMessages
+from analogrig import ConfigurationError, DeviceError, LinkError, LinkTimeout
+from analogrig.answers import LARGEST_FLOAT32
+from analogrig.devices import (
+    LOST,
+    UNARMED,
+    UNREPORTED,
+    Answers,
+    Device,
+    RaisedAlarm,
+    Samples,
+    SteppedFlag,
+    TimeLimitReached,
+)
 from analogrig.devices.exchange import MOST_TIMEOUTS
 from analogrig.devices.pace import Pace
 from analogrig.devices.rows import AnswerRows
-from analogrig.errors import ConfigurationError, DeviceError, LinkError, LinkTimeout, TimeLimitReached
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_station import CanStation
 from analogrig.links.link import CanListener
-from analogrig.run import LOST, UNARMED, UNREPORTED, Channel
+from analogrig.run import Channel
+from analogrig_ecu.dbc_description import DbcDescription, ReceivedSignals, Request
+from analogrig_ecu.ecu_messages import Answer, EcuMessages
 
 MISSING = int(SteppedFlag.MISSING)
 

@@ -7,17 +7,18 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.answers import AlarmLevel, Answers
-from analogrig.devices.can_dbc import CanDbcDevice
-from analogrig.devices.captured import CapturedRun
-from analogrig.devices.ecu import MISSING, EcuAnswers
-from analogrig.devices.ecu_messages import EcuMessages, SamplePart
-from analogrig.errors import DeviceError
+from analogrig import DeviceError
+from analogrig.answers import AlarmLevel
+from analogrig.devices import LOST, Answers, CapturedRun
 from analogrig.links.link import Identifier
-from analogrig.run import LOST, Channel
+from analogrig.run import Channel
+from analogrig_ecu.ecu import MISSING, EcuAnswers
+from analogrig_ecu.ecu_messages import EcuMessages, SamplePart
 
 if TYPE_CHECKING:
     import can
+
+    from analogrig_ecu.can_dbc import CanDbcDevice
 
 
 class EcuRun(CapturedRun):

@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 
 import can
 
+from analogrig import ConfigurationError
 from analogrig.answers import LARGEST_FLOAT32
 from analogrig.config import suggest
-from analogrig.devices.dbc_description import DbcDescription, Request, scale
-from analogrig.devices.ecu_checksum import COUNTED_TO_14, ChecksumSpec, FrameChecksum
-from analogrig.devices.ecu_traffic import EcuTraffic
-from analogrig.devices.message_reader import MessageReader, frame_bytes
-from analogrig.errors import ConfigurationError
 from analogrig.links.causes import Causes
 from analogrig.links.dbc import check_layout, load_dbc
 from analogrig.links.link import Identifier
 from analogrig.run import Channel
+from analogrig_ecu.dbc_description import DbcDescription, Request, scale
+from analogrig_ecu.ecu_checksum import COUNTED_TO_14, ChecksumSpec, FrameChecksum
+from analogrig_ecu.ecu_traffic import EcuTraffic
+from analogrig_ecu.message_reader import MessageReader, frame_bytes
 
 CLASSIC_BYTES = 8
 FD_BYTES = 64

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import can
 
-from analogrig.devices.message_reader import MessageReader
 from analogrig.links.causes import Causes
 from analogrig.links.link import Identifier, identifier_text
 from analogrig.wording import number_of
+from analogrig_ecu.message_reader import MessageReader
 
 _FIRST_DESTINED = 240
 """PDU format of J1939 from which on the next byte belongs to the parameter group, not to a destination."""

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import can
 
-from analogrig.devices.ecu_checksum import FrameChecksum
-from analogrig.devices.readings import layout_of, misreading
 from analogrig.links.causes import Causes
 from analogrig.links.link import Identifier, identifier_text
 from analogrig.wording import number_of
+from analogrig_ecu.ecu_checksum import FrameChecksum
+from analogrig_ecu.readings import layout_of, misreading
 
 _ABSENT = re.compile(
     r"sna|n/?a|nan|(signal|data|value)?[\s_]*(is[\s_]*)?(not|un)[\s_]*(avail|defined|valid|known)\w*|invalid\w*"

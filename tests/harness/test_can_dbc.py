@@ -19,7 +19,6 @@ import pytest
 from analogrig.answers import Samples
 from analogrig.bench import Bench
 from analogrig.cli import main
-from analogrig.devices.can_dbc import CanDbcDevice
 from analogrig.devices.registry import describe, open_dut
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout, RecordingError
 from analogrig.estimator_config import EstimatorConfig
@@ -30,6 +29,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.run import LOST, UNARMED, UNREPORTED, Run
 from analogrig.scenario import Scenario
 from analogrig.testing.counterexample import Counterexample
+from analogrig_ecu.can_dbc import CanDbcDevice
 from tests.harness.scripted_ecu import DBC, Answer, ScriptedEcu, write
 
 THESIS_HASH = "54f04f72e4f6d22a"

@@ -15,7 +15,6 @@ import can
 import cantools
 import pytest
 
-from analogrig.devices.can_dbc import CanDbcDevice
 from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError
 from analogrig.judging.verdict import judge
@@ -25,6 +24,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_ecu.can_dbc import CanDbcDevice
 
 N = 40
 SCENARIO = dataclasses.replace(Scenario.load("healthy"), samples=N)

@@ -16,14 +16,14 @@ import cantools
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.can_dbc import CanDbcDevice
-from analogrig.devices.ecu_checksum import ChecksumSpec, FrameChecksum
 from analogrig.devices.registry import describe, open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge
 from analogrig.reporting.summary import summary
 from analogrig.rigs.rig import Rig
 from analogrig.run import UNARMED, Run
+from analogrig_ecu.can_dbc import CanDbcDevice
+from analogrig_ecu.ecu_checksum import ChecksumSpec, FrameChecksum
 from tests.harness.test_can_mismatch import (
     DBC,
     SCENARIO,

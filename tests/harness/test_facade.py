@@ -23,7 +23,7 @@ PUBLIC = """
 
 DEVICES = """
     LOST UNARMED UNREPORTED AdaptedDescription Answers Capability
-    Cause Change Datasheet Device DeviceDescription DeviceRefused
+    CaptureDecoding CapturedRun Cause Change Datasheet Device DeviceDescription DeviceRefused
     Estimator HostDevice LinkClosed ModelOrders RaisedAlarm ReportedDiagnosis
     ReportedMisfit Samples SteppedFlag Thing TimeLimitReached trusted
 """.split()

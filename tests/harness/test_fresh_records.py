@@ -15,7 +15,6 @@ import pytest
 
 from analogrig import Bench, Scenario, open_rig
 from analogrig.answers import Samples
-from analogrig.devices.can_dbc import CanDbcDevice
 from analogrig.devices.device import KEEPS_MEMORY, Device, DeviceDescription
 from analogrig.devices.estimator_library import EstimatorLibrary
 from analogrig.devices.inproc import InprocDevice
@@ -23,6 +22,7 @@ from analogrig.devices.lines import LinesDevice, ProgramDevice
 from analogrig.devices.python import PythonDescription
 from analogrig.devices.registry import describe
 from analogrig.run import Run
+from analogrig_ecu.can_dbc import CanDbcDevice
 from tests.harness.library_builds import OWN, build
 from tests.harness.remembering import PLACES
 

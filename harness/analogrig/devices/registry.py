@@ -41,7 +41,6 @@ KINDS = Kinds(
         "qemu-f405": "analogrig.devices.processes:QemuF405",
         "serial": "analogrig.devices.port:SerialDevice",
         "can": "analogrig.devices.can:CanDevice",
-        "can-dbc": "analogrig.devices.can_dbc:CanDbcDevice",
         "python": "analogrig.devices.python:PythonDescription",
         "lines": "analogrig.devices.lines:LinesDevice",
         "frames": "analogrig.devices.lines:FramesDevice",
