@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -73,8 +72,8 @@ class DeviceAnswers:
         if sheet.alarms:
             values[run.alarm_index, columns.index(ALARM)] = 1.0
             compared[:, columns.index(ALARM)] = ~run.lost
-        steps = [_resolution(values[compared[:, i], i]) for i in range(len(columns))]
-        tolerance = np.column_stack([step(values[:, i]) for i, step in enumerate(steps)])
+        units, parts = zip(*(_resolution(values[compared[:, i], i]) for i in range(len(columns))), strict=True)
+        tolerance = np.array(units) + np.array(parts) * np.abs(values.astype(np.float64))
         return cls(columns, values, compared, tolerance)
 
     def upto(self, samples: int) -> Self:
@@ -130,29 +129,23 @@ def _theta_names(reported: int, library: Library, theta: Sequence[str]) -> Seque
     )
 
 
-def _resolution(values: NDArray[np.float32]) -> Callable[[NDArray[np.float32]], NDArray[np.float64]]:
-    """Function that returns the resolution of a column at each value, found from its values.
+def _resolution(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Resolution of a column, found from its values: a unit, and a part of the value.
 
     A firmware prints so many digits, or sends whole numbers of some unit. The rest are floats.
     """
     distinct = np.unique(values[np.isfinite(values) & (values != 0)]).astype(np.float64)
     if len(distinct) >= _LEAST_VALUES:
-        units = [*(10.0**-digits for digits in range(_MOST_DIGITS)), *(2.0**-bits for bits in range(_MOST_BITS))]
-        for unit in units:
+        for unit in (*(10.0**-digits for digits in range(_MOST_DIGITS)), *(2.0**-bits for bits in range(_MOST_BITS))):
             if _are_multiples(distinct, unit):
-                return functools.partial(_at_each, unit, ULP)
+                return unit, ULP
         for digits in range(3, _MOST_DIGITS):
             if _are_multiples(distinct, 10.0 ** (np.floor(np.log10(np.abs(distinct))) - digits + 1)):
-                return functools.partial(_at_each, 0.0, 10.0 ** (1 - digits))
+                return 0.0, 10.0 ** (1 - digits)
         with np.errstate(over="ignore"):
             if np.array_equal(distinct.astype(np.float16).astype(np.float64), distinct):
-                return functools.partial(_at_each, _HALF_LEAST, _HALF_ULP)
-    return functools.partial(_at_each, 0.0, ULP)
-
-
-def _at_each(unit: float, part: float, x: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Resolution at each value: a unit and a part of the value."""
-    return np.asarray(unit + part * np.abs(x.astype(np.float64)))
+                return _HALF_LEAST, _HALF_ULP
+    return 0.0, ULP
 
 
 def _are_multiples(values: NDArray[np.float64], unit: float | NDArray[np.float64]) -> bool:

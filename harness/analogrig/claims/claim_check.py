@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from analogrig.bench import Bench
 from analogrig.catalogue import SteppedFlag
 from analogrig.claims.answered import ULP, DeviceAnswers
-from analogrig.claims.codes import code_hypotheses, unit_hypotheses
-from analogrig.claims.events import Edit, find_events
+from analogrig.claims.events import find_events
 from analogrig.claims.feed import INNOVATION, Feed, Library, Matrix, library_of
 from analogrig.claims.outputs import explain_outputs
-from analogrig.claims.sample_faults import Suspect, input_hypotheses
+from analogrig.claims.sample_faults import Suspect, code_hypotheses, input_hypotheses, unit_hypotheses
 from analogrig.claims.wrong_settings import fitted, setting_hypotheses
 from analogrig.devices.catalogue_device import has_our_estimator
 from analogrig.devices.estimator import REPORTED
@@ -67,7 +66,6 @@ _ROUNDING = "from sample {} on up to rounding: compiled with other options than 
 _EVENT_N = 50
 """A first difference after so many samples is rather that of one sample than of a number to be fitted."""
 
-
 _NO_LINK = "none"
 """Link of a run without messages, which lacks what they alone carry."""
 
@@ -86,9 +84,6 @@ _REFRESH = SteppedFlag.RESTARTED | SteppedFlag.GATHERING
 
 _SURE_COUNTERS = ("missing", "refused", "saturated", "stuck", "alarms")
 """Counters that do not depend on rounding."""
-
-_Report = tuple[float, ...]
-"""Sample and values of a report."""
 
 
 @dataclass(frozen=True)
@@ -131,36 +126,26 @@ class ClaimCheck:
             note = f" ({self.note})" if self.note else ""
             return f"{self.samples} samples as the bundled library answers: {', '.join(self.compared)}{note}"
         where = f"first differing sample {self.first}: {'; '.join(self.fields)}"
-        if not self.tried_n:
-            return where
-        cause = self.cause or f"none of {self.tried_n} hypotheses{self._nearest()}; {_OTHER_BUILD}"
-        return f"{where}; cause: {cause}"
-
-    def _nearest(self) -> str:
-        if not self.tried or self.tried[0].agrees_n <= self.first:
-            return ""
-        best = self.tried[0]
-        return f"; nearest, up to sample {best.agrees_n}: {best.cause}"
+        if not self.tried_n or self.cause:
+            return f"{where}; cause: {self.cause}" if self.cause else where
+        near = [f"; nearest, up to sample {each.agrees_n}: {each.cause}" for each in self.tried[:1]
+                if each.agrees_n > self.first]  # fmt: skip
+        return f"{where}; cause: none of {self.tried_n} hypotheses{''.join(near)}; {_OTHER_BUILD}"
 
     def text(self) -> str:
         """Lines for people: the first difference, the cause, and the table of hypotheses."""
         lines = [self.summary.replace("; cause: ", "\ncause: ")]
         if self.tried:
             width = max(len(each.cause) for each in self.tried)
-            lines += [
-                "",
-                f"{'hypothesis':{width}}  agrees until  explains",
-                *(_row(each, width) for each in self.tried),
-            ]
+            lines += ["", f"{'hypothesis':{width}}  agrees until  explains"]
+            for each in self.tried:
+                explained = max(0.0, 1.0 - each.unexplained)
+                lines.append(f"{each.cause:{width}}  {each.agrees_n:12}  {explained:7.0%}")
             lines.append(f"{self.tried_n} hypotheses tried")
         return "\n".join(lines)
 
     def as_table(self) -> dict[str, Any]:
         return {"agrees": self.agrees, **dataclasses.asdict(self), "summary": self.summary}
-
-
-def _row(tried: Tried, width: int) -> str:
-    return f"{tried.cause:{width}}  {tried.agrees_n:12}  {max(0.0, 1.0 - tried.unexplained):7.0%}"
 
 
 def claimed_estimator(run: Run) -> EstimatorConfig:
@@ -198,7 +183,6 @@ def compare_with_library(run: Run, before: Run | None = None, *, explain: bool =
     library, conditions = Library(claimed_estimator(run)), run.conditions
     description = recorded(conditions.dut)
     form = getattr(description, "form", None)
-    is_ours = has_our_estimator(description)
     answered = DeviceAnswers.of(run, library, () if form is None else form().theta)
     feed = Feed.of(run)
     claimed = library.replay(feed)
@@ -214,37 +198,36 @@ def compare_with_library(run: Run, before: Run | None = None, *, explain: bool =
             name: conditions.channels[conditions.program.channels[i]] for name, i in (("u", INPUT), ("y", OUTPUT))
         }
         past = None if before is None else Feed.of(before)
-        search = _Search(answered, library, feed, claimed, past, channels)
-        if not explain:
-            return ClaimCheck(run.samples, compared, first, search.fields())
-        found = search.cause()
-        if not found.cause and is_rounded:
-            search = _Search(wide, library, feed, claimed, past, channels)
-            found = search.cause()
-        return ClaimCheck(run.samples, compared, search.first, search.fields(), *found)
+        for tolerant in (answered, wide) if is_rounded and explain else (answered,):
+            search = _Search(tolerant, library, feed, claimed, past, channels)
+            found = ClaimCheck(
+                run.samples, compared, search.first, search.fields(), *(search.cause() if explain else ())
+            )
+            if found.cause:
+                break
+        return found
     if is_rounded:
         note = _ROUNDING.format(first)
-    if is_ours and conditions.link != _NO_LINK:
+    if has_our_estimator(description) and conditions.link != _NO_LINK:
         compared = tuple(dict.fromkeys((*compared, "flags", *_REPORTS, "counters")))
-        if wrong := min(_other_reports(run, _bundled(run, library.config), is_rounded=is_rounded), default=None):
+        if wrong := min(_other_reports(run, library.config, is_rounded=is_rounded), default=None):
             return ClaimCheck(run.samples, compared, wrong[0], (wrong[1],))
     return ClaimCheck(run.samples, compared, run.samples, note=note)
 
 
-def _bundled(run: Run, config: EstimatorConfig) -> Run:
-    """Run of the bundled device in this process on the same samples, to which lost ones are missing."""
-    clipped = run.clipped | run.lost[:, np.newaxis]
-    rig = RecordingRig.of(dataclasses.replace(run, clipped=clipped), Path("claimed"))
-    with InprocDevice(name="bundled", exchange="block", estimator=config).connect() as device:
-        return Bench(rig, device).play(rig.scenario(), run.conditions.seed)
-
-
-def _other_reports(run: Run, expected: Run, *, is_rounded: bool) -> Iterator[tuple[int, str]]:
+def _other_reports(run: Run, config: EstimatorConfig, *, is_rounded: bool) -> Iterator[tuple[int, str]]:
     """Samples and texts of differences of what only the messages of our catalogue carry.
+
+    The expected messages are those of the bundled device in this process on the same samples, to which lost ones are
+    missing.
 
     :param is_rounded: the device rounds otherwise: values may differ a little, a diagnosis or a refresh of the
         prefilter may come at another sample. Its alarms have been compared with the estimates.
     """
+    clipped = run.clipped | run.lost[:, np.newaxis]
+    rig = RecordingRig.of(dataclasses.replace(run, clipped=clipped), Path("claimed"))
+    with InprocDevice(name="bundled", exchange="block", estimator=config).connect() as device:
+        expected = Bench(rig, device).play(rig.scenario(), run.conditions.seed)
     is_reported = (run.flags & (LOST | UNREPORTED)) == 0
     compared = np.uint8(0xFF & ~_REFRESH if is_rounded else 0xFF)
     other = (((run.flags ^ expected.flags) & compared) != 0) & is_reported
@@ -258,11 +241,11 @@ def _other_reports(run: Run, expected: Run, *, is_rounded: bool) -> Iterator[tup
             list(zip(*(getattr(each, f"{report}_{name}").tolist() for name in ("index", *values)), strict=True))
             for each in (run, expected)
         )
-        for one, due_one in itertools.zip_longest(found, due):
-            if not _are_near(one, due_one, is_rounded=is_rounded):
-                at = min(each[0] for each in (one, due_one) if each)
+        for pair in itertools.zip_longest(found, due):
+            if not _are_near(*pair, is_rounded=is_rounded):
+                texts = ["none" if each is None else f"({', '.join(f'{x:.6g}' for x in each)})" for each in pair]
                 names = f"{report} ({', '.join(('sample', *values))})"
-                yield at, f"{names} is {_values(one)}, expected {_values(due_one)}"
+                yield min(each[0] for each in pair if each), f"{names} is {texts[0]}, expected {texts[1]}"
                 break
     if not run.lost.any() and not run.conditions.faults:
         for name in _SURE_COUNTERS if is_rounded else REPORTED:
@@ -271,16 +254,12 @@ def _other_reports(run: Run, expected: Run, *, is_rounded: bool) -> Iterator[tup
                 yield run.samples - 1, f"counter {name} is {counted}, expected {due_n}"
 
 
-def _are_near(one: _Report | None, other: _Report | None, *, is_rounded: bool) -> bool:
+def _are_near(one: tuple[float, ...] | None, other: tuple[float, ...] | None, *, is_rounded: bool) -> bool:
     """True if all values are equal; of a device that rounds otherwise, reals nearly, and the sample does not count."""
     if one is None or other is None or not is_rounded:
         return one == other
     pairs = zip(one[1:], other[1:], strict=True)
     return all(a == b or (not float(a).is_integer() and math.isclose(a, b, rel_tol=_REPORT_ROUNDING)) for a, b in pairs)
-
-
-def _values(report: _Report | None) -> str:
-    return "none" if report is None else f"({', '.join(f'{each:.6g}' for each in report)})"
 
 
 def _rounding(library: Library, feed: Feed, claimed: Matrix) -> NDArray[np.float64]:
@@ -296,157 +275,129 @@ def _rounding(library: Library, feed: Feed, claimed: Matrix) -> NDArray[np.float
     )
 
 
-class _SearchResult(NamedTuple):
-    """Result of a search: the cause, the best hypotheses, and the number of those tried."""
-
-    cause: str
-    tried: tuple[Tried, ...]
-    tried_n: int
-
-
+@dataclass
 class _Search:
     """Search for the hypothesis that reproduces the answers."""
 
-    def __init__(
-        self,
-        answered: DeviceAnswers,
-        library: Library,
-        feed: Feed,
-        claimed: Matrix,
-        before: Feed | None,
-        channels: Mapping[str, Channel],
-    ) -> None:
-        self._answered, self._library, self._feed, self._claimed = answered, library, feed, claimed
-        self._before, self._channels = before, channels
-        self.first = answered.first_difference(claimed)
-        self._tried: list[Tried] = []
-        self._suspects: list[tuple[Suspect, Tried]] = []
+    answered: DeviceAnswers
+    library: Library
+    feed: Feed
+    claimed: Matrix
+    before: Feed | None
+    channels: Mapping[str, Channel]
+    tried: list[Tried] = field(default_factory=list)
+    suspects: list[tuple[Suspect, Tried]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.first = self.answered.first_difference(self.claimed)
 
     def fields(self) -> tuple[str, ...]:
         """Fields that differ at the first sample that does."""
-        found, expected = self._answered, self._claimed
+        found, expected = self.answered, self.claimed
         return tuple(
             f"{found.columns[i]} is {found.values[self.first, i]:.6g}, expected {expected[self.first, i]:.6g}"
             for i in np.flatnonzero(found.wrong(expected)[self.first]).tolist()
         )
 
-    def cause(self) -> _SearchResult:
-        """Try one family of hypotheses after the other, until one reproduces the answers."""
-        last = (self._events, self._fitted)
-        ordered = last if self.first >= _EVENT_N else reversed(last)
-        for family in (self._outputs, self._inputs, *ordered, self._pairs):
+    def cause(self) -> tuple[str, tuple[Tried, ...], int]:
+        """Cause, best hypotheses, and number of those tried: one family after the other, until one reproduces the
+        answers."""
+        last: list[Callable[[], None]] = [
+            self._events,
+            lambda: self._each(fitted(self.answered, self.library, self.feed)),
+        ]
+        if self.first < _EVENT_N:
+            last.reverse()
+        alarms = np.flatnonzero(self.answered.values[:, -1])
+        for family in (
+            self._outputs,
+            lambda: self._each(input_hypotheses(self.feed, self.before, alarms)),
+            lambda: self._each(code_hypotheses()),
+            lambda: self._each(unit_hypotheses(self.channels)),
+            lambda: self._each(setting_hypotheses(self.library.config)),
+            *last,
+            self._pairs,
+        ):
             family()
-            if named := self._named():
+            ranked = sorted(self.tried, key=lambda each: (-each.agrees_n, each.unexplained))
+            if named := self._named(ranked):
                 break
-        return _SearchResult(named, tuple(self._ranked()[:_SHOWN]), len(self._tried))
+        return named, tuple(ranked[:_SHOWN]), len(self.tried)
+
+    def _named(self, ranked: Sequence[Tried]) -> str:
+        """Cause of the hypothesis that reproduces the answers; empty if none does."""
+        if ranked and ranked[0].agrees_n == len(self.claimed):
+            return ranked[0].cause
+        nearly = min(self.tried, key=lambda each: each.unexplained, default=None)
+        is_near = nearly is not None and nearly.unexplained <= _MOST_LEFT
+        return f"{nearly.cause} (nearly)" if nearly is not None and is_near else ""
 
     def _outputs(self) -> None:
-        if outputs := explain_outputs(self._answered, self._claimed):
-            self._tried.append(Tried(outputs, len(self._claimed), 0.0))
-
-    def _inputs(self) -> None:
-        alarms = np.flatnonzero(self._answered.values[:, -1])
-        for family in (
-            input_hypotheses(self._feed, self._before, alarms),
-            code_hypotheses(),
-            unit_hypotheses(self._channels),
-            setting_hypotheses(self._library.config),
-        ):
-            for each in family:
-                self._try(each)
-            if self._named():
-                return
+        if outputs := explain_outputs(self.answered, self.claimed):
+            self.tried.append(Tried(outputs, len(self.claimed), 0.0))
 
     def _events(self) -> None:
-        edits, feed = find_events(self._answered, self._library, self._feed)
+        edits, feed = find_events(self.answered, self.library, self.feed)
+        kinds: dict[str, list[int]] = {}
+        for edit in edits:
+            kinds.setdefault(edit.kind, []).append(edit.at)
         if edits:
-            self._enter(_events_text(edits), self._library.replay(feed))
+            text = "; ".join(f"{kind} at {_places(at)}" for kind, at in kinds.items())
+            self._enter(text, self.library.replay(feed))
 
-    def _fitted(self) -> None:
-        for each in fitted(self._answered, self._library, self._feed):
-            self._try(each)
-
-    def _ranked(self) -> list[Tried]:
-        return sorted(self._tried, key=lambda each: (-each.agrees_n, each.unexplained))
-
-    def _named(self) -> str:
-        """Cause of the hypothesis that reproduces the answers; empty if none does."""
-        n = len(self._claimed)
-        for each in self._ranked():
-            if each.agrees_n == n:
-                return each.cause
-        nearly = min(self._tried, key=lambda each: each.unexplained, default=None)
-        if nearly is not None and nearly.unexplained <= _MOST_LEFT:
-            return f"{nearly.cause} (nearly)"
-        return ""
+    def _each(self, family: Iterator[Suspect]) -> None:
+        for suspect in family:
+            self._try(suspect, self.first)
 
     def _pairs(self) -> None:
         """Try each of the best hypotheses together with every other."""
-        helpful = [each for each in self._suspects if each[1].agrees_n > self.first]
+        helpful = [each for each in self.suspects if each[1].agrees_n > self.first]
         best = sorted(helpful, key=lambda each: (-each[1].agrees_n, each[1].unexplained))[:_PAIRED]
-        others = [suspect for suspect, _ in self._suspects]
-        for suspect, tried in best:
-            for other in others:
-                self._try(suspect.with_other(other), least_n=tried.agrees_n)
-                if self._tried[-1].agrees_n == len(self._claimed):
-                    return
+        others = [suspect for suspect, _ in self.suspects]
+        for (suspect, tried), other in itertools.product(best, others):
+            self._try(suspect.with_other(other), tried.agrees_n)
+            if self.tried[-1].agrees_n == len(self.claimed):
+                return
 
-    def _try(self, suspect: Suspect, least_n: int | None = None) -> None:
+    def _try(self, suspect: Suspect, least_n: int) -> None:
         """Replay a hypothesis: the first samples, then up to shortly after the first difference, then all.
 
-        :param least_n: samples that it must explain to be replayed on; by default those before the first difference.
+        :param least_n: samples that it must explain to be replayed on.
         """
-        library = library_of(self._library.config, **suspect.settings) if suspect.settings else self._library
+        library = library_of(self.library.config, **suspect.settings) if suspect.settings else self.library
         if library is None:
             return
-        least_n = self.first if least_n is None else least_n
-        tried: Tried | None = None
         for samples in (_FIRST_N, least_n + _PREFIX_N):
-            n = min(len(self._claimed), samples)
-            agrees_n = self._answered.upto(n).first_difference(self._answers(library, suspect, n))
+            n = min(len(self.claimed), samples)
+            agrees_n = self.answered.upto(n).first_difference(self._answers(library, suspect, n))
             if agrees_n < n and agrees_n <= least_n:
-                tried = Tried(suspect.cause, agrees_n, 1.0)
+                self.tried.append(Tried(suspect.cause, agrees_n, 1.0))
                 break
-        if tried is None:
-            self._enter(suspect.cause, self._answers(library, suspect, len(self._claimed)))
         else:
-            self._tried.append(tried)
-        self._suspects.append((suspect, self._tried[-1]))
+            self._enter(suspect.cause, self._answers(library, suspect, len(self.claimed)))
+        self.suspects.append((suspect, self.tried[-1]))
 
     def _answers(self, library: Library, suspect: Suspect, samples: int) -> Matrix:
-        feed = suspect.alter(self._feed.upto(samples))
+        feed = suspect.alter(self.feed.upto(samples))
         answers = library.replay(feed)
-        if samples and feed.answer[0] < 0 and library.columns == self._library.columns:
-            answers[0] = self._answered.values[0]  # nothing is known of an answer before the first step
-        if library.columns == self._library.columns:
+        if library.columns == self.library.columns:
+            if samples and feed.answer[0] < 0:
+                answers[0] = self.answered.values[0]  # nothing is known of an answer before the first step
             return answers
-        aligned = np.zeros((samples, len(self._library.columns)), np.float32)
-        for i, name in enumerate(self._library.columns):
+        aligned = np.zeros((samples, len(self.library.columns)), np.float32)
+        for i, name in enumerate(self.library.columns):
             if name in library.columns:
                 aligned[:, i] = answers[:, library.columns.index(name)]
         return aligned
 
     def _enter(self, cause: str, answers: Matrix) -> None:
-        agrees_n = self._answered.first_difference(answers)
-        self._tried.append(Tried(cause, agrees_n, self._answered.unexplained(answers, self._claimed)))
-
-
-def _events_text(edits: Sequence[Edit]) -> str:
-    kinds: dict[str, list[int]] = {}
-    for edit in edits:
-        kinds.setdefault(edit.kind, []).append(edit.at)
-    return "; ".join(f"{kind} at {_places(at)}" for kind, at in kinds.items())
+        agrees_n = self.answered.first_difference(answers)
+        self.tried.append(Tried(cause, agrees_n, self.answered.unexplained(answers, self.claimed)))
 
 
 def _places(at: Sequence[int]) -> str:
     steps = set(np.diff(at).tolist())
     if len(at) > 2 and len(steps) == 1:
         return f"sample {at[0]}, then each {steps.pop()}"
-    return ("sample " if len(at) == 1 else "samples ") + ", ".join(map(str, at[:6])) + _wrap(at[0])
-
-
-def _wrap(at: int) -> str:
-    for bits in (16, 15, 8):
-        if abs(at - (1 << bits)) <= 1:
-            return f" (2^{bits}: a counter wraps)"
-    return ""
+    wraps = [f" (2^{bits}: a counter wraps)" for bits in (16, 15, 8) if abs(at[0] - (1 << bits)) <= 1]
+    return ("sample " if len(at) == 1 else "samples ") + ", ".join(map(str, at[:6])) + "".join(wraps[:1])

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from analogrig.claims.answered import DeviceAnswers
-from analogrig.claims.codes import HIGH, LOW, torn
 from analogrig.claims.feed import Feed, Library
-
-Change = Callable[[Feed], Feed]
+from analogrig.claims.sample_faults import HIGH, LOW, Alter, torn
 
 MOST_EVENTS = 12
 
@@ -40,32 +37,29 @@ def find_events(answered: DeviceAnswers, library: Library, feed: Feed) -> tuple[
     """Faults of single samples, in order, and the feed with all of them."""
     found: list[Edit] = []
     n = len(answered.values)
-    first = answered.first_difference(library.replay(feed))
-    while first < n and len(found) < MOST_EVENTS:
+    while (first := answered.first_difference(library.replay(feed))) < n and len(found) < MOST_EVENTS:
         best = _best_edit(answered, library, feed, first)
         if best is None:
             break
-        edit, feed = best
-        found.append(edit)
+        found.append(best[0])
+        feed = best[1](feed)
         if (repeated := _repeated(answered, library, feed, found)) is not None:
             return found, repeated
-        first = answered.first_difference(library.replay(feed))
     return found, feed
 
 
-def _best_edit(answered: DeviceAnswers, library: Library, feed: Feed, first: int) -> tuple[Edit, Feed] | None:
+def _best_edit(answered: DeviceAnswers, library: Library, feed: Feed, first: int) -> tuple[Edit, Alter] | None:
     """Edit after which the answers agree for longest."""
     n = min(len(answered.values), first + _WINDOW_N)
-    shown = answered.upto(n)
-    short = feed.upto(n)
-    here = int(short.answer[first]) if first < n else -1
-    best: tuple[int, Edit, Change] | None = None
+    shown, short = answered.upto(n), feed.upto(n)
+    here, longest = int(short.answer[first]), min(first + _LEAST_GAIN_N, n) - 1
+    best: tuple[Edit, Alter] | None = None
     for at in range(here, max(here - _BACK_N, -1), -1):
         for kind, change in _edits(short, at):
             agreed = shown.first_difference(library.replay(change(short)))
-            if agreed >= min(first + _LEAST_GAIN_N, n) and (best is None or agreed > best[0]):
-                best = agreed, Edit(kind, at), change
-    return None if best is None else (best[1], best[2](feed))
+            if agreed > longest:
+                longest, best = agreed, (Edit(kind, at), change)
+    return best
 
 
 def _repeated(answered: DeviceAnswers, library: Library, feed: Feed, found: list[Edit]) -> Feed | None:
@@ -86,25 +80,30 @@ _SHIFTING = (_LOST, _TWICE)
 """Edits that move the steps after them."""
 
 
-def _edits(feed: Feed, at: int) -> Iterator[tuple[str, Change]]:
+def _edits(feed: Feed, at: int) -> Iterator[tuple[str, Alter]]:
     """Every fault of one step, by its name."""
     u, y = feed.u, feed.y
     before, after = max(at - 1, 0), min(at + 1, len(u) - 1)
+    stale = {"u": u[before], "y": y[before]}
     yield _LOST, lambda feed: feed.without(feed.at(at))
-    yield "stale sample: that before it is taken again", functools.partial(_put, at, {"u": u[before], "y": y[before]})
+    yield "stale sample: that before it is taken again", lambda feed: feed.put(at, **stale)
     yield _TWICE, lambda feed: feed.twice(feed.at(at))
     if feed.valid[at]:
-        yield "sample treated as missing", functools.partial(_put, at, {"valid": False})
+        yield "sample treated as missing", lambda feed: feed.put(at, valid=False)
     else:
-        yield "missing sample treated as measured", functools.partial(_put, at, {"valid": True})
-        held = {"valid": True, "u": u[before], "y": y[before]}
-        yield "missing sample treated as measured: the last one again", functools.partial(_put, at, held)
+        measured = "missing sample treated as measured"
+        yield measured, lambda feed: feed.put(at, valid=True)
+        yield f"{measured}: the last one again", lambda feed: feed.put(at, valid=True, **stale)
     yield "reset before the sample", lambda feed: feed.restarted(at)
     if at + 1 < len(u):
         yield "reset after the sample", lambda feed: feed.restarted(at + 1)
     for name, x in (("u", u), ("y", y)):
         for kind, value in _values(x[at], x[before], x[after]):
-            yield kind.format(name), functools.partial(_put, at, {name: value})
+            yield kind.format(name), _put(at, name, value)
+
+
+def _put(at: int, name: str, value: float) -> Alter:
+    return lambda feed: feed.put(at, **{name: value})
 
 
 def _values(now: float, before: float, after: float) -> Iterator[tuple[str, float]]:
@@ -119,7 +118,3 @@ def _values(now: float, before: float, after: float) -> Iterator[tuple[str, floa
                 yield f"torn read of {{}}: {part} byte of the sample {which}", float(value)
     for bit in range(_BITS):
         yield f"bit {bit} of {{}} inverted", float(int(now) ^ 1 << bit)
-
-
-def _put(at: int, values: Mapping[str, float], feed: Feed) -> Feed:
-    return feed.put(at, **values)

@@ -21,17 +21,6 @@ Matrix = NDArray[np.float32]
 INNOVATION, STATISTIC, ALARM = "innovation", "statistic", "alarm"
 
 
-def column_names(config: EstimatorConfig) -> tuple[str, ...]:
-    """Names of the columns of a replay: elements of theta, innovation, statistic, alarm."""
-    theta = (
-        *(f"a{i + 1}" for i in range(config.na)),
-        *(f"b{i}" for i in range(config.nb)),
-        *(f"c{i + 1}" for i in range(config.nc)),
-        *(("offset",) if config.offset else ()),
-    )
-    return (*theta, INNOVATION, STATISTIC, ALARM)
-
-
 @dataclass(frozen=True, eq=False)
 class Feed:
     """Steps of the library, and the step whose answer each sample has."""
@@ -57,15 +46,9 @@ class Feed:
     def upto(self, samples: int) -> Self:
         """The feed of the first samples."""
         answer = self.answer[:samples]
-        steps = int(answer.max(initial=-1)) + 1
-        steps = max(steps, min(samples, len(self.u)))
-        return type(self)(
-            self.u[:steps],
-            self.y[:steps],
-            self.valid[:steps],
-            answer,
-            tuple(each for each in self.restarts if each < max(steps, 1)),
-        )
+        steps = max(int(answer.max(initial=-1)) + 1, min(samples, len(self.u)))
+        restarts = tuple(each for each in self.restarts if each < max(steps, 1))
+        return type(self)(self.u[:steps], self.y[:steps], self.valid[:steps], answer, restarts)
 
     def altered(self, **arrays: Any) -> Self:
         """The feed with other ``u``, ``y`` or ``valid``."""
@@ -124,25 +107,23 @@ class Library:
     def __init__(self, config: EstimatorConfig) -> None:
         """:raises ConfigurationError: the estimator refuses the configuration."""
         self.config = config
-        self.columns = column_names(config)
+        names = (("a", 1, config.na), ("b", 0, config.nb), ("c", 1, config.nc))
+        theta = [f"{letter}{i + first}" for letter, first, n in names for i in range(n)]
+        self.columns = (*theta, *(("offset",) if config.offset else ()), INNOVATION, STATISTIC, ALARM)
+        """Names of the columns of a replay."""
         self._estimator = Estimator(config, library=estimator_library_for(config))
 
     def replay(self, feed: Feed) -> Matrix:
         """(n, columns): answers to each sample."""
         ends = sorted({0, *feed.restarts, len(feed.u)})
-        parts = [self._initial(), *(self._record(feed, *span) for span in itertools.pairwise(ends))]
-        return np.concatenate(parts)[feed.answer + 1]
-
-    def _initial(self) -> Matrix:
-        return np.zeros((1, len(self.columns)), np.float32)
-
-    def _record(self, feed: Feed, start: int, end: int) -> Matrix:
-        if start in feed.restarts or start == 0:
+        parts = [np.zeros((1, len(self.columns)), np.float32)]
+        for start, end in itertools.pairwise(ends):
             self._estimator.restart()
-        out = self._estimator.run(feed.u[start:end], feed.y[start:end], feed.valid[start:end])
-        alarm = np.zeros(end - start, np.float32)
-        alarm[out.alarms] = 1.0
-        return np.column_stack([out.theta, out.innovation, out.statistic, alarm])
+            out = self._estimator.run(feed.u[start:end], feed.y[start:end], feed.valid[start:end])
+            alarm = np.zeros(end - start, np.float32)
+            alarm[out.alarms] = 1.0
+            parts.append(np.column_stack([out.theta, out.innovation, out.statistic, alarm]))
+        return np.concatenate(parts)[feed.answer + 1]
 
 
 def library_of(config: EstimatorConfig, **settings: Any) -> Library | None:

@@ -16,7 +16,7 @@ from analogrig.claims.feed import ALARM, Matrix
 Values = NDArray[np.float64]
 Form = Callable[[Values], Values]
 
-_FACTORS = (-1.0, 0.5, 2.0, 1000.0, 0.001, 100.0, 0.01, 10.0, 0.1, 1e6, 1e-6, 65536.0, 256.0, 1 / 256.0, 1 / 65536.0)
+_FACTORS = (0.5, 2.0, 1000.0, 0.001, 100.0, 0.01, 10.0, 0.1, 1e6, 1e-6, 65536.0, 256.0, 1 / 256.0, 1 / 65536.0)
 _LAGS = (0, 1, 2, 3, -1)
 _OLDEST = 64
 """Largest age in samples of a part of an answer that was left from before."""
@@ -102,41 +102,12 @@ def _lagged(x: Values, lag: int) -> Values:
 
 def _forms(expected: Values, found: Values, all_found: Values) -> Iterator[tuple[str, Form]]:
     """Forms in which a value may arrive; ``expected`` and ``found`` are some of the values."""
-    yield "", np.asarray
-    for factor in _FACTORS:
-        yield (
-            "with the other sign" if factor == -1.0 else f"scaled by {factor:g}",
-            functools.partial(np.multiply, factor),
-        )
-    yield "without its sign", np.abs
-    yield "without its sign between -1 and 0", lambda x: np.where(np.abs(x) < 1.0, np.abs(x), x)
-    for digits, rounding in itertools.product((6, 5, 4, 3, 2), (np.rint, np.trunc)):
-        yield (
-            f"zeros after the point lost: {digits} digits printed as a whole number",
-            functools.partial(_unpadded, digits, rounding),
-        )
-    for digits in range(6):
-        yield f"rounded to {digits} digits after the point", functools.partial(_rounded, digits)
-        yield f"cut to {digits} digits after the point", functools.partial(_cut, digits)
-    yield "squared", np.square
-    yield "of the square root", lambda x: np.sqrt(np.abs(x))
-    yield "byte-swapped float", lambda x: _float(_bits(x).byteswap())
-    yield "float with its 16-bit halves swapped", lambda x: _float(_bits(x) >> 16 | _bits(x) << 16)
-    yield (
-        "float with the bytes of each half swapped",
-        lambda x: _float(_bits(x).view(np.uint16).byteswap().view(np.uint32)),
-    )
-    yield "bits of the float read as a whole number", lambda x: _bits(x).view(np.int32).astype(np.float64)
-    yield "cut to the upper 16 bits of the float", lambda x: _float(_bits(x) >> 16 << 16)
+    yield from _FORMS
     low, high = all_found.min(), all_found.max()
     yield f"limited to {low:g} .. {high:g}", functools.partial(np.clip, a_min=low, a_max=high)
     yield f"limited to {high:g}", functools.partial(np.minimum, high)
     yield f"limited from {low:g} on", functools.partial(np.maximum, low)
-    for bits, unit, rounding in itertools.product((8, 16), _UNITS, (np.rint, np.trunc, np.floor)):
-        yield (
-            f"in units of {1.0 / unit:g} that overflow {bits} bits",
-            functools.partial(_wrapped, bits, unit, rounding),
-        )
+    yield from _OVERFLOWS
     if (big := np.abs(expected) > 0.5 * np.abs(expected).max()).any():
         ratio = float(np.median(found[big] / expected[big]))
         yield f"scaled by {ratio:.4g}", functools.partial(np.multiply, ratio)
@@ -144,35 +115,67 @@ def _forms(expected: Values, found: Values, all_found: Values) -> Iterator[tuple
     yield f"shifted by {shift:.4g}", functools.partial(np.add, shift)
 
 
-def _unpadded(digits: int, rounding: Form, x: Values) -> Values:
-    """Values whose fraction is printed as a whole number of ``digits`` digits without leading zeros."""
-    scaled = rounding(np.abs(x) * 10.0**digits)
-    whole, fraction = np.divmod(scaled, 10.0**digits)
-    length = np.floor(np.log10(np.maximum(fraction, 1.0))) + 1.0
-    return np.asarray(np.sign(x) * (whole + fraction / 10.0**length))
+def _unpadded(digits: int, rounding: Form) -> Form:
+    """Fraction printed as a whole number of ``digits`` digits without leading zeros."""
+
+    def form(x: Values) -> Values:
+        whole, fraction = np.divmod(rounding(np.abs(x) * 10.0**digits), 10.0**digits)
+        length = np.floor(np.log10(np.maximum(fraction, 1.0))) + 1.0
+        return np.asarray(np.sign(x) * (whole + fraction / 10.0**length))
+
+    return form
 
 
-def _rounded(digits: int, x: Values) -> Values:
-    return np.round(x, digits)
+def _rounded(digits: int) -> Form:
+    return lambda x: np.round(x, digits)
 
 
-def _cut(digits: int, x: Values) -> Values:
-    return np.asarray(np.trunc(x * 10.0**digits) / 10.0**digits)
+def _cut(digits: int) -> Form:
+    return lambda x: np.trunc(x * 10.0**digits) / 10.0**digits
 
 
-def _bits(x: Values) -> NDArray[np.uint32]:
-    return np.ascontiguousarray(x.astype(np.float32)).view(np.uint32)
+def _of_bits(change: Callable[[NDArray[np.uint32]], NDArray[Any]]) -> Form:
+    """Change of the bits of the float."""
+
+    def form(x: Values) -> Values:
+        bits = change(np.ascontiguousarray(x.astype(np.float32)).view(np.uint32))
+        with np.errstate(invalid="ignore"):
+            return np.asarray(bits.view(np.float32).astype(np.float64))
+
+    return form
 
 
-def _float(bits: NDArray[Any]) -> Values:
-    with np.errstate(invalid="ignore"):
-        return np.asarray(bits.view(np.float32).astype(np.float64))
-
-
-def _wrapped(bits: int, unit: float, rounding: Form, x: Values) -> Values:
-    """Values as signed whole numbers of so many bits that overflow."""
+def _overflowing(bits: int, unit: float, rounding: Form) -> Form:
+    """Signed whole number of so many bits that overflows."""
     half = float(1 << bits - 1)
-    return np.asarray(((rounding(x * unit) + half) % (2.0 * half) - half) / unit)
+    return lambda x: ((rounding(x * unit) + half) % (2.0 * half) - half) / unit
+
+
+_FORMS: Sequence[tuple[str, Form]] = (
+    ("", np.asarray),
+    ("with the other sign", np.negative),
+    *((f"scaled by {factor:g}", functools.partial(np.multiply, factor)) for factor in _FACTORS),
+    ("without its sign", np.abs),
+    ("without its sign between -1 and 0", lambda x: np.where(np.abs(x) < 1.0, np.abs(x), x)),
+    *(
+        (f"zeros after the point lost: {digits} digits printed as a whole number", _unpadded(digits, rounding))
+        for digits, rounding in itertools.product((6, 5, 4, 3, 2), (np.rint, np.trunc))
+    ),
+    *((f"rounded to {digits} digits after the point", _rounded(digits)) for digits in range(6)),
+    *((f"cut to {digits} digits after the point", _cut(digits)) for digits in range(6)),
+    ("squared", np.square),
+    ("of the square root", lambda x: np.sqrt(np.abs(x))),
+    ("byte-swapped float", _of_bits(lambda bits: bits.byteswap())),
+    ("float with its 16-bit halves swapped", _of_bits(lambda bits: bits >> 16 | bits << 16)),
+    ("float with the bytes of each half swapped", _of_bits(lambda bits: bits.view(np.uint16).byteswap())),
+    ("bits of the float read as a whole number", lambda x: x.astype(np.float32).view(np.int32).astype(np.float64)),
+    ("cut to the upper 16 bits of the float", _of_bits(lambda bits: bits >> 16 << 16)),
+)
+
+_OVERFLOWS: Sequence[tuple[str, Form]] = [
+    (f"in units of {1.0 / unit:g} that overflow {bits} bits", _overflowing(bits, unit, rounding))
+    for bits, unit, rounding in itertools.product((8, 16), _UNITS, (np.rint, np.trunc, np.floor))
+]
 
 
 def _cause_of_alarms(found: Values, expected: NDArray[np.float32]) -> str | None:
@@ -181,30 +184,23 @@ def _cause_of_alarms(found: Values, expected: NDArray[np.float32]) -> str | None
     raised, due = np.flatnonzero(found), np.flatnonzero(is_due)
     if not len(raised):
         return f"never raised: {len(due)} are due"
-    for lag in (*range(1, 17), -1):
-        if np.array_equal(_lagged(is_due, lag), found):
-            return "one sample early" if lag < 0 else f"{'one sample' if lag == 1 else f'{lag} samples'} late"
-    if np.array_equal(1.0 - is_due, found):
-        return "inverted: raised where none is due"
-    if len(due) and (cause := _held(found, is_due, due)):
+    forms = {
+        "one sample late": _lagged(is_due, 1),
+        **{f"{lag} samples late": _lagged(is_due, lag) for lag in range(2, 17)},
+        "one sample early": _lagged(is_due, -1),
+        "inverted: raised where none is due": 1.0 - is_due,
+        "held for ever: the alarm is a level that nothing clears": np.maximum.accumulate(is_due),
+    }
+    if cause := next((cause for cause, form in forms.items() if np.array_equal(form, found)), ""):
         return cause
-    if set(raised) < set(due):
-        lost = sorted(set(due.tolist()) - set(raised.tolist()))
-        return f"lost: {len(lost)} of {len(due)}, the first at sample {lost[0]}"
-    return None
-
-
-def _held(found: Values, is_due: Values, due: NDArray[np.int64]) -> str | None:
-    """Cause if each alarm stays up: for a number of samples, or for ever."""
-    if np.array_equal(np.maximum.accumulate(is_due), found):
-        return "held for ever: the alarm is a level that nothing clears"
-    ends = np.flatnonzero(found[int(due[0]) :] == 0)
+    ends = np.flatnonzero(found[due[0] :] == 0) if len(due) else due
     length = int(ends[0]) if len(ends) else 0
-    if _HELD[0] <= length <= _HELD[1]:
-        kernel = np.ones(length)
-        if np.array_equal(np.convolve(is_due, kernel)[: len(found)] > 0, found > 0):
-            return f"held for {length} samples: the alarm is a level, not an event"
-    return None
+    if _HELD[0] <= length <= _HELD[1] and np.array_equal(
+        np.convolve(is_due, np.ones(length))[: len(found)] > 0, found > 0
+    ):
+        return f"held for {length} samples: the alarm is a level, not an event"
+    lost = sorted(set(due.tolist()) - set(raised.tolist()))
+    return f"lost: {len(lost)} of {len(due)}, the first at sample {lost[0]}" if set(raised) < set(due) else None
 
 
 def _torn(answered: DeviceAnswers, expected: Matrix, wrong: NDArray[np.bool_], columns: Sequence[int]) -> str:
@@ -213,22 +209,22 @@ def _torn(answered: DeviceAnswers, expected: Matrix, wrong: NDArray[np.bool_], c
     rows: set[int] = set()
     for column in columns:
         at = np.flatnonzero(wrong[:, column])
-        left = np.ones(len(at), np.bool_)
         for age in range(1, _OLDEST + 1):
             earlier = np.where(at >= age, expected[np.maximum(at - age, 0), column], 0.0)
             near = np.abs(answered.values[at, column] - earlier) <= answered.tolerance[at, column]
-            if (left & near).any():
+            if near.any():
                 ages.add(age)
-                rows.update(at[left & near].tolist())
-            left &= ~near
-            if not left.any():
+                rows.update(at[near].tolist())
+            at = at[~near]
+            if not len(at):
                 break
-        if left.any():
+        else:
             return ""
-    first = min(rows)
+    first, steps = min(rows), set(np.diff(sorted(rows)).tolist())
     oldest = "the sample before" if ages == {1} else f"up to {max(ages)} samples before"
+    spacing = f", then each {steps.pop()}" if len(steps) == 1 and len(rows) > 2 else ""
     return (
-        f"partially updated record: of {oldest} in {len(rows)} samples, the first {first}{_spacing(rows)}"
+        f"partially updated record: of {oldest} in {len(rows)} samples, the first {first}{spacing}"
         " (torn: read while it was written, or one page of several was not updated)"
     )
 
@@ -237,15 +233,8 @@ def _swapped(answered: DeviceAnswers, expected: Matrix, columns: Sequence[int]) 
     """Cause if the values of some columns change places in some samples."""
     for column in columns:
         use = answered.compared[:, column]
-        near = [
-            np.abs(answered.values[use, column] - expected[use, other]) <= answered.tolerance[use, column]
-            for other in range(expected.shape[1] - 1)
-        ]
+        found, tolerance = answered.values[use, column], answered.tolerance[use, column]
+        near = [np.abs(found - expected[use, other]) <= tolerance for other in range(expected.shape[1] - 1)]
         if not np.any(near, axis=0).all():
             return ""
     return "values of other fields in some samples: pages of the answer are mixed up"
-
-
-def _spacing(rows: set[int]) -> str:
-    steps: set[int] = set(np.diff(sorted(rows)).tolist())
-    return f", then each {steps.pop()}" if len(steps) == 1 and len(rows) > 2 else ""

@@ -12,7 +12,7 @@ import numpy as np
 
 from analogrig.claims.answered import DeviceAnswers
 from analogrig.claims.feed import Feed, Library, library_of
-from analogrig.claims.sample_faults import Suspect
+from analogrig.claims.sample_faults import Suspect, changed
 from analogrig.estimator_config import EstimatorConfig
 
 _VALUES: Mapping[str, Sequence[Any]] = {
@@ -39,7 +39,8 @@ _VALUES: Mapping[str, Sequence[Any]] = {
     "code_high": (1e6, 4096.0, 4095.0, 4094.0, 4000.0, 2048.0, 1024.0),
 }
 
-_ARL0 = (1e2, 1e3, 1e4, 5e4, 1e5, 2e5, 1e6, 1e7, 1e8)
+_ARL0, _CEILINGS = (1e2, 1e3, 1e4, 5e4, 1e5, 2e5, 1e6, 1e7, 1e8), (0.1, 0.5, 2.0, 10.0)
+"""Rates whose ceilings are tried, and multiples of the ceiling."""
 
 
 def setting_hypotheses(config: EstimatorConfig) -> Iterator[Suspect]:
@@ -52,17 +53,14 @@ def setting_hypotheses(config: EstimatorConfig) -> Iterator[Suspect]:
         for value in values:
             if value != getattr(config, name):
                 given = list(value) if isinstance(value, tuple) else value
-                cause = f"{name} = {given} instead of {getattr(config, name)}"
-                yield Suspect(cause, unchanged, {name: value})
+                yield Suspect(f"{name} = {given} instead of {getattr(config, name)}", unchanged, {name: value})
     ceiling = config.statistic_ceiling
     if config.trigger == "none" or ceiling is None:
         return
-    for arl0 in _ARL0:
-        cause = f"ceiling = {math.log(arl0):.6g} instead of {ceiling:.6g}: that of arl0 = {arl0:g}"
-        yield Suspect(cause, unchanged, {"ceiling": math.log(arl0), "arl0": None})
-    for factor in (0.1, 0.5, 2.0, 10.0):
-        cause = f"ceiling = {factor * ceiling:.6g} instead of {ceiling:.6g}"
-        yield Suspect(cause, unchanged, {"ceiling": factor * ceiling, "arl0": None})
+    others_of = {math.log(arl0): f": that of arl0 = {arl0:g}" for arl0 in _ARL0}
+    for value, which in (others_of | {factor * ceiling: "" for factor in _CEILINGS}).items():
+        cause = f"ceiling = {value:.6g} instead of {ceiling:.6g}{which}"
+        yield Suspect(cause, unchanged, {"ceiling": value, "arl0": None})
 
 
 def unchanged(feed: Feed) -> Feed:
@@ -77,10 +75,8 @@ _WINDOW_N = 600
 _GRID, _ROUNDS = 21, 7
 """Values in each round, and rounds; each narrows the range to the two neighbours of the best."""
 
-_DIGITS = (1, 2, 3, 4)
+_DIGITS = (1, 2, 3, 4, 5)
 """Numbers of digits to which a fitted number is rounded, the fewest first."""
-
-_ABOUT = 5
 
 Range = tuple[float, float]
 
@@ -96,64 +92,59 @@ _FITTED: Mapping[str, Range] = {
 
 
 def fitted(answered: DeviceAnswers, library: Library, feed: Feed) -> Iterator[Suspect]:
-    """Hypotheses whose number is fitted."""
+    """Hypotheses whose number is fitted, with few digits, and as it is."""
     n = min(len(answered.values), answered.first_difference(library.replay(feed)) + _WINDOW_N)
-    fit = functools.partial(_best, answered.upto(n), feed.upto(n), library)
+    shown, short = answered.upto(n), feed.upto(n)
     for names in (("u",), ("y",), ("u", "y")):
-        scale, shift = functools.partial(_by_scale, names), functools.partial(_by_offset, names)
-        yield from map(scale, _rounded(10.0 ** fit(functools.partial(_by_power, scale), (-1.5, 1.5))))
-        yield from map(shift, _rounded(fit(shift, (-2100.0, 2100.0))))
+        yield from _best(functools.partial(_scaled, names), (-1.5, 1.5), _exponential, shown, short, library)
+        yield from _best(functools.partial(_shifted, names), (-2100.0, 2100.0), float, shown, short, library)
     for name, span in _FITTED.items():
-        setting = functools.partial(_by_setting, library, name)
-        yield from map(setting, _rounded(10.0 ** fit(functools.partial(_by_power, setting), span)))
+        yield from _best(functools.partial(_set, library.config, name), span, _exponential, shown, short, library)
 
 
-def _by_scale(names: Sequence[str], factor: float) -> Suspect:
-    return Suspect(f"{' and '.join(names)} scaled by {factor:g}", functools.partial(_scaled, names, factor, 0.0))
+def _exponential(logarithm: float) -> float:
+    return math.pow(10.0, logarithm)
 
 
-def _by_offset(names: Sequence[str], offset: float) -> Suspect:
-    return Suspect(f"{' and '.join(names)} shifted by {offset:g} codes", functools.partial(_scaled, names, 1.0, offset))
+def _scaled(names: Sequence[str], factor: float) -> Suspect:
+    return Suspect(f"{' and '.join(names)} scaled by {factor:g}", changed(names, lambda x: x * np.float32(factor)))
 
 
-def _by_setting(library: Library, name: str, value: float) -> Suspect:
+def _shifted(names: Sequence[str], offset: float) -> Suspect:
+    cause = f"{' and '.join(names)} shifted by {offset:g} codes"
+    return Suspect(cause, changed(names, lambda x: x + np.float32(offset)))
+
+
+def _set(config: EstimatorConfig, name: str, value: float) -> Suspect:
     """Hypothesis of a setting; forgetting is fitted as what is forgotten."""
     value = 1.0 - value if name == "forgetting" else value
-    cause = f"{name} = {value:g} instead of {getattr(library.config, name)}"
+    cause = f"{name} = {value:g} instead of {getattr(config, name)}"
     return Suspect(cause, unchanged, {name: value, "arl0": None} if name == "ceiling" else {name: value})
 
 
-def _by_power(hypothesis: Callable[[float], Suspect], logarithm: float) -> Suspect:
-    return hypothesis(10.0**logarithm)
-
-
-def _scaled(names: Sequence[str], factor: float, offset: float, feed: Feed) -> Feed:
-    return feed.altered(**{name: getattr(feed, name) * np.float32(factor) + np.float32(offset) for name in names})
-
-
-def _rounded(value: float) -> Iterator[float]:
-    """The number with few digits, and as it is."""
-    yield from dict.fromkeys(float(f"{value:.{digits}g}") for digits in (*_DIGITS, _ABOUT))
-
-
 def _best(
-    answered: DeviceAnswers, feed: Feed, library: Library, attempt: Callable[[float], Suspect], span: Range
-) -> float:
-    """Number in a range for which the answers deviate least."""
+    hypothesis: Callable[[float], Suspect],
+    span: Range,
+    number: Callable[[float], float],
+    answered: DeviceAnswers,
+    feed: Feed,
+    library: Library,
+) -> Iterator[Suspect]:
+    """Hypotheses with the number for which the answers deviate least.
+
+    :param span: range that is searched, of which ``number`` makes the number.
+    """
+    scale = np.abs(answered.values).mean(axis=0) + 1e-9
     low, high = span
     for _ in range(_ROUNDS):
-        values = np.linspace(low, high, _GRID)
-        costs = [_cost(answered, feed, library, attempt(float(value))) for value in values]
+        values, costs = np.linspace(low, high, _GRID), []
+        for value in values.tolist():
+            suspect = hypothesis(number(value))
+            chosen = library_of(library.config, **suspect.settings) if suspect.settings else library
+            answers = answered.values if chosen is None else chosen.replay(suspect.alter(feed))
+            deviation = np.abs(answered.values - answers) * answered.compared
+            costs.append(math.inf if chosen is None else float(np.minimum(deviation / scale, 10.0).sum()))
         at = int(np.argmin(costs))
         low, high = values[max(at - 1, 0)], values[min(at + 1, _GRID - 1)]
-    return float((low + high) / 2.0)
-
-
-def _cost(answered: DeviceAnswers, feed: Feed, library: Library, hypothesis: Suspect) -> float:
-    chosen = library_of(library.config, **hypothesis.settings) if hypothesis.settings else library
-    if chosen is None:
-        return float("inf")
-    answers = chosen.replay(hypothesis.alter(feed))
-    deviation = np.abs(answered.values - answers) * answered.compared
-    scale = np.abs(answered.values).mean(axis=0) + 1e-9
-    return float(np.minimum(deviation / scale, 10.0).sum())
+    found = number(float((low + high) / 2.0))
+    return map(hypothesis, dict.fromkeys(float(f"{found:.{digits}g}") for digits in _DIGITS))

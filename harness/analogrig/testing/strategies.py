@@ -10,6 +10,7 @@ Needs the extra ``analogrig[pytest]``.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -74,6 +75,7 @@ def _usually(usual: Any, others: st.SearchStrategy[Any]) -> st.SearchStrategy[An
     return st.one_of(st.just(usual), others)
 
 
+@functools.cache
 def _number(low: float, high: float, digits: int = 3) -> st.SearchStrategy[float]:
     """Evenly distributed numbers with few digits, so that a file shows them exactly."""
     step = 10.0 ** math.floor(math.log10(high) - digits + 1)
@@ -83,6 +85,7 @@ def _number(low: float, high: float, digits: int = 3) -> st.SearchStrategy[float
 # ------------------------------------------------------------------------------------------------------ what is played
 
 
+@functools.cache
 def suspensions() -> st.SearchStrategy[Plant]:
     """Front suspensions with any mass, damping and stiffness that the pots can show."""
     front = _front().parameters()
@@ -116,6 +119,7 @@ def random_suspensions(count: int, seed: int) -> list[Plant]:
     return [_suspension(_round(m), _round(k), zeta) for m, k, zeta in zip(*drawn, strict=True)]
 
 
+@functools.cache
 def _front() -> Plant:
     return Plant.of(Program.load(DEFAULT_PROGRAM))
 
@@ -186,6 +190,7 @@ def changes(
     return PotChange(sample, turned, draw(st.integers(0, longest_ramp_n)))
 
 
+@functools.cache
 def excitations(*, free: bool = False) -> st.SearchStrategy[Excitation]:
     """Two-level waveforms within the card's range, never longer than 10 ms without an edge; the usual is the thesis's
     square wave.
