@@ -22,7 +22,7 @@ from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import describe
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario
-from analogrig_emulator.machine.compiler import load_patch
+from analogrig_emulator.machine.program_loader import load_patch
 from analogrig_imports.imported import ImportDescription
 from analogrig_instruments.rig_wiring import RealDescription
 from analogrig_instruments.simulator.served import ServedDescription

@@ -49,6 +49,7 @@ from analogrig_emulator.exceptions import (
     ProgramError,
     SamplerError,
 )
+from analogrig_emulator.machine.analog_computer import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.channel_courses import (
     Course,
     Courses,
@@ -58,9 +59,8 @@ from analogrig_emulator.machine.channel_courses import (
     WideProgram,
     Wired,
 )
-from analogrig_emulator.machine.compiler import PatchedProgram, circuit_of, compile_program, load_patch
-from analogrig_emulator.machine.computer import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import ABSOLUTE_ZERO_C, CircuitNoise, NoisySuspension, Supply
+from analogrig_emulator.machine.patched_program import PatchedProgram
 from analogrig_emulator.machine.program_circuit import (
     CHANNELS,
     SOURCE,
@@ -71,7 +71,8 @@ from analogrig_emulator.machine.program_circuit import (
     Scale,
     Scales,
 )
-from analogrig_emulator.machine.program_file import Equations, ProgramParameter, equations_of
+from analogrig_emulator.machine.program_file import Equations, ProgramParameter
+from analogrig_emulator.machine.program_loader import circuit_of, compile_program, equations_of, load_patch
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated_plays import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v

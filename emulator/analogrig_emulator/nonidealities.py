@@ -34,10 +34,9 @@ from analogrig_emulator.circuit.components import (
 from analogrig_emulator.circuit.nonlinear import MULTIPLIERS, MultiplierModel
 from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
 from analogrig_emulator.circuit.pot import PotTurn
-from analogrig_emulator.machine.compiler import compile_program
 from analogrig_emulator.machine.noise import ABSOLUTE_ZERO_C, QUIET, NoisySuspension, Supply
 from analogrig_emulator.machine.program_circuit import CHANNELS, ProgramCircuit
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.program_loader import compile_program, parse_program
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
 

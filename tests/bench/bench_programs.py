@@ -20,8 +20,7 @@ from analogrig_emulator import (
     Multiplier,
 )
 from analogrig_emulator.exceptions import ProgramError
-from analogrig_emulator.machine.compiler import compile_program
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.program_loader import compile_program, parse_program
 from tests.emulator.random_programs import random_program
 from tests.emulator.real_parts import off_ngspice_lsb
 from tests.emulator.test_compiler import assert_slopes, off_equations_lsb

@@ -20,8 +20,7 @@ from analogrig.rigs.emulator import ComputerDescription
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
 from analogrig_emulator import CHANNELS, PatchedProgram, load_patch
-from analogrig_emulator.machine.compiler import compile_program
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.program_loader import compile_program, parse_program
 from analogrig_instruments.calibration.recorded_plant import RecordedPlant, fit_program
 
 from .figure import Figure

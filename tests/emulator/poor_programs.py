@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from analogrig_emulator import EmulatorError
-from analogrig_emulator.machine.compiler import compile_program, compile_unadvised
-from analogrig_emulator.machine.program_file import equations_of, unadvised_equations
+from analogrig_emulator.machine.compiler import compile_equations
+from analogrig_emulator.machine.program_file import read_equations
+from analogrig_emulator.machine.program_loader import compile_program, equations_of
 from tests.emulator.drawn_plays import show
 from tests.emulator.random_programs import random_program
 from tests.emulator.test_tried_advice import advised, assert_plays, tomllib_text
@@ -42,7 +43,7 @@ def _poorer(seed: int) -> Iterator[dict[str, Any]]:
 
 def _is_refused(table: Mapping[str, Any]) -> bool:
     try:
-        compile_unadvised(unadvised_equations(table))
+        compile_equations(read_equations(table))
     except EmulatorError:
         return True
     return False

@@ -23,8 +23,7 @@ from analogrig_emulator import (
     VoltageSource,
 )
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
-from analogrig_emulator.machine.compiler import compile_program
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.program_loader import compile_program, parse_program
 from tests.emulator.random_programs import REFUSED
 from tests.emulator.real_parts import off_ngspice_lsb
 from tests.emulator.test_compiler import LSB_V, RATE_HZ, compiled_random, levels_v, off_equations_lsb

@@ -24,8 +24,9 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.nodal import piecewise_linear
 from analogrig_emulator.exceptions import ProgramError
-from analogrig_emulator.machine.compiler import INPUT_OHM, MACHINE_V, PatchedProgram, compile_program
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.compiler import INPUT_OHM
+from analogrig_emulator.machine.patched_program import MACHINE_V, PatchedProgram
+from analogrig_emulator.machine.program_loader import compile_program, parse_program
 from analogrig_emulator.machine.sheet import dials
 from analogrig_emulator.machine.stages import StageKind, stages_of
 from analogrig_emulator.machine.trial import reaches, settings

@@ -8,9 +8,10 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from analogrig_emulator.machine.compiler import PatchedProgram, load_patch
 from analogrig_emulator.machine.drawing import patch_drawing
 from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Box, PatchLayout, Point, lay_out
+from analogrig_emulator.machine.patched_program import PatchedProgram
+from analogrig_emulator.machine.program_loader import load_patch
 from analogrig_emulator.machine.sheet import inverters
 
 PROGRAMS = Path(__file__).parents[2] / "fixtures" / "programs"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from analogrig_emulator.exceptions import ProgramError, UnfitError
-from analogrig_emulator.machine.compiler import compile_program, compile_unadvised
-from analogrig_emulator.machine.program_file import equations_of
+from analogrig_emulator.machine.compiler import compile_equations
+from analogrig_emulator.machine.program_loader import compile_program, equations_of
 from tests.emulator.drawn_plays import RIGS, failures, scenario_of, table_of
 from tests.emulator.poor_programs import mended
 from tests.emulator.random_programs import REFUSED, random_program
@@ -73,7 +73,7 @@ def test_full_scales_hold_an_integrator_that_winds_up() -> None:
 
 def test_a_flow_that_real_parts_drive_to_infinity_is_refused() -> None:
     with pytest.raises(UnfitError, match="real parts drive the program to infinity"):
-        compile_unadvised(equations_of(tomllib.loads(random_program(REFUSED[2]))))
+        compile_equations(equations_of(tomllib.loads(random_program(REFUSED[2]))))
 
 
 @pytest.mark.heavy

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from analogrig_emulator.exceptions import ProgramError
-from analogrig_emulator.machine.compiler import load_patch
 from analogrig_emulator.machine.formula import parse_formula
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.program_loader import load_patch, parse_program
 from analogrig_emulator.machine.units import parse_unit
 
 MOTOR = """

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from analogrig_emulator import SuspensionComputer
-from analogrig_emulator.machine.compiler import compile_program, load_patch
 from analogrig_emulator.machine.drawing import patch_drawing
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.program_loader import compile_program, load_patch, parse_program
 from analogrig_emulator.machine.sheet import dials, scaling_sheet
 
 FOLDER = Path(__file__).parents[2] / "fixtures" / "programs"

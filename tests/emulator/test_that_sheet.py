@@ -12,7 +12,8 @@ import pytest
 
 from analogrig.config import locate, names
 from analogrig_emulator import ProgramError
-from analogrig_emulator.machine.compiler import PatchedProgram, load_patch
+from analogrig_emulator.machine.patched_program import PatchedProgram
+from analogrig_emulator.machine.program_loader import load_patch
 from analogrig_emulator.machine.that_drawing import that_drawing
 from analogrig_emulator.machine.that_sheet import ThatSheet
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from analogrig_emulator import COMPONENTS, MULTIPLIERS, PotError, SuspensionComputer
-from analogrig_emulator.machine.compiler import PatchedProgram, compile_program
-from analogrig_emulator.machine.program_file import parse_program
+from analogrig_emulator.machine.patched_program import PatchedProgram
+from analogrig_emulator.machine.program_loader import compile_program, parse_program
 from tests.emulator.programs import FILES, program_of
 from tests.emulator.test_compiler import assert_slopes
 

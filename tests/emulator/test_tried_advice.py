@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from analogrig_emulator import COMPONENTS, MULTIPLIERS, EmulatorError, Excitation, SuspensionComputer
-from analogrig_emulator.machine.compiler import PatchedProgram, compile_program
-from analogrig_emulator.machine.program_file import equations_of
+from analogrig_emulator.machine.patched_program import PatchedProgram
+from analogrig_emulator.machine.program_loader import compile_program, equations_of
 
 _ROUNDS = 3
 """Errors in a file that are mended one after another."""

@@ -16,8 +16,8 @@ from analogrig.output import REPORT_FILE, OutputFolder
 from analogrig.reporting import effects_page, write_report
 from analogrig.reporting.campaign_page import write_page
 from analogrig.reporting.session import find_session, write_session
-from analogrig_emulator.machine.compiler import load_patch
 from analogrig_emulator.machine.drawing import patch_drawing
+from analogrig_emulator.machine.program_loader import load_patch
 from analogrig_emulator.nonidealities import Effect
 from tests.browser import VIEWS, Watched
 from tests.harness.reported import empty_run, reported_run, reported_verdict

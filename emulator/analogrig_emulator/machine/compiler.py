@@ -8,45 +8,39 @@ near an end of its track, which real parts do not reach, another resistor moves 
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from types import MappingProxyType
 from typing import assert_never
 
 from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.circuit.elements import GROUND, Capacitor, DiodeLimiter, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
-from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
+from analogrig_emulator.circuit.opamp import IDEAL
 from analogrig_emulator.engine.system import Law
-from analogrig_emulator.exceptions import Edit, PotError, ProgramError, UnfitError
-from analogrig_emulator.machine.formula import suggestion
+from analogrig_emulator.exceptions import Edit, ProgramError, UnfitError
+from analogrig_emulator.machine.patched_program import (
+    MACHINE_V,
+    PatchedCord,
+    PatchedElement,
+    PatchedProgram,
+)
 from analogrig_emulator.machine.polarity import cord_sign, inverted, signs_of
-from analogrig_emulator.machine.program_circuit import SOURCE, PotRow, ProgramCircuit, Scale, Scales
-from analogrig_emulator.machine.program_file import Equations, read_program
-from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
+from analogrig_emulator.machine.program_circuit import SOURCE
+from analogrig_emulator.machine.program_file import Equations
 from analogrig_emulator.machine.rehearsal import rehearsed, unfit
 from analogrig_emulator.machine.stages import (
     REFERENCE,
     Cord,
-    Factors,
     PatchStage,
     StageKind,
     Stages,
     stages_of,
 )
 from analogrig_emulator.machine.trial import Reach, reaches
-
-DIAGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
-"""Circuits wired by hand, by the name that a program file gives as its diagram."""
-
-MACHINE_V = 10.0
-"""Voltage of full scale, of the reference, and scale of the multipliers."""
 
 LINEAR_V = 12.0
 """Greatest voltage in a trial play: amplifiers are linear up to there."""
@@ -89,175 +83,11 @@ _MOST_CORNERS = 6
 _EXACT = 1e-9
 
 
-@dataclass(frozen=True)
-class PatchedCord:
-    """Cord as patched: node and sign of its source there, coefficient for the file's values, gain of its resistor.
-
-    pot: its pot, if it has one; per_unit: coefficient of that pot by product of the cord's factors.
-    """
-
-    cord: Cord
-    node: str
-    sign: int
-    coefficient: float
-    gain: float
-    resistor: str
-    pot: str = ""
-    per_unit: float = 0.0
-
-
-@dataclass(frozen=True)
-class PatchedElement:
-    """Computing element as patched: name, node of its output, sign and full scale there, and cords.
-
-    farad: capacitor of an integrator, else 0.
-    """
-
-    name: str
-    stage: PatchStage
-    node: str
-    sign: int
-    full: float
-    cords: tuple[PatchedCord, ...]
-    farad: float = 0.0
-
-
-@dataclass(frozen=True)
-class PatchedProgram(ProgramCircuit):
-    """Program compiled from equations.
-
-    patch: computing elements in the order of the diagram; inverters: names of the last amplifiers, by quantity;
-    input_nodes: node by input; reach: range in the trial play by quantity; ideal: by amplifier and name, elements that
-    replace those of the same names if the amplifier is ideal, None for none.
-    """
-
-    equations: Equations
-    stages: Stages
-    fulls: Mapping[str, float]
-    reach: Mapping[str, Reach]
-    patch: tuple[PatchedElement, ...]
-    inverters: Mapping[str, str]
-    input_nodes: Mapping[str, str]
-    elements: tuple[Element, ...]
-    ideal: Mapping[str, Mapping[str, Element | None]]
-
-    __hash__ = object.__hash__
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.equations.name
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        return self.equations.channels
-
-    @functools.cached_property
-    def places(self) -> Mapping[str, tuple[str, int]]:
-        """Node and sign there of every quantity."""
-        elements = {each.stage.name: (each.node, each.sign) for each in self.patch}
-        return elements | {name: (node, 1) for name, node in self.input_nodes.items()}
-
-    @functools.cached_property
-    def scales(self) -> Scales:
-        return Scales(
-            self.equations.speed,
-            {name: Scale(*self.places[name], self.fulls[name]) for name in self.equations.quantities},
-        )
-
-    @functools.cached_property
-    def values(self) -> dict[str, float]:
-        return {name: row.value for name, row in self.equations.parameters.items() if row.pot}
-
-    @functools.cached_property
-    def _cords(self) -> dict[str, PatchedCord]:
-        return {cord.pot: cord for element in self.patch for cord in element.cords if cord.pot}
-
-    @functools.cached_property
-    def pots(self) -> Mapping[str, PotRow]:
-        return {
-            pot: PotRow(
-                cord.resistor, tuple([name for name in _names(self.stages, cord.cord.factors) if name in self.values])
-            )
-            for pot, cord in self._cords.items()
-        }
-
-    def pot_coefficient(self, pot: str, values: Mapping[str, float]) -> float:
-        cord = self._cords[pot]
-        try:
-            return cord.per_unit * self.stages.factor(cord.cord.factors, self.equations.values | dict(values))
-        except ProgramError as cause:
-            raise PotError(f"pot {pot}: {cause}") from cause
-
-    @property
-    def is_linear(self) -> bool:
-        return self.stages.is_linear
-
-    @property
-    def amplifiers(self) -> int:
-        return sum(1 for element in self.elements if isinstance(element, OpAmp))
-
-    @property
-    def integrators(self) -> tuple[str, ...]:
-        return tuple(each.name for each in self.patch if each.stage.kind is StageKind.INTEGRATOR)
-
-    def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
-        given = dict(zip((each.name for each in self.elements if isinstance(each, OpAmp)), models, strict=True))
-        ideal: dict[str, Element | None] = {}
-        for amp, parts in self.ideal.items():
-            if not given[amp].has_state:
-                ideal |= parts
-        elements = [ideal.get(each.name, each) for each in self.elements]
-        return [replace(each, model=given[each.name]) if isinstance(each, OpAmp) else each for each in elements if each]
-
-
-def circuit_of(equations: Equations) -> ProgramCircuit:
-    """Circuit that solves the equations: that of the diagram that the file names, or else their patch.
-
-    Raises ProgramError like compile_program(), and for an unknown diagram or one with other parameters and channels.
-    """
-    if not equations.diagram:
-        return compile_program(equations)
-    if equations.diagram not in DIAGRAMS:
-        raise ProgramError(f"diagram: unknown {equations.diagram[:40]!r}{suggestion(equations.diagram, DIAGRAMS)}")
-    program = DIAGRAMS[equations.diagram]
-    pots = [name for name, row in equations.parameters.items() if row.pot]
-    if pots != list(program.values) or equations.channels != program.channels:
-        raise ProgramError(
-            f"diagram {equations.diagram}: it has the parameters {', '.join(program.values)} and the channels"
-            f" {', '.join(program.channels)}; leave out diagram, or name these"
-        )
-    return program
-
-
-def load_patch(path: str | Path) -> PatchedProgram:
-    """Patch that solves the equations of a program file, also if the file names a diagram.
-
-    Raises ProgramError that names the file, the place and the cure.
-    """
-    equations = read_program(path)
-    try:
-        return compile_program(equations)
-    except ProgramError as cause:
-        raise cause.at(str(path)) from cause
-
-
-@functools.lru_cache(maxsize=32)
-def compile_program(equations: Equations) -> PatchedProgram:
+def compile_equations(equations: Equations) -> PatchedProgram:
     """Patch that solves the equations.
 
-    Raises ProgramError naming the term that cannot be patched, and what to change.
+    Raises ProgramError naming the term that cannot be patched, with edits that may cure it, none of them tried.
     """
-    from analogrig_emulator.machine.tried_edits import advising  # which compiles what it advises
-
-    with advising(equations.table):
-        return compile_unadvised(equations)
-
-
-def compile_unadvised(equations: Equations) -> PatchedProgram:
-    """The same without a trial of the cures."""
     stages = stages_of(equations)
     _check_driven(stages)
     program = _patched(stages, reaches(stages))
@@ -406,7 +236,7 @@ def full_place(equations: Equations, name: str) -> tuple[str, ...]:
 def extremes(stages: Stages, cord: Cord, place: str) -> tuple[float, float]:
     """Least and greatest magnitude of a cord's coefficient in the plant's units, over the ranges of parameters."""
     parameters = stages.equations.parameters
-    names = _names(stages, cord.factors)
+    names = stages.parameters_of(cord.factors)
     if len(names) > _MOST_CORNERS:
         raise ProgramError(f"{place}: term {cord.text} has {len(names)} parameters; name parts of it as signals")
     found = []
@@ -417,15 +247,6 @@ def extremes(stages: Stages, cord: Cord, place: str) -> tuple[float, float]:
             raise ProgramError(f"{place}: {cause}") from cause
         found.append(abs(cord.number) * factor)
     return min(found), max(found)
-
-
-def _names(stages: Stages, factors: Factors) -> list[str]:
-    """Parameters in factors."""
-    found: dict[str, None] = {}
-    for name, _ in factors:
-        inner = stages.composites[name].names() if name in stages.composites else (name,)
-        found |= dict.fromkeys([each for each in inner if each in stages.equations.parameters])
-    return list(found)
 
 
 class _Patcher:
@@ -495,11 +316,13 @@ class _Patcher:
 
     def _users(self, rows: Sequence[PatchStage]) -> Counter[str]:
         """Number of cords by parameter."""
-        return Counter(name for stage in rows for cord in stage.cords for name in _names(self._stages, cord.factors))
+        return Counter(
+            name for stage in rows for cord in stage.cords for name in self._stages.parameters_of(cord.factors)
+        )
 
     def _pot_name(self, cord: Cord) -> str:
         """Name of the parameter, if it turns this pot alone; else P1, P2, ..."""
-        names = _names(self._stages, cord.factors)
+        names = self._stages.parameters_of(cord.factors)
         taken = {pot.lower() for pot in self._pots}
         if len(names) == 1 and self._uses[names[0]] == 1 and not _reserved(names[0]) and names[0].lower() not in taken:
             name = names[0]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
-from analogrig_emulator.machine.compiler import PatchedCord, PatchedElement, PatchedProgram
 from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Box, Point, WirePath, lay_out
+from analogrig_emulator.machine.patched_program import PatchedCord, PatchedElement, PatchedProgram
 from analogrig_emulator.machine.sheet import Inverter, input_text, inverters, signed
 from analogrig_emulator.machine.stages import StageKind
 

@@ -30,10 +30,8 @@ import functools
 import graphlib
 import itertools
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,7 +50,6 @@ from analogrig_emulator.machine.formula import (
 )
 from analogrig_emulator.machine.units import Unit, parse_unit
 
-_MOST_BYTES = 65536
 _MOST_ROWS = 64
 """Most rows of a table, lines of equations and points of a function."""
 
@@ -197,51 +194,11 @@ class Equations:
         return slopes
 
 
-def read_program(path: str | Path) -> Equations:
-    """Program of a file. Raises ProgramError that names the file, the place and the cure."""
-    if Path(path).exists() and not Path(path).is_file():
-        raise ProgramError(f"{path}: cannot be read: it is no regular file")
-    try:
-        with Path(path).open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
-    except OSError as cause:
-        raise ProgramError(f"{path}: cannot be read: {cause.strerror or cause}") from cause
-    return parse_program(data, str(path))
+def read_equations(table: Mapping[str, Any]) -> Equations:
+    """Program of a file's tables.
 
-
-def parse_program(data: bytes | str, where: str) -> Equations:
-    """Program of a file's content; where: its name in error messages. Raises ProgramError like read_program()."""
-    data = data.encode() if isinstance(data, str) else data
-    try:
-        return _parsed(data)
-    except ProgramError as cause:
-        raise ProgramError(f"{where}: {cause}") from cause
-
-
-@functools.lru_cache(maxsize=32)
-def _parsed(data: bytes) -> Equations:
-    if len(data) > _MOST_BYTES:
-        raise ProgramError(f"larger than {_MOST_BYTES} bytes")
-    try:
-        return equations_of(tomllib.loads(data.decode("utf-8-sig")))
-    except UnicodeDecodeError as cause:
-        raise ProgramError(f"is no UTF-8 text: byte {cause.start} does not fit; save it as UTF-8") from None
-    except ValueError as cause:  # a TOMLDecodeError, or a number of too many digits
-        raise ProgramError(f"is no TOML: {cause}") from None
-    except RecursionError:
-        raise ProgramError("is nested too deeply") from None
-
-
-def equations_of(table: Mapping[str, Any]) -> Equations:
-    """Program of a file's tables. Raises ProgramError that names the place and the cure."""
-    from analogrig_emulator.machine.tried_edits import advising  # which compiles what it advises
-
-    with advising(table):
-        return unadvised_equations(table)
-
-
-def unadvised_equations(table: Mapping[str, Any]) -> Equations:
-    """The same without a trial of the cures."""
+    Raises ProgramError that names the place, with edits that may cure it, none of them tried.
+    """
     return _Reader(table).equations()
 
 

@@ -8,18 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.components import COMPONENTS, NOMINAL
 from analogrig_emulator.exceptions import EngineError, UnfitError
+from analogrig_emulator.machine.patched_program import PatchedProgram
 from analogrig_emulator.machine.suspension import SuspensionComputer
 from analogrig_emulator.machine.trial import Reach
-
-if TYPE_CHECKING:
-    from analogrig_emulator.machine.compiler import PatchedProgram
 
 _SAMPLES = 1500
 """Samples of a run without a scenario."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from analogrig_emulator.circuit.pot import dial_for
-from analogrig_emulator.machine.compiler import PatchedCord, PatchedElement, PatchedProgram
+from analogrig_emulator.machine.patched_program import PatchedCord, PatchedElement, PatchedProgram
 from analogrig_emulator.machine.stages import is_atom
 
 

@@ -140,6 +140,14 @@ class Stages:
             product *= float(value) ** power
         return product
 
+    def parameters_of(self, factors: Factors) -> list[str]:
+        """Parameters in factors."""
+        found: dict[str, None] = {}
+        for name, _ in factors:
+            inner = self.composites[name].names() if name in self.composites else (name,)
+            found |= dict.fromkeys([each for each in inner if each in self.equations.parameters])
+        return list(found)
+
     def add_signals(self, quantities: dict[str, Any], values: Mapping[str, float]) -> None:
         """Add the value of every stage but the integrators to the quantities, which hold inputs and states."""
         quantities.setdefault(REFERENCE, np.float64(1.0))

@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from analogrig_emulator.exceptions import ProgramError
-from analogrig_emulator.machine.compiler import INPUT_OHM, PatchedElement, PatchedProgram
+from analogrig_emulator.machine.compiler import INPUT_OHM
+from analogrig_emulator.machine.patched_program import PatchedElement, PatchedProgram
 from analogrig_emulator.machine.sheet import inverters, signed, table
 from analogrig_emulator.machine.stages import StageKind
 

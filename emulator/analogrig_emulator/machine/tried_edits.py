@@ -12,7 +12,7 @@ import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +20,11 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.components import COMPONENTS
 from analogrig_emulator.circuit.nonlinear import MULTIPLIERS
 from analogrig_emulator.exceptions import Edit, EmulatorError, ProgramError, UnfitError
+from analogrig_emulator.machine.compiler import compile_equations
+from analogrig_emulator.machine.patched_program import PatchedProgram
 from analogrig_emulator.machine.program_circuit import ProgramCircuit
-from analogrig_emulator.machine.program_file import unadvised_equations
-
-if TYPE_CHECKING:
-    from analogrig_emulator.machine.compiler import PatchedProgram
+from analogrig_emulator.machine.program_file import read_equations
+from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
 
 _MOST_TRIALS = 40
 _DEEPEST = 8
@@ -118,11 +118,9 @@ def check_edit(table: Mapping[str, Any], edit: Edit) -> None:
 
     It plays on nominal and on real parts, under the square wave of a run and that of its trial play.
     """
-    from analogrig_emulator.machine.compiler import DIAGRAMS, compile_unadvised
-
-    program = compile_unadvised(unadvised_equations(edited(table, edit)))
+    program = compile_equations(read_equations(edited(table, edit)))
     check_tables(program, [place[1] for place in edit if place[0] == "functions"])
-    check_plays(DIAGRAMS.get(program.equations.diagram, program), program)
+    check_plays(PROGRAMS.get(program.equations.diagram, program), program)
 
 
 def check_tables(program: PatchedProgram, tables: Sequence[str]) -> None:
@@ -136,8 +134,6 @@ def check_tables(program: PatchedProgram, tables: Sequence[str]) -> None:
 
 def check_plays(circuit: ProgramCircuit, program: PatchedProgram) -> None:
     """Raise EmulatorError for a play that overloads an amplifier."""
-    from analogrig_emulator.machine.suspension import SuspensionComputer
-
     equations = program.equations
     name, quantity = next(iter(equations.inputs.items()))
     low_v, high_v = (level * program.scales.volts(name) for level in quantity.trial)

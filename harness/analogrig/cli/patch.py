@@ -327,7 +327,7 @@ def _that_sheet(program: PatchedProgram) -> ThatSheet:
 def _deck(program: PatchedProgram) -> str:
     """Deck of the patch under the square wave of the machine, between the levels of the trial play."""
     from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, Excitation, SuspensionComputer
-    from analogrig_emulator.machine.compiler import MACHINE_V
+    from analogrig_emulator.machine.patched_program import MACHINE_V
     from analogrig_emulator.machine.sheet import diagram_lines
 
     computer = SuspensionComputer(program)

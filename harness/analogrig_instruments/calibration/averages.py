@@ -19,7 +19,7 @@ from analogrig.recordings import unanswered
 from analogrig.rigs import Block, Performance
 from analogrig.run import INPUT, OUTPUT, Channel
 from analogrig_emulator import Excitation
-from analogrig_emulator.machine.compiler import MACHINE_V
+from analogrig_emulator.machine.patched_program import MACHINE_V
 
 Vector = NDArray[np.float64]
 _Scalar = TypeVar("_Scalar", bound=np.generic)

@@ -27,7 +27,7 @@ from analogrig_emulator import (
     RecordedExcitation,
     SuspensionComputer,
 )
-from analogrig_emulator.machine.compiler import MACHINE_V
+from analogrig_emulator.machine.patched_program import MACHINE_V
 from analogrig_instruments.calibration.averages import noise_variance
 
 SETTLING_N = 200
