@@ -1,7 +1,7 @@
-"""Two million corrupted frames against both decoders: none may be taken for something that nobody sent.
+"""Corrupted frames against both decoders: none may be taken for something that nobody sent.
 
 A checksum of 32 bits takes one in 2^32 of what is random, so that two million find one with a probability of 0.05 %.
-One that takes one in 2^18 is noticed with a probability of 99.9 %. The seed is fixed.
+One that takes one in 2^18 is noticed with a probability of 99.9 %, of 53 % by 200,000. The seed is fixed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from tests.estimator_c.est_driver import STRICT
 
 ROOT = Path(__file__).parents[2]
 GENERATED = ROOT / "build" / "generated"
-FRAMES = 2_000_000
 AT_ONCE = 10_000
 
 
@@ -59,15 +58,16 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return product
 
 
-def test_no_corrupted_frame_is_taken_for_what_nobody_sent(library: Path) -> None:
+@pytest.mark.parametrize("frames", [200_000, pytest.param(2_000_000, marks=pytest.mark.heavy)])
+def test_no_corrupted_frame_is_taken_for_what_nobody_sent(library: Path, frames: int) -> None:
     line, decoder = CorruptedLine(library, seed=5), frame.FrameDecoder()
     taken = wrong = 0
-    for _ in range(FRAMES // AT_ONCE):
+    for _ in range(frames // AT_ONCE):
         outcome, stream, packets = line.run()
         assert b"".join(decoder.feed(stream)) == packets, "the decoders of harness and device differ"
         assert outcome.dropped == decoder.dropped
         taken += outcome.taken
         wrong += outcome.wrong
     assert wrong == 0
-    assert decoder.dropped > 0.8 * FRAMES
-    assert taken < 0.2 * FRAMES
+    assert decoder.dropped > 0.8 * frames
+    assert taken < 0.2 * frames

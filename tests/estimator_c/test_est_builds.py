@@ -81,7 +81,7 @@ def test_builds_agree_to_the_bit(
 def test_build_refuses_what_it_was_made_without(
     build: Build, options: tuple[str, ...], settings: dict[str, int]
 ) -> None:
-    driver = build(*options)
+    driver = build(*options, "-O0")
     base = MINIMAL if options == WITHOUT else CARD
     assert driver.init(**base)
     assert not driver.init(**settings)
@@ -91,12 +91,12 @@ def test_build_refuses_what_it_was_made_without(
 def test_build_without_checks_takes_the_configuration_at_its_word(
     build: Build, option: tuple[str, ...], *, accepts: bool
 ) -> None:
-    assert build(*option).init(forgetting=2.0) == accepts
+    assert build(*option, "-O0").init(forgetting=2.0) == accepts
 
 
 @pytest.mark.parametrize("orders", [("-DEST_NB_MAX=1U", "-DEST_NK_MAX=0U"), fixed({**CARD, "nb": 1, "nk": 0})])
 def test_build_with_room_for_one_input_sees_edges_where_they_are(build: Build, orders: tuple[str, ...]) -> None:
-    driver = build("-DEST_WITH_EDGES=0", *orders)
+    driver = build("-DEST_WITH_EDGES=0", *orders, "-O0")
     assert driver.init(na=2, nb=1, nk=0, offset=0, edge_instants=LOCKED, stuck_n=4, refresh_n=0)
     u, y = np.full(40, 1000.0), np.full(40, 1500.0)
     assert driver.run(u, y).counters["stuck"] == 0, "u never moves"

@@ -85,7 +85,10 @@ def test_several_changes_at_once_are_stated_as_such(estimator: Estimator) -> Non
     assert (estimator.isolate(played.u, played.y, played.onset).change == "several").sum() >= 6
 
 
-@pytest.mark.parametrize("change", SINGLE, ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [pytest.param(each, id=str(each), marks=() if each in SINGLE[3:5] else pytest.mark.heavy) for each in SINGLE],
+)
 def test_random_plants_are_isolated_as_well(estimator: Estimator, change: Change) -> None:
     """With 20 trials each of ten."""
     found = [

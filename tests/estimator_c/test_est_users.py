@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import signal
 import subprocess
@@ -32,28 +33,31 @@ def gcc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def link(folder: Path, library: str, caller: str) -> subprocess.CompletedProcess[str]:
-    """Compile est.c and est_isolation.c with one option, their caller with another, and link them."""
+@functools.cache
+def objects(folder: Path, option: str) -> tuple[list[Path], Path]:
+    """Objects of est.c and est_isolation.c, and of their caller, compiled with an option."""
     (folder / "caller.c").write_text(USE)
-    objects = []
-    for source, option in (
-        (CORE / "est.c", library),
-        (ISOLATION / "est_isolation.c", library),
-        (folder / "caller.c", caller),
-    ):
-        objects.append(folder / f"{source.stem}.o")
-        assert gcc(option, "-c", source, "-o", objects[-1]).returncode == 0
-    return gcc(*objects, "-o", folder / "program")
+    made = []
+    for source in (CORE / "est.c", ISOLATION / "est_isolation.c", folder / "caller.c"):
+        made.append(folder / f"{source.stem}{option}.o")
+        assert gcc(option, "-c", source, "-o", made[-1]).returncode == 0
+    return made[:2], made[2]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("objects")
 
 
 @pytest.mark.parametrize(
     "option", ["-DEST_NA_MAX=3U", "-DEST_NB_MAX=4U", "-DEST_NK_MAX=2U", "-DEST_NC_MAX=1U", "-DEST_THETA_MAX=8U"]
 )
-def test_caller_with_other_maxima_than_the_library_does_not_link(tmp_path: Path, option: str) -> None:
-    assert link(tmp_path, option, option).returncode == 0
+def test_caller_with_other_maxima_than_the_library_does_not_link(folder: Path, tmp_path: Path, option: str) -> None:
+    (library, caller), (other_library, other_caller) = objects(folder, option), objects(folder, "-DNDEBUG")
+    assert gcc(*library, caller, "-o", tmp_path / "program").returncode == 0
     assert subprocess.run([tmp_path / "program"], check=False).returncode == 0
-    for library, caller in ((option, "-DNDEBUG"), ("-DNDEBUG", option)):
-        done = link(tmp_path, library, caller)
+    for linked in ((*library, other_caller), (*other_library, caller)):
+        done = gcc(*linked, "-o", tmp_path / "program")
         assert done.returncode != 0
         assert "undefined reference to `est_init_na" in done.stderr
         assert "undefined reference to `est_isolation_init_na" in done.stderr

@@ -148,7 +148,7 @@ def test_suspension_is_predicted_as_in_extended_precision(
 
 
 @settings(
-    max_examples=200,
+    max_examples=80,
     deadline=None,
     derandomize=True,
     database=None,

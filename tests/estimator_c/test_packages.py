@@ -34,8 +34,8 @@ CORTEX = {
     "M55": ("-mcpu=cortex-m55", "-mfloat-abi=hard"),
 }
 LEVELS = ("-O0", "-Os", *(pytest.param(level, marks=pytest.mark.heavy) for level in ("-O2", "-O3")))
-QUICK_CORES = ("M0", "M3", "M4F")
-"""Cores that `make test` compiles for: no hardware division, no floating point, and both."""
+QUICK_CORES = ("M0", "M4F")
+"""Cores that `make test` compiles for: neither hardware division nor floating point, and both."""
 
 
 def run(*command: str | Path, cwd: Path | None = None) -> str:
@@ -76,36 +76,20 @@ def test_cmake_project_takes_the_estimator_by_add_subdirectory_with_its_options(
 
 
 @pytest.mark.tools("cmake")
-def test_cmake_project_finds_the_installed_estimator_and_its_options(tmp_path: Path) -> None:
+def test_cmake_project_finds_the_installed_estimator_its_options_and_no_other_version(tmp_path: Path) -> None:
     prefix, user = tmp_path / "prefix", tmp_path / "user"
     user.mkdir()
-    run(
-        "cmake",
-        "-S",
-        ESTIMATOR,
-        "-B",
-        tmp_path / "est",
-        f"-DCMAKE_INSTALL_PREFIX={prefix}",
-        "-DEST_OPTIONS=EST_NC_MAX=1U",
-    )
+    options = (f"-DCMAKE_INSTALL_PREFIX={prefix}", "-DEST_OPTIONS=EST_NC_MAX=1U")
+    run("cmake", "-S", ESTIMATOR, "-B", tmp_path / "est", *options)
     run("cmake", "--build", tmp_path / "est", "--target", "install")
     script = f"project(user C)\nfind_package(est {VERSION} REQUIRED)\n{PROGRAM}"
     run(cmake(user, script, f"-DCMAKE_PREFIX_PATH={prefix}") / "program")
-
-
-@pytest.mark.tools("cmake")
-def test_cmake_project_rejects_another_minor_version(tmp_path: Path) -> None:
-    prefix, user = tmp_path / "prefix", tmp_path / "user"
-    user.mkdir()
-    run("cmake", "-S", ESTIMATOR, "-B", tmp_path / "est", f"-DCMAKE_INSTALL_PREFIX={prefix}")
-    run("cmake", "--build", tmp_path / "est", "--target", "install")
     (user / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(user C)\nfind_package(est 9.9 REQUIRED)\n"
     )
-    command: list[str | Path] = ["cmake", "-S", user, "-B", user / "build", f"-DCMAKE_PREFIX_PATH={prefix}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(["cmake", user / "build"], capture_output=True, text=True, check=False)
     assert done.returncode != 0
-    assert "est" in done.stderr
+    assert 'requested version "9.9"' in " ".join(done.stderr.split())
 
 
 @pytest.mark.tools("cmake")
@@ -187,13 +171,15 @@ def test_no_warning_on_any_cortex_m(core: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.tools("arm-none-eabi-gcc")
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", [level for level in LEVELS if level != "-Os"])  # the cores have that
 def test_no_warning_at_any_level_of_optimisation(level: str, tmp_path: Path) -> None:
     compiles("arm-none-eabi-gcc", (*CORTEX["M4F"], level), tmp_path)
 
 
 @pytest.mark.tools("avr-gcc")
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize(
+    "level", ["-Os", *(pytest.param(level, marks=pytest.mark.heavy) for level in ("-O0", "-O2", "-O3"))]
+)
 def test_no_warning_on_an_avr(level: str, tmp_path: Path) -> None:
     compiles("avr-gcc", ("-mmcu=atmega2560", level), tmp_path)
 

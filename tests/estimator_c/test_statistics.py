@@ -61,6 +61,7 @@ def test_healthy_plant_raises_no_more_alarms_than_promised(estimator: Estimator,
     assert performance.upper_rate(found, 1_000_000) <= 1.0 / ARL0
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("settings", "excitation"), [(SHARED_CLOCK, FULL), (OWN_CLOCK, FULL_FREE)])
 def test_random_healthy_plants_raise_no_more_alarms_than_promised(
     estimator: Estimator, settings: Settings, excitation: Excitation

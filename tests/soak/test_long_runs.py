@@ -97,16 +97,17 @@ def test_page_has_at_most_five_megabytes(samples: int) -> None:
     assert len(render(run, judge(run)).encode()) <= MOST_PAGE_BYTES
 
 
-def test_page_of_many_false_alarms_changes_and_ramps_has_at_most_five_megabytes() -> None:
-    run = long_run(200_000, false_alarms=100_000, changes=300)
+@pytest.mark.parametrize("alarms", [20_000, pytest.param(100_000, marks=pytest.mark.heavy)])
+def test_page_of_many_false_alarms_changes_and_ramps_has_at_most_five_megabytes(alarms: int) -> None:
+    run = long_run(2 * alarms, false_alarms=alarms, changes=300 * alarms // 100_000)
     verdict = judge(run)
-    assert len(verdict.false_alarms) > 90_000
+    assert len(verdict.false_alarms) > 0.9 * alarms
     ramped = tuple(
         replace(segment, ramp_n=600 if segment.start else 0) for segment in run.conditions.segments
     )  # nearly all samples
     turning = replace(run, conditions=replace(run.conditions, segments=ramped))
     page = render(turning, verdict)
-    assert len(page.encode()) <= MOST_PAGE_BYTES
+    assert len(page.encode()) <= MOST_PAGE_BYTES * min(1.0, 2 * alarms / MOST_POINTS)
     assert "alarms are marked" in Page(page).text
 
 
@@ -154,7 +155,7 @@ def test_short_run_is_shown_sample_by_sample() -> None:
 
 
 def test_changes_and_alarms_of_a_long_run_are_shown_sample_by_sample() -> None:
-    samples = 2_000_000
+    samples = 400_000
     run = long_run(samples)
     data = Page(render(run, judge(run))).data()
     whole = [range(start, end) for start, end, size in data["pieces"] if size == 1]

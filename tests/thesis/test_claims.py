@@ -714,6 +714,7 @@ def test_comparison_has_every_scheme_and_its_cost_on_every_data(claims: Claims) 
     assert all(claims["comparison"]["instructions"][key] > 100 for key in keys)
 
 
+@pytest.mark.heavy
 def test_second_reproduction_is_the_same_to_the_byte(reproduced: Path) -> None:
     again = reproduce()
     assert again.page().encode() == (reproduced / PAGE).read_bytes()
