@@ -81,6 +81,7 @@ def measured(pytest_arguments: tuple[str, ...] = ()) -> Coverage:
         tests = sorted(str(path) for path in (ROOT / "tests" / "estimator_c").glob("test_est_*.py"))
         chosen = [path for path in tests if not path.endswith(OWN_BUILDS)]
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-k", KEPT]
+        command += ["-m", "not heavy"]
         command += pytest_arguments
         environment = os.environ | {"EST_COVERAGE": str(folder)}
         subprocess.run([*command, *chosen], cwd=ROOT, env=environment, check=True, stdout=subprocess.DEVNULL)
