@@ -77,8 +77,9 @@ extern "C" {
 /// | EST_ASSERT(x)               | assert(x)  | statement that must not continue if x is false: the caller made a  |
 /// |                             |            | mistake. Empty by default with NDEBUG or without an assert.h       |
 ///
-/// The five maxima determine sizeof(est_t). They are plain numbers, with or without U, and part of the names that the
-/// linker sees: if the library and its caller disagree, est_init() is an undefined reference.
+/// The five maxima and EST_WITH_ROBUSTNESS determine the layout of the state. They are part of the names that the linker
+/// sees: if the library and its caller disagree, est_init() is an undefined reference. Write the maxima as plain numbers,
+/// with U or without it, alike in every file.
 /// A configuration that requests an omitted feature is refused by est_init(). EST_WITH_CHECKS=0 is for a constant
 /// configuration that est_config_valid() has accepted elsewhere, as in a test on the host.
 #ifndef EST_NA_MAX
@@ -121,11 +122,18 @@ extern "C" {
 #define EST_WITH_ROBUSTNESS 1
 #endif
 
-/// Names with the maxima, as est_init_na2U_nb3U_nk1U_nc0U_theta6U. Private.
-#define EST_NAME_JOINED(name, a, b, k, c, n) name##_na##a##_nb##b##_nk##k##_nc##c##_theta##n  // MISRA D6
-#define EST_NAME_EXPANDED(name, a, b, k, c, n) EST_NAME_JOINED(name, a, b, k, c, n)
-#define EST_NAME(name) EST_NAME_EXPANDED(name, EST_NA_MAX, EST_NB_MAX, EST_NK_MAX, EST_NC_MAX, EST_THETA_MAX)
+/// Names with everything that determines the layout of the state, as est_init_na2U_nb3U_nk1U_nc0U_theta6U_full. Private.
+#if EST_WITH_ROBUSTNESS
+#define EST_NAME_BUILD _full
+#else
+#define EST_NAME_BUILD _lean
+#endif
+#define EST_NAME_JOINED(name, a, b, k, c, n, build) name##_na##a##_nb##b##_nk##k##_nc##c##_theta##n##build  // MISRA D6
+#define EST_NAME_EXPANDED(name, a, b, k, c, n, build) EST_NAME_JOINED(name, a, b, k, c, n, build)
+#define EST_NAME(name)                                                                                                 \
+    EST_NAME_EXPANDED(name, EST_NA_MAX, EST_NB_MAX, EST_NK_MAX, EST_NC_MAX, EST_THETA_MAX, EST_NAME_BUILD)
 #define est_init EST_NAME(est_init)
+#define est_config_default EST_NAME(est_config_default)
 
 /// Warning if the result of a function is ignored. Private.
 #ifdef __GNUC__

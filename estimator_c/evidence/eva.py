@@ -31,7 +31,7 @@ HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
 RESULTS = HERE.parents[1] / "build" / "eva.json"
 THETA_MAX, NC_MAX = 6, 2
-INIT = f"est_init_na2U_nb3U_nk1U_nc{NC_MAX}U_theta{THETA_MAX}U"
+INIT = f"est_init_na2U_nb3U_nk1U_nc{NC_MAX}U_theta{THETA_MAX}U_full"
 """Name that est.h gives to est_init()."""
 
 OPTIONS = (

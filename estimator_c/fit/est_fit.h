@@ -25,7 +25,7 @@
 extern "C" {
 #endif
 
-/// A name with the maxima of est.h: files compiled with different ones do not link.
+/// A name with the layout of est.h: files compiled with different ones do not link.
 #define est_fit_init EST_NAME(est_fit_init)
 
 /// Number of samples whose sum is one sample of the spectrum. Lines up to 1 / (2 * EST_FIT_SUM_N) cycles per sample

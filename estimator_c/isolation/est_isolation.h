@@ -23,7 +23,7 @@
 extern "C" {
 #endif
 
-/// A name with the maxima of est.h: files compiled with different ones do not link.
+/// A name with the layout of est.h: files compiled with different ones do not link.
 #define est_isolation_init EST_NAME(est_isolation_init)
 
 /// Number of stored samples: those before the alarm, which contain the onset, and those that wait for

@@ -1,8 +1,7 @@
-"""est.h protects its users: from a mismatch of options, an ignored refusal, a dangling configuration, a wrong unit."""
+"""est.h protects its users: from an ignored refusal, a dangling configuration, a wrong unit."""
 
 from __future__ import annotations
 
-import functools
 import re
 import signal
 import subprocess
@@ -31,44 +30,6 @@ int main(void) { return (est_init(&estimator, &config) && est_isolation_init(&is
 def gcc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = ["gcc", "-std=c99", f"-I{CORE}", f"-I{ISOLATION}", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-@functools.cache
-def objects(folder: Path, option: str) -> tuple[list[Path], Path]:
-    """Objects of est.c and est_isolation.c, and of their caller, compiled with an option."""
-    (folder / "caller.c").write_text(USE)
-    made = []
-    for source in (CORE / "est.c", ISOLATION / "est_isolation.c", folder / "caller.c"):
-        made.append(folder / f"{source.stem}{option}.o")
-        assert gcc(option, "-c", source, "-o", made[-1]).returncode == 0
-    return made[:2], made[2]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("objects")
-
-
-@pytest.mark.parametrize(
-    "option", ["-DEST_NA_MAX=3U", "-DEST_NB_MAX=4U", "-DEST_NK_MAX=2U", "-DEST_NC_MAX=1U", "-DEST_THETA_MAX=8U"]
-)
-def test_caller_with_other_maxima_than_the_library_does_not_link(folder: Path, tmp_path: Path, option: str) -> None:
-    (library, caller), (other_library, other_caller) = objects(folder, option), objects(folder, "-DNDEBUG")
-    assert gcc(*library, caller, "-o", tmp_path / "program").returncode == 0
-    assert subprocess.run([tmp_path / "program"], check=False).returncode == 0
-    for linked in ((*library, other_caller), (*other_library, caller)):
-        done = gcc(*linked, "-o", tmp_path / "program")
-        assert done.returncode != 0
-        assert "undefined reference to `est_init_na" in done.stderr
-        assert "undefined reference to `est_isolation_init_na" in done.stderr
-
-
-def test_isolation_with_other_maxima_than_its_caller_does_not_link(tmp_path: Path) -> None:
-    (tmp_path / "caller.c").write_text(USE)
-    assert gcc("-DEST_NC_MAX=1U", "-c", ISOLATION / "est_isolation.c", "-o", tmp_path / "isolation.o").returncode == 0
-    done = gcc(tmp_path / "caller.c", CORE / "est.c", tmp_path / "isolation.o", "-o", tmp_path / "program")
-    assert "undefined reference to `est_isolation_init_na2U" in done.stderr
-    assert "`est_init_na" not in done.stderr
 
 
 @pytest.mark.parametrize("call", ["est_init(&estimator, &config)", "est_isolation_init(&isolation, &config, 0.0F)"])
