@@ -288,12 +288,12 @@ static bool in_range(const est_config_t* const config, const float code) {
 
 /// True iff the two numbers have the same bits.
 static bool same_bits(const float a, const float b) {
-    typedef union {       // MISRA D5
+    typedef union {       // MISRA D4
         float    number;  // cppcheck F3
         uint32_t bits;
     } est_bits_t;
-    const est_bits_t first  = { .number = a };  // MISRA D5
-    const est_bits_t second = { .number = b };  // MISRA D5
+    const est_bits_t first  = { .number = a };  // MISRA D4
+    const est_bits_t second = { .number = b };  // MISRA D4
     return first.bits == second.bits;
 }
 
@@ -302,7 +302,7 @@ static bool same_bits(const float a, const float b) {
 EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
     if (!same_bits(y, self->y[0])) {
         self->same_n = 0U;
-        return false;  // MISRA D4
+        return false;
     }
     const uint32_t watched = (edge ? 1U : 0U) | self->same_n;  // 0: every edge was answered
     if ((watched > 0U) && (self->same_n < UINT8_MAX)) {
@@ -334,7 +334,7 @@ EST_SHARED bool other_reading_leads(const est_t* const self) {
 /// begins a new doubt.
 static void doubt_edge(est_t* const self) {
     if (other_reading_leads(self)) {
-        return;  // MISRA D4
+        return;
     }
     const float step = self->u[0] - self->u[1];
     self->doubt_n    = 1U;
@@ -349,7 +349,7 @@ static void doubt_edge(est_t* const self) {
 EST_INLINE est_edge_instants_t edge_instants_of(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
     if (self->edges_vary) {
-        return EST_EDGES_ANYWHERE;  // MISRA D4
+        return EST_EDGES_ANYWHERE;
     }
 #endif
     return self->config->edge_instants;
@@ -388,7 +388,7 @@ static void enter_edge(est_t* const self) {
     if (in_gap(self)) {
         increment(&self->edge_age_n);  // the instant of the edge is unknown
         forget_samples(self);
-        return;  // MISRA D4
+        return;
     }
 #if EST_WITH_ROBUSTNESS
     self->correlation.edge_outliers = (uint8_t)(self->correlation.edge_outliers << 1U);
@@ -396,7 +396,7 @@ static void enter_edge(est_t* const self) {
     const bool slope = self->edge_age_n < SLOPE_N;
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
-        return;  // MISRA D4
+        return;
     }
     const est_edge_instants_t instants = edge_instants_of(self);
     if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) && is_cusum(self->config)) {
@@ -429,7 +429,7 @@ static est_status_t enter_input(est_t* const self, float u, float* const y) {
     const bool edge = EST_KNOWS_EDGES && est_edges_is_edge(self->config, self->u) && self->known;
     if (EST_WITH_WATCH && is_stuck(self, *y, edge)) {
         increment(&self->counters.stuck);
-        return EST_REFUSED;  // MISRA D4
+        return EST_REFUSED;
     }
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->doubt_n = (self->doubt_n < EST_DOUBT_N) ? (uint8_t)(self->doubt_n + 1U) : 0U;
@@ -446,7 +446,7 @@ static est_status_t enter_input(est_t* const self, float u, float* const y) {
         end_bridge(self);
         gather(self);
         shift_y(self, *y);
-        return EST_GATHERING;  // MISRA D4
+        return EST_GATHERING;
     }
     return EST_UPDATED;
 }
@@ -454,11 +454,11 @@ static est_status_t enter_input(est_t* const self, float u, float* const y) {
 /// Classify the sample, and enter its u if it is good. `y`: that of its equation.
 static est_status_t examine(est_t* const self, const est_sample_t sample, float* const y) {
     if (!sample.valid) {
-        return EST_MISSING;  // MISRA D4
+        return EST_MISSING;
     }
     if (in_range(self->config, sample.u) && in_range(self->config, sample.y)) {
         *y = sample.y;
-        return enter_input(self, sample.u, y);  // MISRA D4
+        return enter_input(self, sample.u, y);
     }
     if (EST_WITH_WATCH && is_plausible(sample.u) && is_plausible(sample.y)) {
         increment(&self->counters.saturated);
@@ -534,7 +534,7 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
     if (moved < REFRESH_STEP) {
         self->renewal    = EST_RENEWAL_NONE;
         self->refresh_in = self->config->refresh_n;
-        return;  // MISRA D4
+        return;
     }
     self->renewal = EST_RENEWAL_PREFILTER;
     if (!self->settled || (moved > REFRESH_STRIDE)) {
@@ -633,7 +633,7 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
         shift_u(self, self->u[0]);
         *y = self->y[0];
         increment(&self->edge_age_n);
-        return true;  // MISRA D4
+        return true;
     }
 #else
     (void)y;
@@ -664,7 +664,7 @@ static void find_hidden_change(est_t* const self, const float mean) {
     est_scale_t* const scale = &self->scale;
     if ((self->trigger.quiet_n > 0U) || !self->config->noise_estimated) {
         scale->high_n = 0U;
-        return;  // MISRA D4
+        return;
     }
     est_scale_count(scale, mean >= (EST_HIGH * self->noise_variance));
     if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {  // a doubt comes first
@@ -697,7 +697,7 @@ static void renew_scale(est_t* const self) {
     if (scale->phase == EST_PHASE_END) {
         est_scale_relax(scale);
         est_scale_restart(self);
-        return;  // MISRA D4
+        return;
     }
     const float mean = est_scale_mean(scale);
     if (scale->phase == EST_PHASE_CHANGE) {
@@ -734,7 +734,7 @@ EST_INLINE void watch_scale(est_t* const                self,
                             const float                 precision) {
 #if EST_WITH_ROBUSTNESS
     if (est_scale_enter(&self->scale, term)) {
-        return;  // MISRA D4
+        return;
     }
     if (est_scale_on_trial(&self->scale)) {
         try_alarm(self, shape, equation, precision);
@@ -807,7 +807,7 @@ static bool returns_at_edge(const est_t* const self) {
 EST_ROBUST_SHARED bool is_lone_outlier(const est_t* const self, const float term) {
 #if EST_WITH_ROBUSTNESS
     if (may_be_displaced(self)) {
-        return false;  // MISRA D4
+        return false;
     }
     const float reached = self->trigger.statistic + est_max(self->correlation.lead, 0.0F);  // sum of the first reading
     const float before  = (reached - term) + EST_CUSUM_DRIFT;
@@ -866,12 +866,12 @@ EST_INLINE void enter_innovation(
     }
     if (correlation->work <= EST_WORK_LAG_1) {
         trigger->statistic = est_trigger_sum(trigger->statistic, share * term);
-        return;  // the usual step; MISRA D4
+        return;  // the usual step
     }
     if (correlation->work != EST_WORK_OTHER_TRIGGER) {
         trigger->statistic = est_correlation_enter(correlation, &self->scale, e, trigger->statistic, share * term,
                                                    share * weight, precision);
-        return;  // MISRA D4
+        return;
     }
 #else
     (void)weight;
@@ -900,7 +900,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
     if (EST_WITH_ROBUSTNESS && (step->status != EST_UPDATED)) {
         bridge(self, shape, equation.innovation);
-        return;  // MISRA D4
+        return;
     }
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation);
     if (EST_WITH_ADAPTATION && (config->random_walk > 0.0F)) {
@@ -921,16 +921,16 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     } else {
         if (is_lone_outlier(self, term)) {
             set_outlier_aside(self, equation.innovation, step);
-            return;  // MISRA D4
+            return;
         }
         accept_equation(self, shape, &equation);
         if (finding == EST_ALARM) {
             raise_alarm(self, step);
-            return;  // MISRA D4
+            return;
         }
         if (EST_WITH_EDGES && (finding == EST_SLIP)) {
             note_slip(self);
-            return;  // MISRA D4
+            return;
         }
     }
     watch_scale(self, shape, &equation, term, precision);
@@ -950,11 +950,11 @@ static void dispatch_equation(est_t* const self, const float y, est_step_t* cons
     const est_shape_t locked = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
     if (same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
         enter_equation(self, EST_SHAPE_FREE_RUNNING, y, step);
-        return;  // MISRA D4
+        return;
     }
     if (same_shape(shape, locked)) {
         enter_equation(self, locked, y, step);
-        return;  // MISRA D4
+        return;
     }
 #endif
     enter_equation(self, shape, y, step);
@@ -970,7 +970,7 @@ est_config_t est_config_default(void) {
 bool est_init(est_t* const self, const est_config_t* const config) {
     EST_ASSERT((self != NULL) && (config != NULL));
     if (EST_WITH_CHECKS && !est_config_valid(config)) {
-        return false;  // MISRA D4
+        return false;
     }
     *self                = (est_t){ .config = config };
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
@@ -1085,11 +1085,11 @@ est_counters_t est_counters(const est_t* const self) {
 
 bool est_invariants_hold(const est_t* const self) {
     if ((self == NULL) || (self->config == NULL) || !est_config_valid(self->config)) {
-        return false;  // MISRA D4
+        return false;
     }
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         if (!(est_magnitude(self->theta[i]) <= FLT_MAX) || !within(self->factors.d[i], FLT_MIN, FLT_MAX)) {
-            return false;  // MISRA D4
+            return false;
         }
     }
     return within(self->noise_variance, FLT_MIN, FLT_MAX) && within(self->trigger.statistic, 0.0F, FLT_MAX) &&

@@ -128,7 +128,7 @@ extern "C" {
 #else
 #define EST_NAME_BUILD _lean
 #endif
-#define EST_NAME_JOINED(name, a, b, k, c, n, build) name##_na##a##_nb##b##_nk##k##_nc##c##_theta##n##build  // MISRA D6
+#define EST_NAME_JOINED(name, a, b, k, c, n, build) name##_na##a##_nb##b##_nk##k##_nc##c##_theta##n##build  // MISRA D5
 #define EST_NAME_EXPANDED(name, a, b, k, c, n, build) EST_NAME_JOINED(name, a, b, k, c, n, build)
 #define EST_NAME(name)                                                                                                 \
     EST_NAME_EXPANDED(name, EST_NA_MAX, EST_NB_MAX, EST_NK_MAX, EST_NC_MAX, EST_THETA_MAX, EST_NAME_BUILD)

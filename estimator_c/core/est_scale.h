@@ -125,7 +125,7 @@ static inline void est_scale_forgive(est_t* const estimator) {
 /// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
 EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
     if (self->phase >= EST_BLOCK_N) {
-        return false;  // MISRA D4
+        return false;
     }
     self->phase++;
     self->sum += term;

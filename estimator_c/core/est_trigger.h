@@ -63,7 +63,7 @@ static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
 /// edge, and the recorded reading continues.
 static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
-        return true;  // MISRA D4
+        return true;
     }
     self->statistic = est_min(est_trigger_best_rival(self), self->statistic);
     return false;
@@ -126,10 +126,10 @@ EST_INLINE est_finding_t est_trigger_find(const est_trigger_t* const self,
                                           const float                ceiling,
                                           const uint_fast8_t         doubt_n) {
     if (self->statistic < ceiling) {
-        return EST_QUIET;  // MISRA D4
+        return EST_QUIET;
     }
     if (EST_WITH_EDGES && (doubt_n > 0U) && (est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
-        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_UNDECIDED;  // MISRA D4
+        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_UNDECIDED;
     }
     return EST_ALARM;
 }
@@ -158,10 +158,10 @@ static inline float est_trigger_other_statistic(est_trigger_t* const            
                                                 const float                       innovation,
                                                 const float                       variance) {
     if (config->kind == EST_TRIGGER_PREDICTION_ERROR) {
-        return est_magnitude(innovation);  // MISRA D4
+        return est_magnitude(innovation);
     }
     if (config->kind == EST_TRIGGER_MEAN_BETWEEN_FAULTS) {
-        return mean_between_faults(self, config->absolute, innovation);  // MISRA D4
+        return mean_between_faults(self, config->absolute, innovation);
     }
     return call_custom(self, config, innovation, variance);
 }
@@ -170,7 +170,7 @@ static inline float est_trigger_other_statistic(est_trigger_t* const            
 EST_INLINE bool est_trigger_holds(est_trigger_t* const self) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
-        return true;  // MISRA D4
+        return true;
     }
     return false;
 }

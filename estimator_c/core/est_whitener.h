@@ -28,7 +28,7 @@ EST_SHARED bool est_whitener_accepts(const float* const c, const uint_fast8_t na
     for (uint_fast8_t order = na; order > 0U; order--) {
         const float k = a[order - 1U];
         if (!(est_magnitude(k) < REFLECTION_MAX)) {
-            return false;  // MISRA D4
+            return false;
         }
         const float rest = 1.0F - (k * k);
         EST_UNROLL

@@ -694,7 +694,7 @@ void est_fit_enter(est_fit_watch_t* const self, const est_t* const estimator, co
     }
     if (self->slot < (EST_FIT_SUM_N - 1U)) {
         self->slot++;
-        return;  // MISRA D4
+        return;
     }
     self->slot = 0U;
     if (full) {

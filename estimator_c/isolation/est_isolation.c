@@ -150,16 +150,16 @@ static bool derive_plant(est_plant_t* const self, const est_config_t* const conf
     self->a[1]      = a1;
     self->a[2]      = a2;
     if ((a2 < 1.0e-6F) || (a2 >= 1.0F) || (sum < 1.0e-6F)) {
-        return false;  // MISRA D4
+        return false;
     }
     const float cosh_w = -a1 / (2.0F * root(a2));
     const float p      = -logarithm(a2);
     if (cosh_w < -0.9F) {
-        return false;  // MISRA D4
+        return false;
     }
     const float q = (0.25F * p * p) - squared_arcosh(cosh_w);
     if (q <= 0.0F) {
-        return false;  // MISRA D4
+        return false;
     }
     const float first  = a1 + (2.0F * a2);
     const float second = a1 + (4.0F * a2);
@@ -417,7 +417,7 @@ static float log_add(const float a, const float b) {
 static float gain_of_variance(const float energy, const float n) {
     const float usual = 0.5F * n;
     if (energy <= usual) {
-        return 0.0F;  // MISRA D4
+        return 0.0F;
     }
     return (energy - usual) + (usual * logarithm(greater(usual / energy, 1.0e-9F)));
 }
@@ -673,7 +673,7 @@ static est_change_t decide(const est_fit_t* const fit, const uint16_t samples_n)
     float                     lead  = SURE + lost;
     bool                      sure;
     if ((pair - found->any) > (NOT_BY_CHANCE + lost)) {
-        return EST_CHANGE_SEVERAL;  // MISRA D4
+        return EST_CHANGE_SEVERAL;
     }
     if (one < PARAMETERS) {
         const float penalty = penalty_of(extent_of(change_of(one), found->change));
@@ -699,7 +699,7 @@ static void diagnose(est_isolation_t* const self) {
         out->change = decide(&self->fit, out->samples_n);
     }
     if ((out->change == EST_CHANGE_UNDECIDED) || (out->change == EST_CHANGE_SEVERAL)) {
-        return;  // MISRA D4
+        return;
     }
     const uint8_t             one   = index_of(out->change);
     const est_single_t* const found = &self->fit.single[one];
@@ -740,14 +740,14 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     if (self->active && (self->diagnosis.change == EST_CHANGE_UNDECIDED)) {
         self->repeated_n = (uint8_t)(self->repeated_n + self->since_n);
         self->since_n    = 0U;
-        return;  // MISRA D4
+        return;
     }
     stop(self);
     self->since_n    = 0U;
     self->repeated_n = 0U;
     self->diagnosis  = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
     if (!was_quiet || (earliest_n < 1U) || !derive_plant(&self->plant, self->config, self->force_zero)) {
-        return;  // MISRA D4
+        return;
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
         self->onsets[i].before_n = onset_before(i, earliest_n);
@@ -809,7 +809,7 @@ void est_isolation_enter(est_isolation_t* const self,
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {
         self->known_n = 0U;
         stop(self);
-        return;  // MISRA D4
+        return;
     }
     keep(self, sample, step.innovation);
     if (self->active) {
@@ -860,7 +860,7 @@ static void enter_onsets(est_isolation_t* const self, const uint8_t first) {
 bool est_isolation_work(est_isolation_t* const self) {
     EST_ASSERT(self != NULL);
     if (!self->active || (self->waiting_n == 0U)) {
-        return false;  // MISRA D4
+        return false;
     }
     if (self->turn == 0U) {
         begin_sample(self);
