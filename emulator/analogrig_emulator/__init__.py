@@ -49,7 +49,7 @@ from analogrig_emulator.exceptions import (
     ProgramError,
     SamplerError,
 )
-from analogrig_emulator.machine.analog_computer import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
+from analogrig_emulator.machine.analog_computer import AnalogComputer
 from analogrig_emulator.machine.channel_courses import (
     Course,
     Courses,
@@ -74,6 +74,8 @@ from analogrig_emulator.machine.program_circuit import (
 from analogrig_emulator.machine.program_file import Equations, ProgramParameter
 from analogrig_emulator.machine.program_loader import circuit_of, compile_program, equations_of, load_patch
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK, SuspensionParts, SuspensionProgram
+from analogrig_emulator.machine.readouts import LAMP_DELAY_S
+from analogrig_emulator.machine.relays import REFERENCE_V, Mode
 from analogrig_emulator.machine.repeated_plays import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
 from analogrig_emulator.machine.units import Unit, parse_unit

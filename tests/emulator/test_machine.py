@@ -45,7 +45,7 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.circuit.pot import coefficient_under_load
-from analogrig_emulator.machine.analog_computer import RelaySwitch
+from analogrig_emulator.machine.relays import RelaySwitch
 from tests.emulator.programs import circuit_of
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]

@@ -1,79 +1,62 @@
-"""Operation of the analogue computer: modes, pots and overload lamps.
+"""Operation of the analogue computer: a circuit in its modes, with its pots, switches and overload lamps.
 
-    POT SET            integrators as in INITIAL CONDITION; every amplifier's inputs on ground instead of the junction,
-                       so that pots keep their loads; a pot is read with its top on the reference
-    INITIAL CONDITION  integrators charge to their initial voltages
-    HOLD               integrators' inputs on ground instead of the junction: capacitors keep their voltages
-    OPERATE            the circuit as patched
-
-A mode is the circuit with its relays in another position, solved by nodal analysis like any other. Capacitors and
-op-amps keep their states across modes. Relays switch at any tick, in no time and without
-bounce.
+Modes are those of relays.py, pots and their ramps those of pot_panel.py, coefficients and lamps those of readouts.py.
+Capacitors and op-amps keep their states across modes.
 """
 
 from __future__ import annotations
 
-import contextlib
-import enum
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.circuit.circuit import Circuit, Element, label
-from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
-from analogrig_emulator.circuit.elements import GROUND, Capacitor, OpAmp, Pot, Resistor, Switch, VoltageSource
+from analogrig_emulator.circuit.circuit import Circuit
+from analogrig_emulator.circuit.components import NOMINAL, Components
+from analogrig_emulator.circuit.elements import OpAmp, Switch
 from analogrig_emulator.circuit.nodal import Nodal, analyse
-from analogrig_emulator.circuit.nonlinear import Multiplier
-from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
+from analogrig_emulator.circuit.pot import check_ramp
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, Kink, Law, PiecewiseLinear
-from analogrig_emulator.exceptions import CircuitError, EmulatorError, EngineError, ModeError, PotError
-from analogrig_emulator.machine.patch_panel import Patch, patches
-
-REFERENCE_V = 10.0
-"""Reference voltage at a pot's top while its coefficient is read."""
-
-LAMP_DELAY_S = 10e-6
-"""Time without virtual ground after which an amplifier's lamp lights, in s."""
-
-_AT_ONCE_OHM = 10e3
-_BISECTIONS = 53
-
-_SLOW_PER_SAMPLE = 5e-5
-"""Dial speed per sample below which one piece per sample suffices."""
-
-_MOST_PIECES = 64
-
-_READING_TOLERANCE = 2 * END_FRACTION
-"""Largest error of a coefficient, from the track left at the end stops."""
-
-
-class Mode(enum.Enum):
-    """Position of the relays."""
-
-    POT_SET = "POT SET"
-    INITIAL_CONDITION = "INITIAL CONDITION"
-    HOLD = "HOLD"
-    OPERATE = "OPERATE"
-
-
-RelaySwitch = tuple[int, Mode]
-"""(tick, mode): the relays switch at that tick, after its sample and edges."""
-
-_FOLLOWERS: Mapping[Mode, frozenset[Mode]] = MappingProxyType(
-    {
-        Mode.POT_SET: frozenset({Mode.INITIAL_CONDITION}),
-        Mode.INITIAL_CONDITION: frozenset({Mode.POT_SET, Mode.HOLD, Mode.OPERATE}),
-        Mode.HOLD: frozenset({Mode.POT_SET, Mode.INITIAL_CONDITION, Mode.OPERATE}),
-        Mode.OPERATE: frozenset({Mode.INITIAL_CONDITION, Mode.HOLD}),
-    }
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, PiecewiseLinear
+from analogrig_emulator.exceptions import CircuitError, EmulatorError, EngineError, ModeError
+from analogrig_emulator.machine.pot_panel import PotPanel
+from analogrig_emulator.machine.readouts import (
+    LAMP_DELAY_S,
+    PotReading,
+    lamp_delay_ticks,
+    lamp_samples,
+    on_reference,
+    terminal,
 )
+from analogrig_emulator.machine.relays import Mode, Relays, RelaySwitch, check_modes
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """Setting of the machine by hand: it determines the circuit."""
+
+    mode: Mode
+    relays: Relays
+    pots: PotPanel
+    closed: Mapping[str, bool]
+
+    @property
+    def nodal(self) -> Nodal:
+        """Nodal analysis of the mode."""
+        return self.relays.nodal(self.mode)
+
+    def system(self) -> PiecewiseLinear:
+        """State space of the circuit."""
+        return self.nodal.at(self.pots.dials, self.closed)
+
+    def on(self, circuit: Circuit) -> Circuit:
+        """Circuit with the pots and switches set."""
+        circuit = circuit.with_dials(self.pots.dials)
+        return circuit.with_switches(self.closed) if self.closed else circuit
 
 
 class AnalogComputer:
@@ -83,9 +66,7 @@ class AnalogComputer:
     CONDITION charges it. ic_ohm: charging resistors, one from the reference and one across the capacitor, with time
     constant ic_ohm C and empty capacitors at the start; None charges at once.
 
-    An amplifier's overload lamp lights when its output has been unable to follow, at its swing or at its slew rate,
-    for lamp_delay_s without a break: then its junction is off virtual ground, by more than slew / (2 pi GBW) (0.7 V
-    for a TL07x). Amplifiers without such limits have a lamp that stays dark.
+    lamp_delay_s: time without virtual ground after which an amplifier's overload lamp lights.
 
     components: those fitted to the circuit; they determine resting places and noise of wipers.
 
@@ -108,23 +89,16 @@ class AnalogComputer:
             raise CircuitError(f"ic_ohm must be positive and finite, got {ic_ohm!r}")
         if not 0 < sample_rate_hz < math.inf:
             raise EngineError(f"sample_rate_hz must be positive and finite, got {sample_rate_hz!r}")
-        if not 0 <= lamp_delay_s < math.inf:
-            raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
+        self._lamp_delay_ticks = lamp_delay_ticks(lamp_delay_s, sample_rate_hz)
         # First: it rejects a circuit that is too large at once.
-        self._nodals = {Mode.OPERATE: analyse(circuit)}
+        operate = analyse(circuit)
         self._patched = circuit
         self.read_nodes(readings)
-        self._patches = patches(circuit)
-        self._initial_v = dict(initial_v or {})
-        self._ic_ohm = ic_ohm
+        relays = Relays(circuit, operate, initial_v or {}, ic_ohm)
+        closed = {switch.name: switch.closed for switch in circuit.of(Switch)}
+        self._setting = _Setting(Mode.INITIAL_CONDITION, relays, PotPanel.of(circuit, components), closed)
+        self._charges_at_once = ic_ohm is None
         self._sample_rate_hz = sample_rate_hz
-        self._ahead_ticks = 0
-        self._lamp_delay_ticks = round(lamp_delay_s * sample_rate_hz * TICKS_PER_SAMPLE)
-        self._wipers = _Wipers(circuit, components)
-        self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
-        self._turns: dict[str, _Ramp] = {}
-        self._closed = {switch.name: switch.closed for switch in circuit.of(Switch)}
-        self._check_integrators(self._initial_v)
         self.restart()
 
     # ---- state
@@ -132,31 +106,28 @@ class AnalogComputer:
     @property
     def mode(self) -> Mode:
         """Present mode."""
-        return self._mode
+        return self._setting.mode
 
     @property
     def circuit(self) -> Circuit:
         """Circuit as patched, with the present pots and switches."""
-        return self._with_settings(self._patched)
+        return self._setting.on(self._patched)
 
     @property
     def wiring(self) -> Circuit:
         """Circuit with the present relays, pots and switches, for to_spice for instance."""
-        return self._with_settings(self._circuit_in(self._mode))
-
-    def _with_settings(self, circuit: Circuit) -> Circuit:
-        circuit = circuit.with_dials(self._dials)
-        return circuit.with_switches(self._closed) if self._closed else circuit
+        return self._setting.on(self._setting.relays.circuit(self.mode))
 
     @property
     def dials(self) -> dict[str, float]:
         """Dials of the pots, 0..1."""
-        return {pot: self._dials[pot] for pot in self._wipers.pots}
+        pots = self._setting.pots
+        return {pot: pots.dials[pot] for pot in pots.wipers.pots}
 
     @property
     def is_turning(self) -> bool:
         """True while a pot turns."""
-        return bool(self._turns)
+        return bool(self._setting.pots.ramps)
 
     @property
     def recorded(self) -> int:
@@ -204,38 +175,20 @@ class AnalogComputer:
         """
         goals = self.resting(dials)
         check_ramp(ramp_n, dials)
-        with self._all_or_nothing():
-            for pot in goals:
-                self._turns.pop(pot, None)
-            if ramp_n:
-                first = max(self.recorded - 1, 0)
-                self._turns |= {
-                    pot: _Ramp(self._dials[pot], dial, first, first + ramp_n)
-                    for pot, dial in goals.items()
-                    if dial != self._dials[pot]
-                }
-            else:
-                self._dials |= goals
-            self._dials |= self._wipers.contacts_at_rest(goals)
+        pots = self._setting.pots
+        turned = pots.ramped(goals, max(self.recorded - 1, 0), ramp_n) if ramp_n else pots.turned(goals)
+        self._become(replace(self._setting, pots=turned))
 
     def resting(self, dials: Mapping[str, float]) -> dict[str, float]:
         """Dials at which wipers rest when pots are turned to these dials. Raises PotError like turn()."""
-        for pot, dial in dials.items():
-            self._check_pot(pot)
-            check_dial(dial, pot)
-        return {pot: self._wipers.resting(pot, dial) for pot, dial in dials.items()}
-
-    def _check_pot(self, pot: str) -> None:
-        if pot not in self._wipers.pots:
-            raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._wipers.pots)) or 'none'}")
+        return self._setting.pots.wipers.resting(dials)
 
     def operating(self, dials: Mapping[str, float]) -> PiecewiseLinear:
         """State space of OPERATE with pots at these dials, windings left out; the others as they stand.
 
         The machine does not change. Raises PotError and CircuitError.
         """
-        settled = self._dials | dict(dials) | self._wipers.contacts_at_rest(dials)
-        return self._nodals[Mode.OPERATE].at(settled, self._closed)
+        return self._setting.relays.nodal(Mode.OPERATE).at(self._setting.pots.settled(dials), self._setting.closed)
 
     def throw(self, closed: Mapping[str, bool]) -> None:
         """Throw switches of the circuit, in any mode.
@@ -243,30 +196,30 @@ class AnalogComputer:
         Raises CircuitError for an unknown switch, EngineError like turn(). No switch is thrown then.
         """
         self._patched.with_switches(closed)
-        with self._all_or_nothing():
-            self._closed |= closed
+        self._become(replace(self._setting, closed={**self._setting.closed, **closed}))
 
     def coefficient(self, pot: str) -> float:
         """Coefficient of a pot in POT SET: wiper voltage under load with the top on the reference, per reference.
 
         Raises ModeError in another mode, PotError for an unknown pot.
         """
-        return self._reading(self._pot_on_reference(pot), pot, self._dials[pot])
+        return self._on_reference(pot).coefficient(self._setting.pots.dials[pot])
 
     def set_coefficient(self, pot: str, coefficient: float) -> None:
         """Turn a pot in POT SET until coefficient() reads the value, to the nearest winding.
 
         Raises ModeError, and PotError beyond the track.
         """
-        nodal = self._pot_on_reference(pot)
-        low, high = 0.0, 1.0
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self._reading(nodal, pot, middle) < coefficient else (low, middle)
-        reached = self._reading(nodal, pot, high)
-        if not abs(reached - coefficient) <= _READING_TOLERANCE:
-            raise PotError(f"pot {pot}: coefficient {coefficient:.6g} is beyond the track, which ends at {reached:.6g}")
-        self.turn({pot: high})
+        self.turn({pot: self._on_reference(pot).dial_of(coefficient)})
+
+    def _on_reference(self, pot: str) -> PotReading:
+        setting = self._setting
+        if setting.mode is not Mode.POT_SET:
+            raise ModeError(f"coefficients are read and set in POT SET, and this is {setting.mode.value}")
+        setting.pots.wipers.check(pot)
+        top, wiper = terminal(self._patched, pot, "top"), terminal(self._patched, pot, "wiper")
+        nodal = Nodal(on_reference(setting.relays.circuit(Mode.POT_SET), pot, top))
+        return PotReading(pot, nodal, wiper, setting.pots.dials, setting.closed, self._levels_v)
 
     # ---- operation
 
@@ -292,9 +245,8 @@ class AnalogComputer:
 
         Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks, drives: as for Engine.
         """
-        self._mode, self._ahead_ticks, self._drives = mode, ahead_ticks, dict(drives)
-        self._dials |= self._wipers.contacts_at_rest(self._turns)
-        self._turns = {}
+        self._ahead_ticks, self._drives = ahead_ticks, dict(drives)
+        self._setting = replace(self._setting, mode=mode, pots=self._setting.pots.stopped())
         self._levels_v = {source.name: 0.0 for source in self._patched.inputs}
         self._powered: Engine | None = None
         self._solved: PiecewiseLinear | None = None
@@ -304,14 +256,8 @@ class AnalogComputer:
 
         Raises CircuitError and, like turn(), EngineError. No voltage is set then.
         """
-        wanted = self._initial_v | dict(initial_v)
-        if wanted.keys() != self._initial_v.keys():
-            strangers = ", ".join(sorted(wanted.keys() - self._initial_v.keys()))
-            raise CircuitError(f"{strangers}: no such integrator; there are {', '.join(self._initial_v) or 'none'}")
-        self._check_integrators(wanted)
-        with self._all_or_nothing(charged=self._powered):
-            self._initial_v = wanted
-            self._nodals = {mode: nodal for mode, nodal in self._nodals.items() if mode in (Mode.HOLD, Mode.OPERATE)}
+        relays = self._setting.relays.with_initial(initial_v)
+        self._become(replace(self._setting, relays=relays), charged=self._powered)
 
     def follow(self, drives: Mapping[str, Drive]) -> None:
         """Replace drives by those of the coming samples, as Engine.follow does."""
@@ -325,7 +271,7 @@ class AnalogComputer:
         Raises ModeError, and EngineError or CircuitError for a circuit without a solution in that mode. The machine
         stays in its mode then.
         """
-        self._check_switches([mode])
+        check_modes([self.mode, mode])
         self._enter(mode)
 
     def window(self, samples: int) -> tuple[int, int]:
@@ -344,10 +290,10 @@ class AnalogComputer:
         edges = edges or {}
         if not switches:
             return self._play(samples, edges)
-        self._check_switches([mode for _, mode in switches])
-        if self._turns:
+        check_modes([self.mode, *(mode for _, mode in switches)])
+        if self.is_turning:
             raise ModeError(
-                f"relays cannot switch within a run while {', '.join(self._turns)} are being turned: "
+                f"relays cannot switch within a run while {', '.join(self._setting.pots.ramps)} are being turned: "
                 "switch() between two runs"
             )
         self._check_instants(samples, [tick for tick, _ in switches])
@@ -367,13 +313,12 @@ class AnalogComputer:
         No pot may be turning. Equals alternating run() and turn(), at a fraction of the cost. Raises PotError,
         CircuitError for a circuit without a solution before anything is played, and EngineError.
         """
-        dials, changes = dict(self._dials), []
+        pots, changes = self._setting.pots, []
         for sample, goals in jumps:
-            dials |= self.resting(goals)
-            dials |= self._wipers.contacts_at_rest(goals)
-            changes.append((sample, self._nodal.at(dials, self._closed)))
+            pots = pots.turned(self.resting(goals))
+            changes.append((sample, self._setting.nodal.at(pots.dials, self._setting.closed)))
         volts = self._engine.run_changing(samples, changes, edges)
-        self._dials, self._solved = dials, None
+        self._setting, self._solved = replace(self._setting, pots=pots), None
         self._note_levels(edges)
         return volts
 
@@ -418,16 +363,8 @@ class AnalogComputer:
     def _system(self) -> PiecewiseLinear:
         """State space of the present mode and pots."""
         if self._solved is None:
-            self._solved = self._nodal.at(self._dials, self._closed)
+            self._solved = self._setting.system()
         return self._solved
-
-    @property
-    def _nodal(self) -> Nodal:
-        """Nodal analysis of the present mode."""
-        nodal = self._nodals.get(self._mode)
-        if nodal is None:
-            nodal = self._nodals[self._mode] = Nodal(self._circuit_in(self._mode))
-        return nodal
 
     def _play_to(self, tick: int, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
         """Record the samples up to a tick and go there."""
@@ -442,7 +379,7 @@ class AnalogComputer:
         return volts
 
     def _play(self, samples: int, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
-        if not (self._turns and samples):
+        if not (self.is_turning and samples):
             volts = self._engine.run(samples, edges)
         else:
             volts = np.concatenate(list(self._run_ramps(self.recorded + samples, edges)))
@@ -451,30 +388,20 @@ class AnalogComputer:
 
     def _run_ramps(self, stop: int, edges: Mapping[str, Edges]) -> Iterator[NDArray[np.float64]]:
         """Record samples up to stop, in stretches with the same pots turning."""
-        while self._turns and self.recorded < stop:
-            last = min(stop - 1, *(turn.last for turn in self._turns.values()))
-            pieces = max(turn.pieces for turn in self._turns.values())
+        while self.is_turning and self.recorded < stop:
+            pots = self._setting.pots
+            last = min(stop - 1, pots.next_arrival)
             until = last * TICKS_PER_SAMPLE
             yield self._engine.run_turning(
-                last + 1 - self.recorded, self._system_during_ramps, _edges_until(edges, until), pieces
+                last + 1 - self.recorded, self._system_during_ramps, _edges_until(edges, until), pots.pieces
             )
             edges = _edges_after(edges, until)
-            self._dials |= self._dials_at(last)
-            self._turns = {pot: turn for pot, turn in self._turns.items() if turn.last > last}
+            self._setting = replace(self._setting, pots=pots.at(last))
             self._update_system()
         yield self._engine.run(stop - self.recorded, edges)
 
     def _system_during_ramps(self, sample: float) -> PiecewiseLinear:
-        return self._nodal.at(self._dials | self._dials_at(sample), self._closed)
-
-    def _dials_at(self, sample: float) -> dict[str, float]:
-        """Dials of the turning pots and of their contacts."""
-        dials: dict[str, float] = {}
-        for pot, turn in self._turns.items():
-            dials[pot] = self._wipers.resting(pot, turn.at(sample))
-            moves = turn.first < sample < turn.last
-            dials |= self._wipers.contacts_moving(pot, dials[pot]) if moves else self._wipers.contacts_at_rest([pot])
-        return dials
+        return self._setting.nodal.at(self._setting.pots.during(sample), self._setting.closed)
 
     def _note_levels(self, edges: Mapping[str, Edges]) -> None:
         self._levels_v |= {name: float(train.levels_v[-1]) for name, train in edges.items() if train.ticks.size}
@@ -491,28 +418,19 @@ class AnalogComputer:
 
     # ---- relays
 
-    def _check_switches(self, modes: Sequence[Mode]) -> None:
-        for before, after in itertools.pairwise([self._mode, *modes]):
-            if after is not before and after not in _FOLLOWERS[before]:
-                ways = ", ".join(sorted(mode.value for mode in _FOLLOWERS[before]))
-                raise ModeError(f"{before.value} cannot be followed by {after.value}, only by {ways}")
-
     def _enter(self, mode: Mode) -> None:
-        if mode is not self._mode:
-            with self._all_or_nothing(charged=self._engine):
-                self._mode = mode
+        if mode is not self.mode:
+            self._become(replace(self._setting, mode=mode), charged=self._engine)
 
-    @contextlib.contextmanager
-    def _all_or_nothing(self, charged: Engine | None = None) -> Iterator[None]:
-        """Apply the changes made in the body to the engine, or undo them if they raise EmulatorError."""
-        before = self._position
+    def _become(self, setting: _Setting, charged: Engine | None = None) -> None:
+        """Take another setting. EmulatorError leaves the machine as it was."""
+        before, self._setting = self._setting, setting
         try:
-            yield
             self._update_system()
             if charged is not None:
                 self._charge_at_once(charged)
         except EmulatorError:
-            self._position = before
+            self._setting = before
             self._update_system()
             raise
 
@@ -521,186 +439,11 @@ class AnalogComputer:
         if self._powered is not None:
             self._powered.set_system(self._system)
 
-    @property
-    def _position(self) -> _Position:
-        mode, nodals = self._mode, dict(self._nodals)
-        return _Position(mode, nodals, self._initial_v, dict(self._dials), dict(self._turns), dict(self._closed))
-
-    @_position.setter
-    def _position(self, position: _Position) -> None:
-        self._mode, self._nodals, self._initial_v, self._dials, self._turns, self._closed = position
-
     def _charge_at_once(self, engine: Engine) -> None:
-        if self._ic_ohm is None and self._mode in (Mode.INITIAL_CONDITION, Mode.POT_SET):
+        if self._charges_at_once and self.mode.charges:
             levels = self._levels_at(max(engine.now_tick, 0))
             levels_v = [levels[name] for name in self._system.inputs]
             engine.state = self._system.rest(np.array(levels_v)).state
-
-    def _circuit_in(self, mode: Mode) -> Circuit:
-        """Circuit with the relays in the position of a mode."""
-        if mode is Mode.OPERATE:
-            return self._patched
-        lifted = self._patches if mode is Mode.POT_SET else self._initial_v
-        elements = list(self._patched.elements)
-        for amplifier in lifted:
-            elements = [_lift_inputs(element, self._patches[amplifier]) for element in elements]
-        if mode is Mode.POT_SET:  # every input is at ground, and 0 / 0 has no value: dividers stand idle as multipliers
-            elements = [replace(each, law=Law.PRODUCT) if isinstance(each, Multiplier) else each for each in elements]
-        if mode is not Mode.HOLD:
-            elements += [part for name in self._initial_v for part in self._charging_circuit(self._patches[name])]
-        return Circuit(elements)
-
-    def _charging_circuit(self, patch: Patch) -> list[Element]:
-        """Charging circuit of one integrator: an inverter of gain 1 with the capacitor across it."""
-        name, node, ohm = f"IC_{patch.amplifier}", f"ic_{patch.amplifier}", self._ic_ohm or _AT_ONCE_OHM
-        return [
-            VoltageSource(name, node, dc_v=-self._initial_v[patch.amplifier]),
-            Resistor(f"{name}_in", node, patch.junction, ohm),
-            Resistor(f"{name}_fb", patch.junction, patch.out, ohm),
-        ]
-
-    def _check_integrators(self, initial_v: Mapping[str, float]) -> None:
-        for name, volts in initial_v.items():
-            patch = self._patches.get(name)
-            if patch is None:
-                raise CircuitError(f"no amplifier is called {name!r}; there are {', '.join(self._patches) or 'none'}")
-            if not patch.capacitors:
-                amp = next(amp for amp in self._patched.of(OpAmp) if amp.name == name)
-                raise CircuitError(
-                    f"{label(amp)}: an integrator without a capacitor between nodes {patch.junction} and {patch.out}"
-                )
-            if not math.isfinite(volts):
-                raise CircuitError(f"integrator {name}: initial voltage {volts!r} is not finite")
-            if abs(volts) > REFERENCE_V:
-                raise CircuitError(
-                    f"integrator {name}: initial voltage {volts:g} V is beyond the reference of {REFERENCE_V:g} V"
-                )
-        self._check_uncharged(initial_v)
-
-    def _check_uncharged(self, initial_v: Mapping[str, float]) -> None:
-        """Raise CircuitError for an integrator without initial voltage: it would drift into its limit."""
-        for amp in self._patched.of(OpAmp):
-            patch = self._patches[amp.name]
-            if not patch.capacitors or amp.name in initial_v:
-                continue
-            parts = (part for part in self._patched.elements if not isinstance(part, Capacitor | OpAmp))
-            if not any({patch.junction, patch.out} <= set(part.nodes) for part in parts):
-                raise CircuitError(f"{label(amp)}: an integrator needs an initial voltage, if only {amp.name}: 0.0")
-
-    # ---- reading pots
-
-    def _pot_on_reference(self, pot: str) -> Nodal:
-        if self._mode is not Mode.POT_SET:
-            raise ModeError(f"coefficients are read and set in POT SET, and this is {self._mode.value}")
-        self._check_pot(pot)
-        pot_top = self._terminal(pot, "top")
-        elements = [
-            _move_ends(element, pot_top, "reference") if element.name == pot or is_part_of(element, pot) else element
-            for element in self._circuit_in(Mode.POT_SET).elements
-        ]
-        return Nodal(Circuit([*elements, VoltageSource("reference", "reference", dc_v=REFERENCE_V)]))
-
-    def _terminal(self, pot: str, end: str) -> str:
-        """Node at which an end of a pot is patched: where the parts added by fit() meet other elements."""
-        own = [element for element in self._patched.elements if element.name == pot or is_part_of(element, pot)]
-        parts = [bond for element in own if element.name != pot for bond in element.bonds]
-        patched = {
-            GROUND,
-            *(node for element in self._patched.elements if element not in own for node in element.nodes),
-        }
-        reached: list[str] = [next(getattr(element, end) for element in own if element.name == pot)]
-        for node in reached:
-            fresh = {other for bond in parts if node in bond for other in bond}
-            reached += sorted(fresh.difference(reached, {GROUND}))
-        return next(node for node in reached if node in patched)
-
-    def _reading(self, nodal: Nodal, pot: str, dial: float) -> float:
-        system = nodal.at(self._dials | {pot: dial}, self._closed)
-        levels_v = np.array([self._levels_v[name] for name in system.inputs])
-        return system.rest(levels_v).volts[self._terminal(pot, "wiper")] / REFERENCE_V
-
-
-def lamp_samples(
-    amplifiers: Iterable[str], kinks: Iterable[Kink], overdue_ticks: NDArray[np.int64]
-) -> dict[str, int | None]:
-    """Value of AnalogComputer.lamps, from the overdue ticks of each kink."""
-    lamps: dict[str, int | None] = dict.fromkeys(amplifiers)
-    for kink, tick in zip(kinks, overdue_ticks.tolist(), strict=True):
-        if tick >= 0 and kink.element in lamps:
-            sample, before = -(-tick // TICKS_PER_SAMPLE), lamps[kink.element]
-            lamps[kink.element] = sample if before is None else min(sample, before)
-    return lamps
-
-
-@dataclass(frozen=True)
-class _Ramp:
-    """Even motion of a pot from one dial at sample `first` to another at sample `last`."""
-
-    start: float
-    goal: float
-    first: int
-    last: int
-
-    def at(self, sample: float) -> float:
-        """Dial at a sample, which may be a fraction."""
-        if sample >= self.last:
-            return self.goal
-        return self.start + (self.goal - self.start) * max(sample - self.first, 0.0) / (self.last - self.first)
-
-    @property
-    def pieces(self) -> int:
-        """Number of pieces with constant dials per sample; the error goes with speed / pieces^2."""
-        speed_per_sample = abs(self.goal - self.start) / (self.last - self.first)
-        return min(max(math.ceil(math.sqrt(speed_per_sample / _SLOW_PER_SAMPLE)), 1), _MOST_PIECES)
-
-
-class _Position(NamedTuple):
-    """State that determines the circuit of the machine."""
-
-    mode: Mode
-    nodals: dict[Mode, Nodal]
-    initial_v: dict[str, float]
-    dials: dict[str, float]
-    turns: dict[str, _Ramp]
-    closed: dict[str, bool]
-
-
-class _Wipers:
-    """Wipers of a circuit's pots: resting places, and noise of the contacts."""
-
-    def __init__(self, circuit: Circuit, components: Components) -> None:
-        pots = {pot.name: pot for pot in circuit.of(Pot)}
-        contacts = {contact_of(name): name for name in pots if contact_of(name) in pots}
-        self.pots = {name: components.pots.model(pot.track_ohm) for name, pot in pots.items() if name not in contacts}
-        self._contacts = {name: components.contact(pots[name]) for name in contacts.values()}
-
-    def resting(self, pot: str, dial: float) -> float:
-        """Dial of the nearest winding."""
-        return self.pots[pot].resting(dial)
-
-    def contacts_at_rest(self, pots: Iterable[str]) -> dict[str, float]:
-        """Dials of the contacts of resting wipers: no resistance."""
-        return {contact_of(pot): 1.0 for pot in pots if pot in self._contacts}
-
-    def contacts_moving(self, pot: str, dial: float) -> dict[str, float]:
-        """Dial of the contact while the wiper passes a dial."""
-        if pot not in self._contacts:
-            return {}
-        places = self._contacts[pot]
-        return {contact_of(pot): 1.0 - float(places[round(dial * (len(places) - 1))])}
-
-
-def _lift_inputs(element: Element, patch: Patch) -> Element:
-    """Element with its end at the junction moved to ground, if it is an input of the patch."""
-    return _move_ends(element, patch.junction, GROUND) if element.name in patch.inputs else element
-
-
-def _move_ends(element: Element, node: str, to: str) -> Element:
-    """Element with its ends at one node moved to another."""
-    ends: dict[str, Any] = {
-        field.name: to for field in fields(element) if field.name != "name" and getattr(element, field.name) == node
-    }
-    return replace(element, **ends)
 
 
 def _split_at(edges: Mapping[str, Edges], ticks: Sequence[int]) -> Iterator[Mapping[str, Edges]]:

@@ -18,8 +18,8 @@ from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.engine.engine import CircuitSchedule, Engine
-from analogrig_emulator.machine.analog_computer import lamp_samples
 from analogrig_emulator.machine.program_circuit import SOURCE
+from analogrig_emulator.machine.readouts import lamp_samples
 from analogrig_emulator.machine.suspension import SuspensionComputer
 
 

@@ -21,9 +21,10 @@ from analogrig_emulator.circuit.opamp import OpAmpModel, preset
 from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
 from analogrig_emulator.engine.system import Edges, Law, is_integer
 from analogrig_emulator.exceptions import CircuitError, EngineError, PotError
-from analogrig_emulator.machine.analog_computer import AnalogComputer, Mode
+from analogrig_emulator.machine.analog_computer import AnalogComputer
 from analogrig_emulator.machine.program_circuit import SOURCE, ProgramCircuit, Scales
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
+from analogrig_emulator.machine.relays import Mode
 
 PROGRAMS: Mapping[str, ProgramCircuit] = MappingProxyType({program.name: program for program in (FRONT, SHOCK)})
 """Circuits wired by hand, by the name of their program. Others are compiled from files."""
