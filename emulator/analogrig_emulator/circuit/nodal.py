@@ -17,32 +17,27 @@ so a circuit has the same bits on every machine.
 
 from __future__ import annotations
 
-import enum
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import Circuit, element_error
 from analogrig_emulator.circuit.elements import (
     GROUND,
-    Capacitor,
     CurrentSource,
-    DiodeLimiter,
     OpAmp,
     Pot,
     Resistor,
     Switch,
     VoltageSource,
 )
-from analogrig_emulator.circuit.nonlinear import Function, Multiplier, MultiplierModel
-from analogrig_emulator.circuit.opamp import CLAMP_RATE, OpAmpModel
+from analogrig_emulator.circuit.laws import LawParts, Laws, Layout, kink_records, law_records
+from analogrig_emulator.circuit.nonlinear import Multiplier
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
 from analogrig_emulator.engine import binding
-from analogrig_emulator.engine.system import Kink, Matrix, PiecewiseLinear, solve_in_place
+from analogrig_emulator.engine.system import Matrix, PiecewiseLinear, solve_in_place
 from analogrig_emulator.exceptions import CircuitError
 
 
@@ -91,17 +86,17 @@ class Nodal:
     Raises CircuitError for a circuit that exceeds the limits of the engine.
     """
 
-    _laws: _Laws
+    _parts: LawParts
+    _laws: Laws
 
     def __init__(self, circuit: Circuit, untrimmed: Nodal | None = None) -> None:
         if untrimmed is None:
             self._build(circuit)
         else:
             vars(self).update(vars(untrimmed))
-            self._poles = circuit.of(OpAmp)
-            offset = self._laws.offset.copy()
-            offset[self._laws.poles] = [amp.model.vos_v for amp in self._poles]
-            self._laws = self._laws._replace(offset=offset)
+            poles = circuit.of(OpAmp)
+            self._parts = self._parts._replace(poles=poles)
+            self._laws = self._laws.with_offsets([amp.model.vos_v for amp in poles])
         self._circuit = circuit
         self._untrimmed = untrimmed
         self._kept: dict[_Place, PiecewiseLinear] = {}
@@ -111,54 +106,36 @@ class Nodal:
         self._circuit = circuit
         self._pots = circuit.of(Pot)
         self._switches = circuit.of(Switch)
-        self._limiters = circuit.of(DiodeLimiter)
-        self._capacitors = circuit.of(Capacitor)
         self._inputs = circuit.inputs
-        amps = circuit.of(OpAmp)
-        self._poles = tuple(amp for amp in amps if amp.model.has_state)
-        self._multipliers = circuit.of(Multiplier)
-        self._functions = circuit.of(Function)
-        followers = tuple(part for part in self._multipliers if part.model.has_state)
-        branches = [element.name for element in self._capacitors] + [
-            source.name for source in circuit.of(VoltageSource)
-        ]
-        outputs: tuple[OpAmp | Multiplier, ...] = (*amps, *self._multipliers)
+        self._parts = parts = LawParts.of(circuit)
+        self._nodes, amps = circuit.nodes, circuit.of(OpAmp)
+        branches = [part.name for part in (*parts.capacitors, *circuit.of(VoltageSource))]
+        outputs: tuple[OpAmp | Multiplier, ...] = (*amps, *parts.multipliers)
         branches += [part.name for part in outputs if not (part.model.has_state and part.model.rout_ohm > 0)]
-        branches += [function.name for function in self._functions]
-
-        self._nodes = circuit.nodes
-        self._row = {node: i for i, node in enumerate(self._nodes)}
+        branches += [function.name for function in parts.functions]
         self._branch = {name: i for i, name in enumerate(branches, len(self._nodes))}
         self._unknowns = len(self._nodes) + len(branches)
         # Ground has the last row and column, which are left out of the solution.
-        self._row[GROUND] = self._unknowns
-        holders: list[Capacitor | OpAmp | Multiplier] = [*self._capacitors, *self._poles, *followers]
-        self._state = {element.name: i for i, element in enumerate(holders)}
-        self._columns = len(self._state) + len(self._inputs) + len(self._multipliers) + 1
-        limited: tuple[OpAmp | Multiplier, ...] = (*self._poles, *followers)
-        limits = [_limits(part.name, part.model) for part in limited]
-        kinks = [kink for pairs in limits for _, kink in pairs]
-        first_source = len(kinks)
-        kinks += [Kink.deadzone(-math.inf, limiter.threshold_v, limiter.name) for limiter in self._limiters]
-        bends = [function.kinks for function in self._functions]
-        kinks += [kink for bent in bends for kink in bent]
-        self._recovering = tuple([amp for amp in self._poles if amp.model.recovers])
-        kinks += [Kink.deadzone(*amp.model.swing_v, amp.name) for amp in self._recovering]
-        self._sources = slice(first_source, len(kinks))
-        kinks += [Kink.none(part.name) for part in self._multipliers for _ in "xy"]
-        self._kinks = tuple(kinks)
+        self._row = {node: i for i, node in enumerate(self._nodes)} | {GROUND: self._unknowns}
+        self._state = {element.name: i for i, element in enumerate(parts.held)}
+        first_product = len(self._state) + len(self._inputs)
+        self._columns = first_product + len(parts.multipliers) + 1
+        layout = Layout(self._row, self._branch, first_product, self._columns)
+        kinks = kink_records(parts, layout)
+        self._kinks = tuple(each.kink for each in kinks)
+        last_source = len(kinks) - 2 * len(parts.multipliers)
+        self._sources = slice(last_source - parts.sources, last_source)
         self._check_size()
 
         size = self._unknowns + 1
         self._left = np.zeros((size, size))
-        self._right = np.zeros((size, self._columns + self._sources.stop - first_source))
+        self._right = np.zeros((size, self._columns + parts.sources))
         legs = _Stamps(size)
         for part in (*self._switches, *self._pots):
             for a, b in part.bonds:
                 legs.join(self._row[a], self._row[b], 1.0)
         self._leg_places = np.array(legs.places, np.intp)
-        parts = _Parts(self._capacitors, self._poles, self._multipliers, self._limiters, self._functions, limits, bends)
-        self._laws = _Laws.of(self._row, self._branch, parts, len(self._state) + len(self._inputs))
+        self._laws = Laws.of(law_records(parts, layout), kinks, parts)
         self._enter(circuit)
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
@@ -178,7 +155,7 @@ class Nodal:
     @property
     def can_be_trimmed(self) -> bool:
         """True if offsets enter nothing but the drives of their own op-amps."""
-        return len(self._poles) == len(self._circuit.of(OpAmp))
+        return len(self._parts.poles) == len(self._circuit.of(OpAmp))
 
     def _place(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> _Place:
         return (
@@ -200,7 +177,7 @@ class Nodal:
             w_phi=w_phi,
             lmn=voltages[:, : self._columns],
             v_phi=self._spread(voltages),
-            products=tuple(part.product for part in self._multipliers),
+            products=tuple(part.product for part in self._parts.multipliers),
         )
 
     def with_trim(
@@ -223,11 +200,11 @@ class Nodal:
 
     def _trim(self, solution: Matrix) -> Trim:
         laws = self._laws
-        slew_kinks = dict(zip(laws.slewing.tolist(), laws.slews, strict=True))
+        slew_kinks = dict(zip(laws.slewing.others.tolist(), laws.slewing.kinks.tolist(), strict=True))
         return Trim(
-            amps=tuple(amp.name for amp in self._poles),
+            amps=tuple(amp.name for amp in self._parts.poles),
             apart_v=laws.apart(solution)[laws.poles, self._columns - 1],
-            gain_rate=laws.rates[: len(self._poles), 0],
+            gain_rate=laws.rates[: len(self._parts.poles), 0],
             rows=tuple((pole, slew_kinks.get(pole)) for pole in range(laws.poles.start, laws.poles.stop)),
         )
 
@@ -240,11 +217,9 @@ class Nodal:
         size = self._unknowns
         slopes = self._laws.slopes(self._solve(self._set(dials, {}), np.eye(size + 1)))
         columns = {node: slopes[:, row] if node != GROUND else np.zeros(len(slopes)) for node, row in self._row.items()}
-        amps = {amp.name: amp for amp in self._poles}
         own = np.eye(len(self._state))
-        followers = {part.name: part for part in self._multipliers if part.model.has_state}
-        held: dict[str, OpAmp | Multiplier] = {**amps, **followers}
-        poles = {name: own[self._state[name]] * part.model.gain_rate for name, part in held.items()}
+        poles = {part.name: own[self._state[part.name]] * part.model.gain_rate for part in self._parts.limited}
+        amps = {amp.name for amp in self._parts.poles}
         return columns | {name: slopes[:, row] for name, row in self._branch.items() if name not in amps} | poles
 
     # ---- entering the elements
@@ -252,8 +227,8 @@ class Nodal:
     def _check_size(self) -> None:
         sizes = (
             ("states", len(self._state), binding.MAX_STATES),
-            ("multipliers", len(self._multipliers), binding.MAX_PRODUCTS),
-            ("inputs and multipliers", len(self._inputs) + len(self._multipliers), binding.MAX_INPUTS),
+            ("multipliers", len(self._parts.multipliers), binding.MAX_PRODUCTS),
+            ("inputs and multipliers", len(self._inputs) + len(self._parts.multipliers), binding.MAX_INPUTS),
             ("limits, diode limiters, bends and inputs of multipliers", len(self._kinks), binding.MAX_KINKS),
             ("nodes and branches", self._unknowns, binding.MAX_UNKNOWNS),
         )
@@ -266,7 +241,7 @@ class Nodal:
         left, right = _Stamps(self._unknowns + 1), self._right
         for resistor in circuit.of(Resistor):
             left.join(row[resistor.a], row[resistor.b], 1.0 / resistor.ohm)
-        for i, capacitor in enumerate(self._capacitors):
+        for i, capacitor in enumerate(self._parts.capacitors):
             right[self._enter_branch(left, capacitor.name, capacitor.a, capacitor.b), i] = 1.0
         for source in circuit.of(VoltageSource):
             column, volts = self._drive(source)
@@ -277,21 +252,21 @@ class Nodal:
             right[row[drive.minus], column] += amperes
         for amp in circuit.of(OpAmp):
             self._enter_opamp(left, amp)
-        for i, limiter in enumerate(self._limiters, self._columns):
+        for i, limiter in enumerate(self._parts.limiters, self._columns):
             left.join(row[limiter.a], row[limiter.b], 1.0 / limiter.off_ohm)
             right[row[limiter.a], i] -= limiter.excess_siemens
             right[row[limiter.b], i] += limiter.excess_siemens
-        for i, part in enumerate(self._multipliers, states + len(self._inputs)):
+        for i, part in enumerate(self._parts.multipliers, states + len(self._inputs)):
             self._enter_multiplier(left, part, i)
-        bend = self._columns + len(self._limiters)
-        for function in self._functions:
+        bend = self._columns + len(self._parts.limiters)
+        for function in self._parts.functions:
             slope, volts = function.line
             branch = self._enter_branch(left, function.name, function.out, GROUND)
             left.add(branch, row[function.x], -slope)
             right[branch, self._columns - 1] = volts
             right[branch, bend : bend + len(function.kinks)] = 1.0
             bend += len(function.kinks)
-        for amp in self._recovering:
+        for amp in self._parts.recovering:
             right[:, bend] = -right[:, self._state[amp.name]]
             bend += 1
         np.add.at(self._left.reshape(-1), np.array(left.places, np.intp), left.values)
@@ -390,15 +365,14 @@ class Nodal:
         """[A B c], G, [C D e] and P."""
         laws, states = self._laws, len(self._state)
         drives = laws.drives(solution, self._columns - 1)
-        w = drives.take(laws.drive_of_kink, 0)
-        w[laws.of_state] = 0.0
-        w[laws.of_state, laws.state] = 1.0
-        if laws.currents:
-            w[laws.currents] -= solution[laws.loaded]
-        for kink, column in laws.saturations:
-            w[kink, column] -= 1.0
+        w = drives.take(laws.law_of_kink, 0)
+        w[laws.held.kinks] = 0.0
+        w[laws.held.kinks, laws.held.others] = 1.0
+        if laws.loaded.kinks.size:
+            w[laws.loaded.kinks] -= solution[laws.loaded.others]
+            w[laws.lacking.kinks, laws.lacking.others] -= 1.0
         slopes = drives[:states]
-        slopes[laws.slewing] = 0.0
+        slopes[laws.slewing.others] = 0.0
         g = laws.g.copy()
         g[:, self._sources] = slopes[:, self._columns :]
         return slopes[:, : self._columns], g, w[:, : self._columns], self._spread(w)
@@ -458,178 +432,3 @@ class _Stamps:
         size = self._size
         self.places += (i * size + row, j * size + row, row * size + i, row * size + j)
         self.values += (1.0, -1.0, 1.0, -1.0)
-
-
-class _Parts(NamedTuple):
-    """Elements with laws."""
-
-    capacitors: Sequence[Capacitor]
-    poles: Sequence[OpAmp]
-    multipliers: Sequence[Multiplier]
-    limiters: Sequence[DiodeLimiter]
-    functions: Sequence[Function]
-    limits: Sequence[_Limits]
-    """Those of each op-amp and multiplier with a pole."""
-    bends: Sequence[Sequence[Kink]]
-    """Those of each function generator."""
-
-
-def _ends(row: Mapping[str, int], branch: Mapping[str, int], parts: _Parts) -> list[tuple[int, int]]:
-    """Plus and minus of each law, in their order: states, limiters, bends, recoveries, and factors of products."""
-    ground = row[GROUND]
-    ends = [(branch[capacitor.name], ground) for capacitor in parts.capacitors]
-    ends += [(row[amp.plus], row[amp.minus]) for amp in parts.poles]
-    ends += [(ground, ground) for part in parts.multipliers if part.model.has_state]
-    ends += [(row[limiter.a], row[limiter.b]) for limiter in parts.limiters]
-    ends += [(row[part.x], ground) for part, bent in zip(parts.functions, parts.bends, strict=True) for _ in bent]
-    ends += [(ground, ground) for amp in parts.poles if amp.model.recovers]
-    ends += [(row[node], ground) for part in parts.multipliers for node in (part.x, part.y)]
-    return ends
-
-
-class _Laws(NamedTuple):
-    """Laws of capacitors (by current), and of op-amps, multipliers, limiters and bends (by voltages), as arrays.
-
-    A drive is solution[plus] - solution[minus] + offset; that of a capacitor is divided by its farads, that of an
-    op-amp or multiplier is multiplied by its rate and lessened by its leak. The drives of multipliers hold their
-    products besides, in the rows and columns of fed. drive_of_kink: drive of each kink, in the order of the kinks;
-    slews: indices of the kinks of that kind, and slewing: their drives. of_state: kinks whose argument is a state, and
-    state: it. currents: those from which the voltage of the node in loaded is taken. saturations: (kink, column of the
-    solution) at which the output of a recovering op-amp lacks its excess. common: for each op-amp, 1 / (2 CMRR), if
-    there is one. g: G without limiters and bends. poles: rows of the op-amps.
-    """
-
-    plus: NDArray[np.intp]
-    minus: NDArray[np.intp]
-    offset: Matrix
-    farads: Matrix
-    rates: Matrix
-    poles: slice
-    fed: list[tuple[int, int]]
-    leak: Matrix
-    drive_of_kink: NDArray[np.intp]
-    slews: list[int]
-    slewing: NDArray[np.intp]
-    of_state: NDArray[np.intp]
-    state: NDArray[np.intp]
-    currents: list[int]
-    loaded: list[int]
-    saturations: list[tuple[int, int]]
-    common: Matrix | None
-    g: Matrix
-
-    @classmethod
-    def of(cls, row: Mapping[str, int], branch: Mapping[str, int], parts: _Parts, first_product: int) -> _Laws:
-        """Laws of a circuit with numbered nodes (row) and branches."""
-        capacitors, poles, multipliers, *_ = parts
-        fed_products = [i for i, part in enumerate(multipliers) if part.model.has_state]
-        followers = [multipliers[i] for i in fed_products]
-        limited: tuple[OpAmp | Multiplier, ...] = (*poles, *followers)
-        first, states = len(capacitors), len(capacitors) + len(limited)
-        recovering = [(i, amp) for i, amp in enumerate(poles, first) if amp.model.recovers]
-        ends = _ends(row, branch, parts)
-        last_source = len(ends) - 2 * len(multipliers)
-        # The columns of sources follow those of the last product and the constant.
-        last_column = first_product + len(multipliers) + 1 + last_source - states
-        excess = {amp.name: column for column, (_, amp) in enumerate(recovering, last_column - len(recovering))}
-        drive_of_kink: list[int] = []
-        slews, of_state, state, currents, loaded, saturations = [], [], [], [], [], []
-        for i, (part, kinks) in enumerate(zip(limited, parts.limits, strict=True), first):
-            for kink, (limit, _) in enumerate(kinks, len(drive_of_kink)):
-                drive_of_kink.append(i)
-                if limit is _Limit.SLEW:
-                    slews.append(kink)
-                    continue
-                of_state.append(kink)
-                state.append(i)
-                if limit is _Limit.CURRENT:
-                    currents.append(kink)
-                    loaded.append(row[part.out])
-                    if part.name in excess:
-                        saturations.append((kink, excess[part.name]))
-        limits_count = len(drive_of_kink)
-        drive_of_kink += range(states, len(ends))
-        slewing = [drive_of_kink[kink] for kink in slews]
-        g = np.zeros((states, len(drive_of_kink)))
-        g[slewing, slews] = 1.0
-        g[state, of_state] = -CLAMP_RATE
-        of_state += range(limits_count + last_source - states - len(recovering), limits_count + last_source - states)
-        state += [i for i, _ in recovering]
-        offset = [0.0] * first + [amp.model.vos_v for amp in poles] + [part.model.z_offset_v for part in followers]
-        offset += [0.0] * (last_source - states)
-        offset += [volts for part in multipliers for volts in (part.model.x_offset_v, part.model.y_offset_v)]
-        common = [0.5 / amp.model.cmrr for amp in poles]
-        return cls(
-            plus=np.array([plus for plus, _ in ends], np.intp),
-            minus=np.array([minus for _, minus in ends], np.intp),
-            offset=np.array(offset),
-            farads=np.array([capacitor.farad for capacitor in capacitors]).reshape(-1, 1),
-            rates=np.array([part.model.gain_rate for part in limited]).reshape(-1, 1),
-            poles=slice(first, first + len(poles)),
-            fed=[(row, first_product + i) for row, i in enumerate(fed_products, first + len(poles))],
-            leak=np.array([part.model.leak_rate for part in limited]),
-            drive_of_kink=np.array(drive_of_kink, np.intp),
-            slews=slews,
-            slewing=np.array(slewing, np.intp),
-            of_state=np.array(of_state, np.intp),
-            state=np.array(state, np.intp),
-            currents=currents,
-            loaded=loaded,
-            saturations=saturations,
-            common=np.array(common).reshape(-1, 1) if any(common) else None,
-            g=g,
-        )
-
-    def apart(self, solution: Matrix) -> Matrix:
-        """Voltage between the ends of each law, with what an op-amp passes of its common mode."""
-        apart: Matrix = solution.take(self.plus, 0) - solution.take(self.minus, 0)
-        if self.common is not None:
-            apart[self.poles] += (solution[self.plus[self.poles]] + solution[self.minus[self.poles]]) * self.common
-        return apart
-
-    def drives(self, solution: Matrix, constant: int) -> Matrix:
-        """A row for each capacitor (V/s), op-amp and multiplier with a pole (V/s, before any limit), and w (V)."""
-        drives = self.apart(solution)
-        drives[:, constant] += self.offset
-        for row, product in self.fed:
-            drives[row, product] += 1.0
-        slopes = self._scaled(drives)
-        diagonal = slopes.reshape(-1)[:: slopes.shape[1] + 1]
-        diagonal[len(self.farads) :] -= self.leak
-        return drives
-
-    def slopes(self, solution: Matrix) -> Matrix:
-        """Rows of drives() with a state, without offsets and leaks."""
-        return self._scaled(self.apart(solution))
-
-    def _scaled(self, apart: Matrix) -> Matrix:
-        """Rows with a state, scaled in place."""
-        first = len(self.farads)
-        slopes = apart[: first + len(self.rates)]
-        slopes[:first] /= self.farads
-        slopes[first:] *= self.rates
-        return slopes
-
-
-class _Limit(enum.Enum):
-    """Limits of an output."""
-
-    SLEW = enum.auto()
-    SWING = enum.auto()
-    CURRENT = enum.auto()
-
-
-_Limits: TypeAlias = list[tuple[_Limit, Kink]]
-
-
-def _limits(name: str, model: OpAmpModel | MultiplierModel) -> _Limits:
-    """Limits of an output with a pole, in the order of their kinks."""
-    limits = []
-    if model.slews:
-        limits.append((_Limit.SLEW, Kink.clip(model.slew_v_per_s, name)))
-    if model.clamps:
-        limits.append((_Limit.SWING, Kink.deadzone(*model.bounds_v, name)))
-    if isinstance(model, OpAmpModel) and model.limits_current:
-        drop_v = model.rout_ohm * model.current_limit_a
-        limits.append((_Limit.CURRENT, Kink.deadzone(-drop_v, drop_v, name)))
-    return limits

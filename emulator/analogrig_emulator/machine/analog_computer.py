@@ -9,8 +9,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,7 @@ from analogrig_emulator.machine.readouts import (
 from analogrig_emulator.machine.relays import Mode, Relays, RelaySwitch, check_modes
 
 
-@dataclass(frozen=True)
-class _Setting:
+class _Setting(NamedTuple):
     """Setting of the machine by hand: it determines the circuit."""
 
     mode: Mode
@@ -177,7 +176,7 @@ class AnalogComputer:
         check_ramp(ramp_n, dials)
         pots = self._setting.pots
         turned = pots.ramped(goals, max(self.recorded - 1, 0), ramp_n) if ramp_n else pots.turned(goals)
-        self._become(replace(self._setting, pots=turned))
+        self._become(self._setting._replace(pots=turned))
 
     def resting(self, dials: Mapping[str, float]) -> dict[str, float]:
         """Dials at which wipers rest when pots are turned to these dials. Raises PotError like turn()."""
@@ -196,7 +195,7 @@ class AnalogComputer:
         Raises CircuitError for an unknown switch, EngineError like turn(). No switch is thrown then.
         """
         self._patched.with_switches(closed)
-        self._become(replace(self._setting, closed={**self._setting.closed, **closed}))
+        self._become(self._setting._replace(closed={**self._setting.closed, **closed}))
 
     def coefficient(self, pot: str) -> float:
         """Coefficient of a pot in POT SET: wiper voltage under load with the top on the reference, per reference.
@@ -246,7 +245,7 @@ class AnalogComputer:
         Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks, drives: as for Engine.
         """
         self._ahead_ticks, self._drives = ahead_ticks, dict(drives)
-        self._setting = replace(self._setting, mode=mode, pots=self._setting.pots.stopped())
+        self._setting = self._setting._replace(mode=mode, pots=self._setting.pots.stopped())
         self._levels_v = {source.name: 0.0 for source in self._patched.inputs}
         self._powered: Engine | None = None
         self._solved: PiecewiseLinear | None = None
@@ -257,7 +256,7 @@ class AnalogComputer:
         Raises CircuitError and, like turn(), EngineError. No voltage is set then.
         """
         relays = self._setting.relays.with_initial(initial_v)
-        self._become(replace(self._setting, relays=relays), charged=self._powered)
+        self._become(self._setting._replace(relays=relays), charged=self._powered)
 
     def follow(self, drives: Mapping[str, Drive]) -> None:
         """Replace drives by those of the coming samples, as Engine.follow does."""
@@ -318,7 +317,7 @@ class AnalogComputer:
             pots = pots.turned(self.resting(goals))
             changes.append((sample, self._setting.nodal.at(pots.dials, self._setting.closed)))
         volts = self._engine.run_changing(samples, changes, edges)
-        self._setting, self._solved = replace(self._setting, pots=pots), None
+        self._setting, self._solved = self._setting._replace(pots=pots), None
         self._note_levels(edges)
         return volts
 
@@ -396,7 +395,7 @@ class AnalogComputer:
                 last + 1 - self.recorded, self._system_during_ramps, _edges_until(edges, until), pots.pieces
             )
             edges = _edges_after(edges, until)
-            self._setting = replace(self._setting, pots=pots.at(last))
+            self._setting = self._setting._replace(pots=pots.at(last))
             self._update_system()
         yield self._engine.run(stop - self.recorded, edges)
 
@@ -420,7 +419,7 @@ class AnalogComputer:
 
     def _enter(self, mode: Mode) -> None:
         if mode is not self.mode:
-            self._become(replace(self._setting, mode=mode), charged=self._engine)
+            self._become(self._setting._replace(mode=mode), charged=self._engine)
 
     def _become(self, setting: _Setting, charged: Engine | None = None) -> None:
         """Take another setting. EmulatorError leaves the machine as it was."""

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
 
 from analogrig_emulator.circuit.circuit import Circuit
 from analogrig_emulator.circuit.components import Components, contact_of
@@ -76,13 +78,12 @@ class Wipers:
         return {contact_of(pot): 1.0 - float(places[round(dial * (len(places) - 1))])}
 
 
-@dataclass(frozen=True)
-class PotPanel:
+class PotPanel(NamedTuple):
     """Dials of a circuit's pots and contacts, and the ramps under way, by pot."""
 
     wipers: Wipers
     dials: Mapping[str, float]
-    ramps: Mapping[str, Ramp] = field(default_factory=dict)
+    ramps: Mapping[str, Ramp] = MappingProxyType({})
 
     @classmethod
     def of(cls, circuit: Circuit, components: Components) -> PotPanel:
@@ -92,7 +93,7 @@ class PotPanel:
     def turned(self, goals: Mapping[str, float]) -> PotPanel:
         """Panel with pots turned to resting dials at once; their ramps end."""
         ramps = {pot: ramp for pot, ramp in self.ramps.items() if pot not in goals}
-        return replace(self, dials=self.settled(goals), ramps=ramps)
+        return self._replace(dials=self.settled(goals), ramps=ramps)
 
     def ramped(self, goals: Mapping[str, float], first: int, ramp_n: int) -> PotPanel:
         """Panel whose pots turn to resting dials from sample `first` on, for ramp_n samples."""
@@ -102,11 +103,13 @@ class PotPanel:
             if dial != self.dials[pot]
         }
         others = {pot: ramp for pot, ramp in self.ramps.items() if pot not in goals}
-        return replace(self, dials={**self.dials, **self.wipers.contacts_at_rest(goals)}, ramps={**others, **ramps})
+        return self._replace(dials={**self.dials, **self.wipers.contacts_at_rest(goals)}, ramps={**others, **ramps})
 
     def stopped(self) -> PotPanel:
         """Panel with every ramp ended at its present dial."""
-        return replace(self, dials={**self.dials, **self.wipers.contacts_at_rest(self.ramps)}, ramps={})
+        if not self.ramps:
+            return self
+        return self._replace(dials={**self.dials, **self.wipers.contacts_at_rest(self.ramps)}, ramps={})
 
     def settled(self, dials: Mapping[str, float]) -> dict[str, float]:
         """Dials of the panel with some pots at rest at others."""
@@ -134,4 +137,4 @@ class PotPanel:
     def at(self, sample: int) -> PotPanel:
         """Panel as the ramps leave it at a sample; those that have arrived end."""
         ramps = {pot: ramp for pot, ramp in self.ramps.items() if ramp.last > sample}
-        return replace(self, dials=self.during(sample), ramps=ramps)
+        return self._replace(dials=self.during(sample), ramps=ramps)
