@@ -19,7 +19,7 @@ from analogrig.datasheet import Datasheet
 from analogrig.devices.device import Device
 from analogrig.devices.pace import Pace
 from analogrig.errors import DeviceError, LinkError, RigError, TimeLimitReached
-from analogrig.links.wire import Clock
+from analogrig.links.link import Clock
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import Conditions, Run
 from analogrig.scenario import Scenario, check_seed

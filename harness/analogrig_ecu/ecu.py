@@ -22,7 +22,7 @@ from analogrig.devices import (
     SteppedFlag,
     TimeLimitReached,
 )
-from analogrig.devices.exchange import MOST_TIMEOUTS
+from analogrig.devices.device import MOST_TIMEOUTS
 from analogrig.devices.pace import Pace
 from analogrig.devices.rows import AnswerRows
 from analogrig.links.can_bus import CanBus

@@ -15,7 +15,7 @@ import can
 from analogrig import ConfigurationError
 from analogrig.answers import LARGEST_FLOAT32
 from analogrig.config import suggest
-from analogrig.links.causes import Causes
+from analogrig.devices.device import Causes
 from analogrig.links.dbc import check_layout, load_dbc
 from analogrig.links.link import Identifier
 from analogrig.run import Channel

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import can
 
-from analogrig.links.causes import Causes
+from analogrig.devices.device import Causes
 from analogrig.links.link import Identifier, identifier_text
 from analogrig.wording import number_of
 from analogrig_ecu.message_reader import MessageReader

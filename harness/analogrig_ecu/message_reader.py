@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import can
 
-from analogrig.links.causes import Causes
+from analogrig.devices.device import Causes
 from analogrig.links.link import Identifier, identifier_text
 from analogrig.wording import number_of
 from analogrig_ecu.ecu_checksum import FrameChecksum

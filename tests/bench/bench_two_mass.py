@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from analogrig.datasheet import DEFAULT_ARL0
-from analogrig.devices.catalogue_device import DirectDevice
+from analogrig.devices.estimator import DirectDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.bursts import BURST, upper_count

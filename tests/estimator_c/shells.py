@@ -23,7 +23,7 @@ from analogrig.catalogue import (
     unpack,
 )
 from analogrig.devices.library import LIBRARY, MemoryWire
-from analogrig.links import frame
+from analogrig.links.link import FrameDecoder, encode_frame
 from tests.estimator_c.test_device import NONCE, blocks, codes
 
 EXTENDED, REMOTE, FD, ERROR = 1, 2, 4, 8
@@ -98,8 +98,8 @@ def conversation(*, in_blocks: bool, n: int = 140) -> list[Message]:
 def over_serial(*, in_blocks: bool) -> list[bytes]:
     """The packets that the same conversation brings back there."""
     wire = MemoryWire(NONCE)
-    wire.write(b"".join(frame.encode(pack(message)) for message in conversation(in_blocks=in_blocks)))
-    return frame.FrameDecoder().feed(wire.read(0.0))
+    wire.write(b"".join(encode_frame(pack(message)) for message in conversation(in_blocks=in_blocks)))
+    return FrameDecoder().feed(wire.read(0.0))
 
 
 class CanDevice:

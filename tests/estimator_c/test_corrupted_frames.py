@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.links import frame
+from analogrig.links.link import FrameDecoder
 from tests.estimator_c.est_driver import STRICT
 
 ROOT = Path(__file__).parents[2]
@@ -60,7 +60,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("frames", [200_000, pytest.param(2_000_000, marks=pytest.mark.heavy)])
 def test_no_corrupted_frame_is_taken_for_what_nobody_sent(library: Path, frames: int) -> None:
-    line, decoder = CorruptedLine(library, seed=5), frame.FrameDecoder()
+    line, decoder = CorruptedLine(library, seed=5), FrameDecoder()
     taken = wrong = 0
     for _ in range(frames // AT_ONCE):
         outcome, stream, packets = line.run()

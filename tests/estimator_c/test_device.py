@@ -51,8 +51,7 @@ from analogrig.catalogue import (
     pack,
 )
 from analogrig.devices.library import LIBRARY, MemoryWire
-from analogrig.links import frame
-from analogrig.links.link import FramedLink
+from analogrig.links.link import FrameDecoder, FramedLink, encode_frame
 from tests.estimator_c import isolation, misfits
 from tests.estimator_c.est_driver import WARM_UP_N, Estimator
 from tests.estimator_c.performance import FULL
@@ -706,7 +705,7 @@ def test_lost_message_is_a_gap_in_the_sequence(device: Device) -> None:
 
 
 def test_damaged_sample_is_dropped_and_counted(device: Device) -> None:
-    damaged = bytearray(frame.encode(pack(Sample(device.seq % 256, 0, 0, 1, 2))))
+    damaged = bytearray(encode_frame(pack(Sample(device.seq % 256, 0, 0, 1, 2))))
     damaged[6] ^= 0x10
     device.link.wire.write(bytes(damaged))
     assert device.heard() == []
@@ -759,9 +758,9 @@ def test_answers_do_not_depend_on_pieces_and_room() -> None:
         Control(0, Command.STATUS, 0),
     ]
     numbered = [message._replace(seq=i) for i, message in enumerate(messages)]
-    stream = b"".join(frame.encode(pack(message)) for message in numbered)
+    stream = b"".join(encode_frame(pack(message)) for message in numbered)
     rng = random.Random(11)
     whole = answers_in_pieces(stream, rng, 65536)
-    assert len(frame.FrameDecoder().feed(whole)) == 2 + 1 + 60 * 8 + len(Counter)
+    assert len(FrameDecoder().feed(whole)) == 2 + 1 + 60 * 8 + len(Counter)
     for room in (16, 17, 31, 1000):  # 16: SERIAL_DEVICE_ANSWER
         assert answers_in_pieces(stream, rng, room) == whole

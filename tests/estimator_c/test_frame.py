@@ -12,7 +12,7 @@ import pytest
 
 from analogrig.catalogue import CATALOGUE_HASH, LAYOUTS
 from analogrig.devices.library import LIBRARY
-from analogrig.links import frame
+from analogrig.links.link import MAX_ENCODED, FrameDecoder, encode_frame
 
 
 class Decoder(ctypes.Structure):
@@ -23,7 +23,7 @@ class Decoder(ctypes.Structure):
         ("dropped", ctypes.c_uint32),
         ("fill", ctypes.c_uint8),
         ("overlong", ctypes.c_bool),
-        ("bytes", ctypes.c_uint8 * frame.MAX_ENCODED),
+        ("bytes", ctypes.c_uint8 * MAX_ENCODED),
     )
 
 
@@ -78,7 +78,7 @@ def test_both_encode_alike(c: ctypes.CDLL) -> None:
     rng = random.Random(1)
     for packet in random_packets(rng, 3000):
         catalogue_hash = rng.choice((CATALOGUE_HASH, rng.getrandbits(32)))
-        assert encoded(c, packet, catalogue_hash) == frame.encode(packet, catalogue_hash)
+        assert encoded(c, packet, catalogue_hash) == encode_frame(packet, catalogue_hash)
 
 
 def damaged(rng: random.Random, stream: bytes) -> bytes:
@@ -106,8 +106,8 @@ def test_both_take_the_same_frames_from_a_damaged_stream(c: ctypes.CDLL, seed: i
     rng = random.Random(seed)
     for _ in range(20):
         sent = list(random_packets(rng, 40))
-        stream = damaged(rng, b"".join(map(frame.encode, sent)))
-        decoder = frame.FrameDecoder()
+        stream = damaged(rng, b"".join(map(encode_frame, sent)))
+        decoder = FrameDecoder()
         packets = decoder.feed(stream)
         assert decoded(c, stream) == (packets, decoder.dropped)
         assert set(packets) <= set(sent), "a frame was taken that nobody sent"
@@ -115,14 +115,14 @@ def test_both_take_the_same_frames_from_a_damaged_stream(c: ctypes.CDLL, seed: i
 
 def test_both_drop_the_same_from_noise(c: ctypes.CDLL) -> None:
     noise = random.Random(2).randbytes(200_000)
-    decoder = frame.FrameDecoder()
+    decoder = FrameDecoder()
     assert decoded(c, noise) == (decoder.feed(noise), decoder.dropped)
     assert decoder.dropped > 500
 
 
 def test_content_of_the_longest_size_is_taken_and_one_byte_more_is_not(c: ctypes.CDLL) -> None:
     longest = max(LAYOUTS.values(), key=lambda layout: layout.length)
-    good = frame.encode(bytes([longest.id]) + b"\x01" * longest.length)
-    assert len(good) == frame.MAX_ENCODED + 2
+    good = encode_frame(bytes([longest.id]) + b"\x01" * longest.length)
+    assert len(good) == MAX_ENCODED + 2
     assert len(decoded(c, good)[0]) == 1
     assert decoded(c, good[:-1] + b"\x01" + b"\0" + good) == (decoded(c, good)[0], 1)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from analogrig.links.wire import Clock, VirtualClock
+from analogrig.links.link import Clock, VirtualClock
 from tests.harness.processes import LONG_S, children, is_idle
 
 LOOK_S = 0.01

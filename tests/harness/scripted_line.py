@@ -13,7 +13,7 @@ from analogrig.answers import Answers, Samples
 from analogrig.devices.line_device import LineDevice
 from analogrig.devices.lines import FramesDevice, LinesDevice
 from analogrig.errors import DeviceError, LinkError
-from analogrig.links.wire import VirtualClock, Wire
+from analogrig.links.link import VirtualClock, Wire
 
 Firmware = Callable[[bytes], bytes | list[bytes]]
 """Function of the bytes of one write. A list holds what each read of the harness returns; b"" is a time-out."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from analogrig.links.wire import VirtualClock
+from analogrig.links.link import VirtualClock
 from analogrig.plant import Plant
 from analogrig.scenario import PotChange
 from analogrig_instruments import by_hand

@@ -15,7 +15,7 @@ from analogrig.devices.inproc import InprocDevice
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
 from analogrig.links.can_link import CanLink
 from analogrig.links.line import CanLine
-from analogrig.links.wire import VirtualClock
+from analogrig.links.link import VirtualClock
 
 SAMPLE = Sample(7, 0, 513, 1000, 2000)
 ESTIMATE = Estimate(3, 1, 513, 0.5)

@@ -60,10 +60,8 @@ from analogrig.errors import (
     LinkTimeout,
 )
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links import frame
 from analogrig.links.can_link import CanLink
-from analogrig.links.link import CanListener, FramedLink, Link
-from analogrig.links.wire import VirtualClock
+from analogrig.links.link import CanListener, FrameDecoder, FramedLink, Link, VirtualClock, encode_frame
 from analogrig.run import LOST
 from tests.harness.fed import Fed, fed
 from tests.harness.processes import LONG_S, children
@@ -427,8 +425,8 @@ class NotANumber(MemoryWire):
         self._kind, self._sample = kind, sample
 
     def read(self, timeout_s: float) -> bytes:
-        packets = frame.FrameDecoder().feed(super().read(timeout_s))
-        return b"".join(frame.encode(pack(self._computed(unpack_any(packet)))) for packet in packets)
+        packets = FrameDecoder().feed(super().read(timeout_s))
+        return b"".join(encode_frame(pack(self._computed(unpack_any(packet)))) for packet in packets)
 
     def _computed(self, message: Message | None) -> Message:
         assert message is not None

@@ -23,7 +23,7 @@ from analogrig.catalogue import (
     pack,
     unpack,
 )
-from analogrig.links import frame
+from analogrig.links.link import MAX_ENCODED, FrameDecoder, encode_frame
 
 POLYNOMIAL = 0x82F63B78
 """Castagnoli's, reflected."""
@@ -62,7 +62,7 @@ def frame_of(packet: bytes, seed: int) -> bytes:
 
 
 def decoded(stream: bytes, catalogue_hash: int = CATALOGUE_HASH) -> tuple[list[bytes], int]:
-    decoder = frame.FrameDecoder(catalogue_hash)
+    decoder = FrameDecoder(catalogue_hash)
     return decoder.feed(stream), decoder.dropped
 
 
@@ -74,23 +74,23 @@ def test_reference_has_the_published_check_value() -> None:
 def test_frame_is_the_definition(message: Message) -> None:
     packet = pack(message)
     seed = 0 if isinstance(message, Identify | Hello) else CATALOGUE_HASH
-    assert frame.encode(packet) == frame_of(packet, seed)
-    assert decoded(frame.encode(packet)) == ([packet], 0)
+    assert encode_frame(packet) == frame_of(packet, seed)
+    assert decoded(encode_frame(packet)) == ([packet], 0)
     assert unpack(packet) == message
 
 
 def test_stream_may_come_in_pieces_of_any_size() -> None:
     packets = [pack(message) for message in MESSAGES]
-    stream = b"".join(map(frame.encode, packets))
+    stream = b"".join(map(encode_frame, packets))
     for size in range(1, len(stream) + 1):
-        decoder = frame.FrameDecoder()
+        decoder = FrameDecoder()
         received = [packet for i in range(0, len(stream), size) for packet in decoder.feed(stream[i : i + size])]
         assert (received, decoder.dropped) == (packets, 0)
 
 
 def test_every_single_damaged_byte_drops_the_frame() -> None:
     packet = pack(MESSAGES[3])
-    good = frame.encode(packet)
+    good = encode_frame(packet)
     for position in range(1, len(good) - 1):
         for flip in range(1, 256):
             damaged = bytearray(good)
@@ -102,7 +102,7 @@ def test_every_single_damaged_byte_drops_the_frame() -> None:
 
 def test_truncated_frame_costs_nothing_but_itself() -> None:
     packet = pack(MESSAGES[3])
-    good = frame.encode(packet)
+    good = encode_frame(packet)
     for size in range(2, len(good) - 1):
         assert decoded(good[:size] + good) == ([packet], 1)
 
@@ -110,7 +110,7 @@ def test_truncated_frame_costs_nothing_but_itself() -> None:
 def test_frame_after_garbage_is_found() -> None:
     noise = random.Random(5).randbytes(5000)
     packet = pack(MESSAGES[3])
-    packets, dropped = decoded(noise + frame.encode(packet))
+    packets, dropped = decoded(noise + encode_frame(packet))
     assert packets == [packet]
     assert dropped > 0
 
@@ -120,7 +120,7 @@ def test_frame_of_another_catalogue_is_dropped_unless_it_introduces_itself() -> 
     for message in MESSAGES:
         packet = pack(message)
         introduces = isinstance(message, Identify | Hello)
-        assert decoded(frame.encode(packet, other)) == (([packet], 0) if introduces else ([], 1))
+        assert decoded(encode_frame(packet, other)) == (([packet], 0) if introduces else ([], 1))
 
 
 def test_wrong_length_is_dropped_though_the_checksum_is_right() -> None:
@@ -138,11 +138,11 @@ def test_unknown_identifier_is_dropped_though_the_checksum_is_right() -> None:
 
 
 def test_endless_frame_takes_no_memory_and_counts_once() -> None:
-    decoder = frame.FrameDecoder()
+    decoder = FrameDecoder()
     for _ in range(100):
         assert decoder.feed(b"\x55" * 10_000) == []
-        assert len(decoder._begun) <= frame.MAX_ENCODED + 1
+        assert len(decoder._begun) <= MAX_ENCODED + 1
     assert decoder.dropped == 0
     packet = pack(MESSAGES[0])
-    assert decoder.feed(frame.encode(packet)) == [packet]
+    assert decoder.feed(encode_frame(packet)) == [packet]
     assert decoder.dropped == 1

@@ -27,9 +27,7 @@ from analogrig.catalogue import (
 from analogrig.devices.library import MemoryWire
 from analogrig.devices.processes import HOST_PROGRAM
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
-from analogrig.links import frame
-from analogrig.links.link import FramedLink
-from analogrig.links.wire import PortWire
+from analogrig.links.link import FrameDecoder, FramedLink, PortWire, encode_frame
 from tests.harness.processes import LONG_S
 
 
@@ -76,12 +74,12 @@ def link(terminal: Terminal) -> Iterator[FramedLink]:
 def test_messages_go_out_as_frames_in_one_piece(link: FramedLink, terminal: Terminal) -> None:
     messages: list[Message] = [Identify(1), Control(2, 3, 4)]
     link.send(messages)
-    assert os.read(terminal.far, 4096) == b"".join(frame.encode(pack(message)) for message in messages)
+    assert os.read(terminal.far, 4096) == b"".join(encode_frame(pack(message)) for message in messages)
 
 
 def test_messages_come_in_one_by_one(link: FramedLink, terminal: Terminal) -> None:
     messages: list[Message] = [Hello(1, 6, 0, 2), Stepped(2, 0, 7, 1.5), Stepped(3, 0, 8, 2.5)]
-    os.write(terminal.far, b"noise" + b"".join(frame.encode(pack(message)) for message in messages))
+    os.write(terminal.far, b"noise" + b"".join(encode_frame(pack(message)) for message in messages))
     assert [link.receive(LONG_S) for _ in messages] == messages
     assert link.receive(0.0) is None
     assert link.counters == {"frames_dropped": 1}
@@ -89,7 +87,7 @@ def test_messages_come_in_one_by_one(link: FramedLink, terminal: Terminal) -> No
 
 def test_message_that_comes_in_halves_is_waited_for(link: FramedLink, terminal: Terminal) -> None:
     message = Stepped(2, 0, 7, 1.5)
-    whole = frame.encode(pack(message))
+    whole = encode_frame(pack(message))
     os.write(terminal.far, whole[:9])
     assert link.receive(0.0) is None
     os.write(terminal.far, whole[9:])
@@ -103,8 +101,8 @@ def test_message_that_comes_in_halves_is_waited_for(link: FramedLink, terminal: 
         (b"x", "1 byte came without a valid frame: another speed, or another protocol"),
         (b"hello\r\n" * 9, "63 bytes came without a valid frame"),
         (b"\0\0\0", "3 bytes came without a valid frame"),
-        (frame.encode(pack(Hello(1, 6, 0, 2)), 7)[:-3] + b"\0", "bytes came without a valid frame"),
-        (b"noise" + frame.encode(pack(Hello(1, 6, 0, 2))), ""),
+        (encode_frame(pack(Hello(1, 6, 0, 2)), 7)[:-3] + b"\0", "bytes came without a valid frame"),
+        (b"noise" + encode_frame(pack(Hello(1, 6, 0, 2))), ""),
     ],
 )
 def test_silence_is_told_from_bytes_without_a_frame(
@@ -141,7 +139,7 @@ def test_other_end_that_hangs_up_is_told_from_silence(link: FramedLink, terminal
 
 
 def test_line_that_takes_nothing_is_an_error_not_a_hang(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("analogrig.links.wire.WRITE_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("analogrig.links.link.WRITE_TIMEOUT_S", 0.05)
     link = at_port(terminal.path)
     with pytest.raises(LinkError, match="the other end does not read"):
         link.send([Identify(0)] * 100_000)
@@ -185,8 +183,8 @@ def test_any_url_of_pyserial_will_do_socket() -> None:
         far, _ = server.accept()
         with far:
             link.send([Identify(1)])
-            assert far.recv(4096) == frame.encode(pack(Identify(1)))
-            far.sendall(frame.encode(pack(Stepped(2, 0, 7, 1.5))))
+            assert far.recv(4096) == encode_frame(pack(Identify(1)))
+            far.sendall(encode_frame(pack(Stepped(2, 0, 7, 1.5))))
             assert link.receive(LONG_S) == Stepped(2, 0, 7, 1.5)
             assert link.receive(0.0) is None
         with pytest.raises(LinkClosed):
@@ -256,9 +254,9 @@ def test_line_that_cannot_be_opened_is_named(path: str) -> None:
 
 def test_program_serves_a_serial_device_that_is_there_and_ends_when_it_is_gone(terminal: Terminal) -> None:
     with subprocess.Popen([HOST_PROGRAM, terminal.path], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        os.write(terminal.far, frame.encode(pack(Identify(0))))
+        os.write(terminal.far, encode_frame(pack(Identify(0))))
         received: list[bytes] = []
-        decoder = frame.FrameDecoder()
+        decoder = FrameDecoder()
         while len(received) < 2:
             received += decoder.feed(os.read(terminal.far, 4096))
         assert received[0][0] == 0x31

@@ -20,14 +20,14 @@ from analogrig.devices.device import Device
 from analogrig.devices.processes import HOST_PROGRAM
 from analogrig.devices.registry import describe, from_table
 from analogrig.errors import LinkTimeout
-from analogrig.links.frame import FrameDecoder, encode
+from analogrig.links.link import FrameDecoder, encode_frame
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from tests.harness.fed import catalogue
 from tests.harness.processes import LONG_S
 
-QUESTION = encode(pack(Identify(1)))
+QUESTION = encode_frame(pack(Identify(1)))
 THESIS_HASH = "54f04f72e4f6d22a"
 """First digits of the theta_hash of the scenario thesis with the seed 7, on any device."""
 

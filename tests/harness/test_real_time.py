@@ -17,8 +17,7 @@ from analogrig.devices.processes import HostDevice
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge
 from analogrig.links.line import SerialLine
-from analogrig.links.link import FramedLink
-from analogrig.links.wire import VirtualClock
+from analogrig.links.link import FramedLink, VirtualClock
 from analogrig.rigs.description import open_rig
 from analogrig.run import UNREPORTED, Run
 from analogrig.scenario import Scenario

@@ -22,8 +22,7 @@ from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
 from analogrig.errors import TimeLimitReached
 from analogrig.judging.verdict import judge
-from analogrig.links import frame
-from analogrig.links.link import FramedLink
+from analogrig.links.link import FrameDecoder, FramedLink
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import BLOCK_SAMPLES
 from analogrig.run import Run
@@ -58,7 +57,7 @@ class SlowWire(MemoryWire):
 
 
 def has_samples(sent: bytes) -> bool:
-    messages = map(unpack_any, frame.FrameDecoder().feed(sent))
+    messages = map(unpack_any, FrameDecoder().feed(sent))
     return any(isinstance(message, Sample | SampleBlock) for message in messages)
 
 

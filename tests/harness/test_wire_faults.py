@@ -11,11 +11,10 @@ import pytest
 from analogrig.catalogue import Sample, pack
 from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, LinkClosed
-from analogrig.links import frame
-from analogrig.links.wire import VirtualClock
+from analogrig.links.link import FrameDecoder, VirtualClock, encode_frame
 from analogrig.links.wire_faults import FaultyWire, WireFault, WireFaults
 
-FRAMES = [frame.encode(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
+FRAMES = [encode_frame(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
 
 
 class Line:
@@ -77,14 +76,14 @@ def test_fault_of_a_frame_touches_no_other(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["reorder", "repeat"])
 def test_late_frame_is_whole(kind: str) -> None:
-    packets = frame.FrameDecoder().feed(sent_through(f"{kind}@to:10"))
+    packets = FrameDecoder().feed(sent_through(f"{kind}@to:10"))
     late = packets[11:].index(pack(Sample(10, 0, 10, 1010, 2000))) + 11
     assert late > 11
     assert len(packets) == (60 if kind == "reorder" else 61)
 
 
 def test_outage_loses_many_frames_and_ends() -> None:
-    lost = {60 - len(frame.FrameDecoder().feed(sent_through(f"outage@to:2,seed={seed}"))) for seed in range(20)}
+    lost = {60 - len(FrameDecoder().feed(sent_through(f"outage@to:2,seed={seed}"))) for seed in range(20)}
     assert len(lost) > 5 and min(lost) < 5 and max(lost) == 58
 
 

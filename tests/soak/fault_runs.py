@@ -35,8 +35,7 @@ from analogrig.judging.verdict import judge
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_link import CanLink
 from analogrig.links.faulty_bus import FaultyBus
-from analogrig.links.link import FramedLink, Link
-from analogrig.links.wire import Wire
+from analogrig.links.link import FramedLink, Link, Wire
 from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import Channel, Run

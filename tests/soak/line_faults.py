@@ -26,7 +26,7 @@ from analogrig.catalogue import SteppedFlag
 from analogrig.devices.line_device import LineDevice
 from analogrig.devices.lines import LinesDevice
 from analogrig.errors import DeviceError, LinkError
-from analogrig.links.wire import PortWire, VirtualClock, Wire
+from analogrig.links.link import PortWire, VirtualClock, Wire
 from analogrig.run import LOST
 
 N = 8

@@ -11,10 +11,10 @@ from urllib.parse import quote, urlencode
 
 from analogrig.devices.catalogue_device import CatalogueDescription
 from analogrig.devices.child import Child
+from analogrig.devices.device import CanRates
 from analogrig.devices.library import library_for
 from analogrig.devices.processes import host_child, host_program_for
 from analogrig.errors import ConfigurationError
-from analogrig.links.line import CanLine
 from analogrig.trust import Thing
 
 if TYPE_CHECKING:
@@ -22,30 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["CanPort"]
 """Names for packages beside the core."""
-
-MOST_BITRATE = 20_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class CanRates:
-    """Bit rates of a CAN bus."""
-
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = dict.fromkeys(("bitrate", "data_bitrate"), (1, MOST_BITRATE))
-    bitrate: int | None = None
-    """Bit rate of the bus [bit/s]. If there is no real bus, the run reports the time that this one would take."""
-    data_bitrate: int | None = None
-    """Bit rate of the data phase of CAN FD [bit/s]; None if it is ``bitrate``."""
-    fd: bool = False
-    """True if bus and device support CAN FD, whose frames carry up to 64 bytes."""
-
-    def check_rates(self) -> None:
-        """:raises ValueError: the rates do not go together."""
-        if self.data_bitrate is not None and not (self.fd and self.bitrate is not None):
-            raise ValueError("data_bitrate is for CAN FD: set fd = true and bitrate as well")
-
-    def can_line(self) -> CanLine | None:
-        """Bit rates, if they are stated."""
-        return None if self.bitrate is None else CanLine(self.bitrate, self.data_bitrate)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from analogrig.devices.library import ALWAYS_ROOM, LIBRARY, LibraryDevice
 from analogrig.errors import LinkClosed
 from analogrig.links.can_bus import PythonCanBus
 from analogrig.links.line import CanLine
-from analogrig.links.wire import VirtualClock
+from analogrig.links.link import VirtualClock
 
 MOST_BYTES = 64
 """Data of the longest frame of CAN FD."""

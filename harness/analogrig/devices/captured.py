@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from analogrig.answers import Answers
-from analogrig.links.causes import Causes
+from analogrig.devices.device import Causes
 from analogrig.links.link import Identifier
 
 

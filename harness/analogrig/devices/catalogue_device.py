@@ -1,4 +1,4 @@
-"""Devices that exchange our catalogue's messages: descriptions, the device behind a link, and its estimator alone.
+"""Devices that exchange our catalogue's messages: descriptions, and the device behind a link.
 
 The device sends nothing without a request. Any other message than the expected answer is an error.
 """
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeGuard
 
 import numpy as np
 
-from analogrig.answers import Answers, Samples, raised_alarms
+from analogrig.answers import Answers, Samples
 from analogrig.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
@@ -32,11 +32,10 @@ from analogrig.catalogue import (
     Identify,
     Result,
     Status,
-    Trigger,
 )
 from analogrig.datasheet import Datasheet
 from analogrig.devices.device import Capability, Device, DeviceDescription
-from analogrig.devices.estimator import Estimator, EstimatorOutput
+from analogrig.devices.estimator import DirectDevice
 from analogrig.devices.exchange import Conversation, Exchange, Packing
 from analogrig.devices.library import estimator_library_for
 from analogrig.devices.pace import Pace, check_line
@@ -51,8 +50,7 @@ from analogrig.errors import (
 )
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.line import SerialLine
-from analogrig.links.link import CanListener, FramedLink, Link
-from analogrig.links.wire import Wire
+from analogrig.links.link import CanListener, FramedLink, Link, Wire
 from analogrig.links.wire_faults import FaultyLine, FaultyWire, WireFaults
 from analogrig.run import Channel
 
@@ -105,6 +103,18 @@ class CatalogueDescription(DeviceDescription):
     def known_datasheet(self) -> Datasheet:
         return Datasheet.of_estimator(self.estimator.as_table())
 
+    def suited(self, poles: Sequence[complex]) -> EstimatorConfig:
+        """Settings of the device for a plant with these poles: chosen by them, or those given.
+
+        :raises ConfigurationError: the estimator has no such order.
+        """
+        try:
+            return self.estimator.suited(poles)
+        except ValueError as error:
+            cure = "give the device settings of its own: [estimator]"
+            where = f"device {self.name}: a program of order {len(poles)}"
+            raise ConfigurationError(f"{where}: {error}; {cure}") from error
+
     def open(self) -> Device:
         return CatalogueDevice(self.open_link(), self)
 
@@ -127,7 +137,10 @@ class CatalogueDescription(DeviceDescription):
             from analogrig.links.faulty_bus import FaultyBus
 
             return CanLink(self.bus() if faults is None else FaultyBus(self.bus, faults))
-        return FramedLink(self.wire() if faults is None else FaultyWire(self.wire, faults), self.serial_line())
+        if faults is None:
+            return FramedLink(self.wire(), self.serial_line())
+        faulty = FaultyWire(self.wire, faults)
+        return FramedLink(faulty, self.serial_line(), faulty=faulty)
 
     def wire(self) -> Wire:
         """Wire to the started device; errors as ``open_link``."""
@@ -164,19 +177,6 @@ class CatalogueDescription(DeviceDescription):
     def can_run_in_blocks(self) -> bool:
         """True if ``estimator_library``, given whole blocks, yields what the device answers sample by sample."""
         return False
-
-
-def suited(description: CatalogueDescription, poles: Sequence[complex]) -> EstimatorConfig:
-    """Settings of the device for a plant with these poles: chosen by them, or those given.
-
-    :raises ConfigurationError: the estimator has no such order.
-    """
-    try:
-        return description.estimator.suited(poles)
-    except ValueError as error:
-        cure = "give the device settings of its own: [estimator]"
-        where = f"device {description.name}: a program of order {len(poles)}"
-        raise ConfigurationError(f"{where}: {error}; {cure}") from error
 
 
 def has_our_estimator(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:
@@ -309,7 +309,7 @@ class CatalogueDevice(Device):
 
     def suit(self, poles: Sequence[complex]) -> None:
         """Choose the settings by the poles of the plant, for ``prepare`` to apply; errors as ``configure``."""
-        self._describe(suited(self._description, poles))
+        self._describe(self._description.suited(poles))
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
         """Set the code of zero force; errors as ``configure``."""
@@ -502,96 +502,3 @@ class CatalogueDevice(Device):
 def _word(kind: type[enum.IntEnum], value: int) -> str:
     """Name of a value, or its number if it has no name."""
     return kind(value).name if value in kind.__members__.values() else f"number {value}"
-
-
-class DirectDevice(Device):
-    """Estimator of a device of our catalogue that has the capability ``blocks``, without its line.
-
-    Its answers are those of ``CatalogueDevice`` to the bit. It lacks what other messages carry: the diagnoses,
-    the misfits, the flags RESTARTED and IDLE, and the counters of messages.
-    """
-
-    def __init__(self, description: CatalogueDescription, *, alarms_only: bool = False) -> None:
-        """Load and configure the estimator.
-
-        :param alarms_only: omit the estimates, which take a twentieth of the time: theta has no columns.
-        :raises ConfigurationError: the estimator refuses its configuration.
-        :raises LinkError: the library was not built.
-        """
-        super().__init__(description)
-        self._description: CatalogueDescription = description
-        self._as_opened = description.estimator
-        self._alarms_only = alarms_only
-        self._next_index = 0
-        self._poles: Sequence[complex] | None = None
-        """Order for which the settings were chosen last: to choose them takes as long as to play a thousand samples."""
-        self.configure()
-
-    @property
-    def datasheet(self) -> Datasheet:
-        return self._datasheet
-
-    def description(self) -> Mapping[str, Any]:
-        return self._table
-
-    def recover(self) -> None:
-        self._estimator.restart()
-
-    def configure(self, **settings: Any) -> None:
-        self._poles = None
-        self._apply(self._as_opened.changed(f"device {self.name}", settings))
-
-    def suit(self, poles: Sequence[complex]) -> None:
-        if poles == self._poles:
-            return
-        estimator = suited(self._description, poles)
-        if estimator != self._description.estimator:
-            self._apply(estimator)
-        self._poles = poles
-
-    def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
-        zero = channels["u"].zero
-        if zero != self._description.estimator.force_zero:
-            self._apply(dataclasses.replace(self._description.estimator, force_zero=zero))
-
-    def _apply(self, estimator: EstimatorConfig) -> None:
-        self._description = dataclasses.replace(self._description, estimator=estimator)
-        self._estimator = Estimator(estimator, library=self._description.estimator_library)
-        self._trigger = Trigger[estimator.trigger.replace("-", "_").upper()]
-        # Runs share the table: to write it anew for each takes as long as to play a thousand samples.
-        self._table = self._description.as_table()
-        self._datasheet = dataclasses.replace(Datasheet.recorded(self._table), misfits=False)
-        if self._alarms_only:
-            self._datasheet = dataclasses.replace(self._datasheet, theta_n=0, model=None)
-        self._table["datasheet"] = self._datasheet.as_table()
-
-    def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
-        self._estimator.restart()
-        self._next_index = 0
-
-    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
-        for block in blocks:
-            if skipped_n := block.skipped_after(self._next_index):
-                nothing = np.zeros(skipped_n, np.uint16)
-                self._estimator.run(nothing, nothing, np.zeros(skipped_n, np.bool_), with_theta=False)
-            self._next_index = block.first + len(block)
-            steps = self._estimator.run(block.u, block.y, block.valid, with_theta=not self._alarms_only)
-            yield self._answers(steps, block.first)
-
-    def play_records(self, records: Sequence[Samples]) -> Iterator[tuple[Answers, Mapping[str, int]]]:
-        u, y, valid = (np.stack([getattr(each, name) for each in records]) for name in ("u", "y", "valid"))
-        for steps, counters in self._estimator.run_records(u, y, valid, with_theta=not self._alarms_only):
-            yield self._answers(steps), counters
-
-    def _answers(self, steps: EstimatorOutput, first: int = 0) -> Answers:
-        """Answers to a block from sample ``first`` on."""
-        return Answers(
-            flags=steps.flags,
-            alarms=raised_alarms(first + steps.alarms, steps.statistic[steps.alarms], self._trigger),
-            theta=steps.theta,
-            innovation=steps.innovation,
-            statistic=steps.statistic,
-        )
-
-    def stop(self) -> Mapping[str, int]:
-        return self._estimator.counters

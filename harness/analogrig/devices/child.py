@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeVar
 from analogrig.errors import LinkClosed, LinkError
 
 if TYPE_CHECKING:  # importing pyserial takes longer than all other imports together
-    from analogrig.links.wire import Wire
+    from analogrig.links.link import Wire
 
 PROGRAMS = Path(__file__).parents[1] / "bin"
 """Folder of the programs that the package brings."""

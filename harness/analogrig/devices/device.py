@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
@@ -18,9 +18,10 @@ from analogrig.devices.pace import Pace
 from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.identity import DeviceFile
-from analogrig.links.causes import Causes
+from analogrig.links.line import CanLine, SerialLine
 from analogrig.run import Channel
 from analogrig.trust import Thing
+from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     import can
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from analogrig.links.link import CanListener
     from analogrig.links.wire_faults import FaultyLine
 
-__all__ = ["Stated"]
+__all__ = ["MOST_TIMEOUTS", "Causes", "Stated"]
 """Names for packages beside the core."""
 
 KEEPS_MEMORY = "a state left from before the record"
@@ -38,6 +39,12 @@ KEEPS_MEMORY = "a state left from before the record"
 LONGEST_TIMEOUT_S = 3600.0
 
 MOST_LOST = 2**31
+
+MOST_TIMEOUTS = 10
+"""Time-outs after which a run is given up."""
+
+MOST_BAUD = 100_000_000
+MOST_BITRATE = 20_000_000
 
 Capability = Literal["blocks", "configure", "faults", "identify", "in-process", "pace"]
 """Capability of a device beyond taking samples and raising alarms:
@@ -269,8 +276,105 @@ class Stated:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SerialRate:
+    """Speed of a line of bytes."""
+
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"baud": (1, MOST_BAUD)}
+    baud: int | None = None
+    """Baud rate of the line [bit/s]. If there is no real line, the run reports the time that this one would take."""
+
+    def serial_line(self) -> SerialLine | None:
+        """Speed of the line, if it is stated."""
+        return None if self.baud is None else SerialLine(self.baud)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CanRates:
+    """Bit rates of a CAN bus."""
+
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = dict.fromkeys(("bitrate", "data_bitrate"), (1, MOST_BITRATE))
+    bitrate: int | None = None
+    """Bit rate of the bus [bit/s]. If there is no real bus, the run reports the time that this one would take."""
+    data_bitrate: int | None = None
+    """Bit rate of the data phase of CAN FD [bit/s]; None if it is ``bitrate``."""
+    fd: bool = False
+    """True if bus and device support CAN FD, whose frames carry up to 64 bytes."""
+
+    def check_rates(self) -> None:
+        """:raises ValueError: the rates do not go together."""
+        if self.data_bitrate is not None and not (self.fd and self.bitrate is not None):
+            raise ValueError("data_bitrate is for CAN FD: set fd = true and bitrate as well")
+
+    def can_line(self) -> CanLine | None:
+        """Bit rates, if they are stated."""
+        return None if self.bitrate is None else CanLine(self.bitrate, self.data_bitrate)
+
+
+@dataclass(frozen=True, kw_only=True)
 class AdaptedDescription(Stated, DeviceDescription):
     """Description of a device with a protocol of its own."""
+
+
+_MOST_CAUSES = 200
+"""Causes that are kept; a hostile sender must not fill the memory."""
+
+
+@dataclass
+class _Cause:
+    noun: str
+    loses: bool
+    place: str
+    detail: str
+    n: int = 0
+
+
+class Causes:
+    """Tally of causes in the order of their first occurrence.
+
+    Each text names a cause without the values that vary: those of its first occurrence are its detail.
+    """
+
+    def __init__(self) -> None:
+        self.place: Callable[[], str] = str
+        """Function that returns the place of the current frame: ``frame 12 at 3.500000 s``, ``sample 12``."""
+        self._found: dict[str, _Cause] = {}
+        self._facts: dict[str, tuple[str, bool]] = {}
+
+    def add(
+        self, text: str, *, noun: str = "frame", place: str = "", detail: str = "", loses: bool = False, n: int = 1
+    ) -> None:
+        """Count occurrences of a cause; ``loses`` if frames or samples were lost by it."""
+        if text not in self._found:
+            if len(self._found) >= _MOST_CAUSES:
+                return
+            self._found[text] = _Cause(noun, loses, place or self.place(), detail)
+        self._found[text].n += n
+
+    def state(self, key: str, text: str, *, loses: bool) -> None:
+        """Set the sentence of a finding on the whole traffic, which replaces an earlier one with this key."""
+        self._facts[key] = text, loses
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """Sentences on causes that lost frames or samples; findings on the whole traffic come first."""
+        return self._sentences(loses=True)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on the others."""
+        return self._sentences(loses=False)
+
+    def _sentences(self, *, loses: bool) -> tuple[str, ...]:
+        facts = [text for text, it_loses in self._facts.values() if it_loses == loses]
+        found = [_sentence(text, cause) for text, cause in self._found.items() if cause.loses == loses]
+        return (*facts, *found)
+
+
+def _sentence(text: str, cause: _Cause) -> str:
+    detail = f": {cause.detail}" if cause.detail else ""
+    if cause.n == 1:
+        return f"{text} ({cause.place}{detail})"
+    return f"{text} ({number_of(cause.n, cause.noun)} from {cause.place} on{detail})"
 
 
 class Device(ABC):

@@ -47,6 +47,7 @@ from analogrig.catalogue import (
     index_up_to,
     pack,
 )
+from analogrig.devices.device import MOST_TIMEOUTS
 from analogrig.devices.pace import Pace
 from analogrig.devices.rows import AnswerRows
 from analogrig.errors import DeviceError, LinkClosed, LinkError, LinkTimeout, TimeLimitReached
@@ -54,16 +55,10 @@ from analogrig.links.link import Link
 from analogrig.run import LOST, UNREPORTED
 from analogrig.wording import number_of
 
-__all__ = ["MOST_TIMEOUTS"]
-"""Names for packages beside the core."""
-
 LATEST = 32
 """Messages within this distance behind the expected number are repetitions; others follow a loss."""
 
 Answer = TypeVar("Answer", Hello, Firmware, Controlled, Configured, Status)
-
-MOST_TIMEOUTS = 10
-"""Time-outs after which a run is given up."""
 
 _RUN_MASK = (RUNS - 1) << RUN_SHIFT
 _NO_INDEX = _NO_ELEMENT = -1

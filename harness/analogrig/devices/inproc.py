@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from analogrig.datasheet import Datasheet
-from analogrig.devices.can import CanRates
 from analogrig.devices.catalogue_device import CatalogueDescription
-from analogrig.devices.device import KEEPS_MEMORY
+from analogrig.devices.device import KEEPS_MEMORY, CanRates, SerialRate
 from analogrig.devices.library import MemoryWire, library_for
-from analogrig.devices.port import SerialRate
-from analogrig.links.wire import Wire
+from analogrig.links.link import Wire
 from analogrig.trust import Thing, absolute_path
 
 if TYPE_CHECKING:

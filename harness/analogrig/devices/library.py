@@ -10,7 +10,7 @@ from typing import Literal
 from analogrig.catalogue import CATALOGUE_HASH, FirmwareId
 from analogrig.errors import ConfigurationError, LinkError
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links.wire import VirtualClock
+from analogrig.links.link import VirtualClock
 
 LIBRARY = Path(__file__).parents[1] / "_device.so"
 """The project's own device."""

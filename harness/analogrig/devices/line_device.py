@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from analogrig.answers import Answers, Samples
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import Datasheet
-from analogrig.devices.device import Device
-from analogrig.devices.exchange import MOST_TIMEOUTS
+from analogrig.devices.device import MOST_TIMEOUTS, Device
 from analogrig.devices.pace import Pace
 from analogrig.devices.rows import INDEX, LOST_ON_THE_WAY, NO_ANSWER, AnswerAssembler, ToCodes
 from analogrig.devices.template_description import TemplateDescription

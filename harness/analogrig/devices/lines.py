@@ -17,7 +17,7 @@ from analogrig.devices.port import Port
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.errors import LinkError
 from analogrig.links.framing import Framing
-from analogrig.links.wire import DEFAULT_BAUD, DescriptorWire, Wire
+from analogrig.links.link import DEFAULT_BAUD, DescriptorWire, Wire
 from analogrig.trust import Thing, absolute_path
 
 

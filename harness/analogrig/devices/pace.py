@@ -7,7 +7,7 @@ import math
 from analogrig.catalogue import BLOCK_SAMPLES, Estimate, Sample, SampleBlock, Stepped
 from analogrig.errors import ConfigurationError
 from analogrig.links.line import Line
-from analogrig.links.wire import Clock
+from analogrig.links.link import Clock
 
 __all__ = ["Pace"]
 """Names for packages beside the core."""

@@ -3,36 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Self
 
 from analogrig.config import suggest
 from analogrig.devices.catalogue_device import CatalogueDescription
+from analogrig.devices.device import SerialRate
 from analogrig.errors import ConfigurationError, LinkError
-from analogrig.links.line import SerialLine
-from analogrig.links.wire import DEFAULT_BAUD, PortWire, Wire
+from analogrig.links.link import DEFAULT_BAUD, PortWire, Wire
 from analogrig.trust import Thing, absolute_port
 
 _OF_PYSERIAL = frozenset({"timeout"})
 """Parameters of pyserial's URLs that look like a field of a device."""
-
-
-MOST_BAUD = 100_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class SerialRate:
-    """Speed of a line of bytes."""
-
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"baud": (1, MOST_BAUD)}
-    baud: int | None = None
-    """Baud rate of the line [bit/s]. If there is no real line, the run reports the time that this one would take."""
-
-    def serial_line(self) -> SerialLine | None:
-        """Speed of the line, if it is stated."""
-        return None if self.baud is None else SerialLine(self.baud)
 
 
 @dataclass(frozen=True, kw_only=True)

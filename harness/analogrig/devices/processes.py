@@ -14,10 +14,10 @@ from typing import ClassVar, Self
 
 from analogrig.devices.catalogue_device import CatalogueDescription
 from analogrig.devices.child import PROGRAMS, Child, ChildWire
-from analogrig.devices.port import SerialRate
+from analogrig.devices.device import SerialRate
 from analogrig.errors import LinkError
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links.wire import DescriptorWire, PortWire, Wire
+from analogrig.links.link import DescriptorWire, PortWire, Wire
 from analogrig.trust import Thing, absolute_path
 
 HOST_PROGRAM = PROGRAMS / "analogrig-device"

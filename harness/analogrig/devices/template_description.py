@@ -32,7 +32,7 @@ from analogrig.devices.templates import (
     parse,
 )
 from analogrig.links.framing import FrameLayout, Framer, Framing
-from analogrig.links.wire import Wire
+from analogrig.links.link import Wire
 
 MOST_WINDOW = 4096
 MOST_STARTING_S = 600.0

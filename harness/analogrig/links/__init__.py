@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from analogrig.links.wire import DEFAULT_BAUD, Clock, PortWire
+    from analogrig.links.link import DEFAULT_BAUD, Clock, PortWire
     from analogrig.links.wire_faults import Direction
 else:
     from analogrig.lazy import loader
@@ -13,7 +13,7 @@ else:
     __getattr__ = loader(
         __name__,
         {
-            "analogrig.links.wire": "DEFAULT_BAUD Clock PortWire",
+            "analogrig.links.link": "DEFAULT_BAUD Clock PortWire",
             "analogrig.links.wire_faults": "Direction",
         },
     )

@@ -26,7 +26,7 @@ from can.typechecking import BitTimingDict, BitTimingFdDict
 from analogrig.config import suggest
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.links.line import CanLine
-from analogrig.links.wire import WRITE_TIMEOUT_S, Clock, Connection
+from analogrig.links.link import WRITE_TIMEOUT_S, Clock, Connection
 
 __all__ = ["CanBus", "PythonCanBus"]
 """Names for packages beside the core."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import logging
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
-from analogrig.links.quiet import silence_logger
 
 __all__ = ["check_layout", "load_dbc"]
 """Names for packages beside the core."""
@@ -26,6 +28,20 @@ _SIZES = re.compile(r"\bBO_\s+\d+\s+\w+\s*:\s*(\d+)|\bSG_\s+\w+[\s\w]*:\s*(\d+)\
 """Length of a message, or start and length of a signal."""
 _RANGES = re.compile(r"\bSG_MUL_VAL_\s[^;]*;")
 _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+
+
+@contextlib.contextmanager
+def silence_logger(library: str) -> Iterator[None]:
+    """Suppress the log of a library, whose exception is already reported in one line."""
+    logger = logging.getLogger(library)
+    before = logger.level, logger.disabled
+    logger.setLevel(logging.CRITICAL + 1)  # also silences child loggers
+    logger.disabled = True  # the library may set the level when it is loaded later
+    try:
+        yield
+    finally:
+        logger.disabled = before[1]
+        logger.setLevel(before[0])
 
 
 def load_dbc(path: Path) -> Any:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from analogrig.catalogue import LAYOUTS, Message
-from analogrig.links import frame
 from analogrig.links.frame_bits import CLASSIC_BYTES, frame_bits, longest_classic_bits, longest_fd_bits
+from analogrig.links.link import frame_size
 
 if TYPE_CHECKING:
     import can
@@ -42,7 +42,7 @@ class SerialLine:
 
     def message_s(self, kind: type[Message]) -> float:
         """Longest time of one message of this type [s]."""
-        return self.bytes_s(frame.size(kind))
+        return self.bytes_s(frame_size(kind))
 
     def together_s(self, to_s: float, from_s: float) -> float:
         """Time for traffic of these durations to and from the device [s]."""

@@ -18,9 +18,17 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 from analogrig.catalogue import CATALOGUE_HASH, Hello, pack, unpack
 from analogrig.errors import ConfigurationError, LinkClosed
-from analogrig.links import frame
 from analogrig.links.line import BITS_PER_BYTE
-from analogrig.links.wire import DEFAULT_BAUD, Clock, Connection, VirtualClock, Wire
+from analogrig.links.link import (
+    DEFAULT_BAUD,
+    MAX_ENCODED,
+    Clock,
+    Connection,
+    FrameDecoder,
+    VirtualClock,
+    Wire,
+    encode_frame,
+)
 
 Direction = Literal["to", "from"]
 """Direction to the device or from it."""
@@ -383,7 +391,7 @@ class FaultyWire(FaultyLine[Wire, bytes]):
         """Complete frames."""
         begun = self._begun[direction] + sent
         frames = _FRAME.findall(begun)
-        self._begun[direction] = begun[sum(map(len, frames)) :][-frame.MAX_ENCODED :]
+        self._begun[direction] = begun[sum(map(len, frames)) :][-MAX_ENCODED:]
         return frames
 
     def _write(self, sent: Sequence[bytes]) -> None:
@@ -412,10 +420,10 @@ class FaultyWire(FaultyLine[Wire, bytes]):
         return super()._apply(kind, lane, sent)
 
     def _stranger(self, sent: bytes) -> bytes:
-        packets = frame.FrameDecoder().feed(sent)
+        packets = FrameDecoder().feed(sent)
         message = unpack(packets[0]) if packets else None
         if message is None:
             return sent
         if isinstance(message, Hello):
             message = message._replace(catalogue_hash=STRANGERS_HASH)
-        return frame.encode(pack(message), STRANGERS_HASH)
+        return encode_frame(pack(message), STRANGERS_HASH)

@@ -14,11 +14,11 @@ from analogrig import catalogue
 from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit
 from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
 from analogrig.devices.captured import CapturedRun
+from analogrig.devices.device import Causes
 from analogrig.devices.exchange import misfit_of
 from analogrig.devices.rows import AnswerRows
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
-from analogrig.links.causes import Causes
 from analogrig.links.dbc import check_layout, load_dbc
 from analogrig.links.link import Identifier
 from analogrig.run import LOST, UNREPORTED

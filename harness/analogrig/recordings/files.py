@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.links.dbc import silence_logger
 from analogrig.links.link import Identifier, identifier_text
-from analogrig.links.quiet import silence_logger
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:

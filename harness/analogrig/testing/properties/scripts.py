@@ -28,7 +28,7 @@ from analogrig.catalogue import (
     pack,
 )
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links import frame
+from analogrig.links.link import encode_frame
 
 
 @dataclass(frozen=True)
@@ -321,8 +321,8 @@ def crowd(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
 
 def damage(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """Bytes that are no frame, between frames; every damaged one is counted once, and harms no other."""
-    good = frame.encode(pack(Control(0, Command.REPORT_INTERVAL, 0x01000001)))
-    full = frame.encode(pack(SampleBlock(0, 14, 1, 1, tuple(range(257, 257 + 2 * BLOCK_SAMPLES)))))
+    good = encode_frame(pack(Control(0, Command.REPORT_INTERVAL, 0x01000001)))
+    full = encode_frame(pack(SampleBlock(0, 14, 1, 1, tuple(range(257, 257 + 2 * BLOCK_SAMPLES)))))
     for damaged, dropped in (
         (b"\0\0\0", 0),
         (b"\x05abc\0", 1),
@@ -334,11 +334,11 @@ def damage(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
         *((good[:cut] + b"\0", 1) for cut in range(2, len(good) - 1)),
         *((good[:at] + bytes([good[at] ^ 0x40]) + good[at + 1 :], 1) for at in range(1, len(good) - 1)),
         *((full[:at] + bytes([full[at] ^ 0x81]) + full[at + 1 :], 1) for at in range(2, len(full) - 1, 5)),
-        *((frame.encode(bytes([0x7F]) + bytes(length)), 1) for length in (0, 1, 8)),
-        *((frame.encode(bytes([layout.id]) + bytes(layout.length + more)), 1)
+        *((encode_frame(bytes([0x7F]) + bytes(length)), 1) for length in (0, 1, 8)),
+        *((encode_frame(bytes([layout.id]) + bytes(layout.length + more)), 1)
           for layout in LAYOUTS.values() for more in (-1, 1)),
-        (frame.encode(pack(Control(0, 0, 0)), CATALOGUE_HASH ^ 1), 1),
-        (frame.encode(pack(Configure(0, 5, 1.0)), 0), 1),
+        (encode_frame(pack(Control(0, 0, 0)), CATALOGUE_HASH ^ 1), 1),
+        (encode_frame(pack(Configure(0, 5, 1.0)), 0), 1),
     ):  # fmt: skip
         yield Garbage(damaged, dropped)
         yield Identify(numbers.next())
