@@ -341,7 +341,7 @@ def _load_tests() -> None:
         module = importlib.import_module(name)
         for function in functions:
             setattr(module, function, _kept(getattr(module, function)))
-    estimator = importlib.import_module("analogrig.devices.estimator").Estimator
+    estimator = importlib.import_module("analogrig.devices.library").Estimator
     start = estimator.__init__
 
     @functools.wraps(start)

@@ -15,7 +15,7 @@ import numpy as np
 from analogrig.bench import Bench
 from analogrig.devices.can import CanDevice
 from analogrig.devices.device import DeviceDescription
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.pace import Pace
 from analogrig.devices.processes import FIRMWARE, HostDevice, QemuM4
 from analogrig.rigs.description import open_rig

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from analogrig.datasheet import DEFAULT_ARL0
-from analogrig.devices.estimator import DirectDevice
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import DirectDevice, InprocDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.bursts import BURST, upper_count
 from analogrig.judging.courses import first_at_level

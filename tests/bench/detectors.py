@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from analogrig.devices.device import DeviceDescription
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.python import PythonDescription
 from analogrig.devices.registry import describe
 from analogrig.estimator_config import EstimatorConfig, TriggerName

@@ -11,8 +11,7 @@ import numpy as np
 from analogrig.answers import Answers, Samples
 from analogrig.catalogue import Cause
 from analogrig.devices.device import Device
-from analogrig.devices.estimator import DirectDevice
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import DirectDevice, InprocDevice
 from analogrig.judging.exposure import ObservedRecord, record_exposure
 from analogrig.run import Channel
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import can
 import numpy as np
 
-from analogrig.devices.estimator import Estimator
+from analogrig.devices.library import Estimator
 from analogrig.estimator_config import EstimatorConfig
 from tests.harness.scripted_ecu import NodeOnBus
 

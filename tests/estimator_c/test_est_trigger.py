@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-import analogrig.devices.estimator
+import analogrig.devices.library
 from analogrig.estimator_config import EstimatorConfig
 from tests.estimator_c.est_driver import (
     ANYWHERE,
@@ -444,7 +444,7 @@ def statistics_in_doubt(
     valid = np.ones(n, bool)
     valid[at + np.flatnonzero(np.abs(np.diff(u[at:])) > 100.0)[0] + 1 + lag_n] = False
     twin = statistic_of_the_twin(config, u / 1000.0, y / 1000.0, valid)
-    estimator = analogrig.devices.estimator.Estimator(config).run(u / 1000.0, y / 1000.0, valid)
+    estimator = analogrig.devices.library.Estimator(config).run(u / 1000.0, y / 1000.0, valid)
     return estimator.statistic[valid].astype(np.float64), twin[valid]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.devices.estimator import Estimator, StepStatus
+from analogrig.devices.library import Estimator, StepStatus
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig

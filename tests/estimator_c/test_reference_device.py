@@ -12,7 +12,7 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.catalogue import Cause, SteppedFlag
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.can_link import CanLink
 from analogrig.rigs.description import open_rig

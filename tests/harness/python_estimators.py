@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.devices.estimator import Estimator
+from analogrig.devices.library import Estimator
 from analogrig.estimator_config import EstimatorConfig
 
 SHEET = {"theta_n": 6, "innovation": True, "statistic": True, "warm_up_n": 150}

@@ -11,7 +11,7 @@ import can
 import cantools
 import numpy as np
 
-from analogrig.devices.estimator import Estimator
+from analogrig.devices.library import Estimator
 from analogrig.estimator_config import EstimatorConfig
 
 PARAMETERS = 6

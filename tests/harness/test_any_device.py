@@ -17,7 +17,7 @@ from analogrig.answers import Answers, RaisedAlarm, Samples
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import Datasheet, ModelOrders
 from analogrig.devices.device import AdaptedDescription, Device
-from analogrig.devices.estimator import Estimator
+from analogrig.devices.library import Estimator
 from analogrig.devices.pace import Pace
 from analogrig.errors import DeviceRefused, RecordingError
 from analogrig.judging.advice import advice

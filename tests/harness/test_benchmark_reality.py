@@ -13,7 +13,7 @@ from scipy.linalg import toeplitz
 
 from analogrig.campaigns.together import direct_bench
 from analogrig.catalogue import SteppedFlag
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2, change_information
 from analogrig.rigs.description import open_rig

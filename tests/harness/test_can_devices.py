@@ -19,7 +19,7 @@ from analogrig.catalogue import Counter
 from analogrig.cli import main
 from analogrig.devices.can import CanDevice
 from analogrig.devices.device import Device
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.registry import describe, from_table, open_dut, reopen_dut
 from analogrig.errors import ConfigurationError, DeviceError, LinkError
 from analogrig.judging.verdict import judge

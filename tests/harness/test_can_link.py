@@ -8,10 +8,9 @@ import can
 import pytest
 
 from analogrig.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
-from analogrig.devices.can_nodes import MemoryBus
 from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.exchange import Conversation
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice, MemoryBus
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
 from analogrig.links.can_link import CanLink
 from analogrig.links.line import CanLine

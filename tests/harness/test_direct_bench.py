@@ -18,9 +18,14 @@ from analogrig.answers import Samples
 from analogrig.bench import Bench
 from analogrig.campaigns.repeated import DIRECT_BLOCK_SAMPLES
 from analogrig.campaigns.together import can_be_direct, direct_bench, judge_all, models_of
-from analogrig.devices.estimator import Estimator
-from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.library import FIXED_LIBRARY, LIBRARY, WIDE_LIBRARY, estimator_library_for
+from analogrig.devices.library import (
+    FIXED_LIBRARY,
+    LIBRARY,
+    WIDE_LIBRARY,
+    Estimator,
+    InprocDevice,
+    estimator_library_for,
+)
 from analogrig.devices.registry import describe, open_dut
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging import information

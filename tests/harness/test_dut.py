@@ -40,13 +40,10 @@ from analogrig.catalogue import (
     pack,
     unpack_any,
 )
-from analogrig.devices.can_nodes import MemoryBus
 from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.child import ChildWire
 from analogrig.devices.device import Device, DeviceDescription
-from analogrig.devices.estimator import Estimator
-from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.library import MemoryWire
+from analogrig.devices.library import Estimator, InprocDevice, MemoryBus, MemoryWire
 from analogrig.devices.port import SerialDevice
 from analogrig.devices.processes import HostDevice, host_wire
 from analogrig.devices.registry import describe, from_table, open_dut, reopen_dut

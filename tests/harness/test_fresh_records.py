@@ -17,7 +17,7 @@ from analogrig import Bench, Scenario, open_rig
 from analogrig.answers import Samples
 from analogrig.devices.device import KEEPS_MEMORY, Device, DeviceDescription
 from analogrig.devices.estimator_library import EstimatorLibrary
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.lines import LinesDevice, ProgramDevice
 from analogrig.devices.python import PythonDescription
 from analogrig.devices.registry import describe

@@ -11,7 +11,7 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.campaigns.together import can_be_direct, direct_bench
 from analogrig.cli import main
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.registry import describe, open_dut, reopen_dut
 from analogrig.errors import ConfigurationError, DeviceRefused
 from analogrig.estimator_config import EstimatorConfig

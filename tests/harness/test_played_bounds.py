@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.bench import Bench
 from analogrig.campaigns.together import direct_bench
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.registry import open_dut
 from analogrig.judging import information
 from analogrig.judging.courses import first_at_level

@@ -18,7 +18,7 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.config import names
 from analogrig.devices.device import Device, DeviceDescription
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.processes import HostDevice, QemuDevice, QemuF405, QemuM4
 from analogrig.devices.registry import KINDS, describe, from_table, reopen_dut
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout

@@ -11,8 +11,7 @@ from analogrig.bench import Bench
 from analogrig.catalogue import BLOCK_SAMPLES, Sample
 from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.device import DeviceDescription
-from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.library import MemoryWire
+from analogrig.devices.library import InprocDevice, MemoryWire
 from analogrig.devices.processes import HostDevice
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from analogrig import config
 from analogrig.bench import Bench
 from analogrig.campaigns.together import direct_bench
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.registry import open_dut
 from analogrig.errors import AnalogrigError
 from analogrig.estimator_config import EstimatorConfig

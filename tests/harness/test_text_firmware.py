@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig.bench import Bench
 from analogrig.config import read_toml
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.processes import QemuF405
 from analogrig.devices.registry import from_table
 from analogrig.rigs.description import open_rig

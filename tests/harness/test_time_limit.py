@@ -18,8 +18,7 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.catalogue import Sample, SampleBlock, unpack_any
 from analogrig.devices.catalogue_device import CatalogueDevice
-from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.library import MemoryWire
+from analogrig.devices.library import InprocDevice, MemoryWire
 from analogrig.errors import TimeLimitReached
 from analogrig.judging.verdict import judge
 from analogrig.links.link import FrameDecoder, FramedLink

@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario

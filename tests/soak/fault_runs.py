@@ -25,10 +25,8 @@ from numpy.typing import NDArray
 
 from analogrig.bench import Bench
 from analogrig.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
-from analogrig.devices.can_nodes import MemoryBus
 from analogrig.devices.catalogue_device import CatalogueDevice
-from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.library import MemoryWire
+from analogrig.devices.library import InprocDevice, MemoryBus, MemoryWire
 from analogrig.errors import AnalogrigError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge

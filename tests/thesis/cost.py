@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from analogrig.devices.estimator import Estimator
+from analogrig.devices.library import Estimator
 from analogrig_thesis.chapter5 import NOISY, SEED, TRACKING, circuit_schemes, play_alone
 
 RESULT = Path("harness/analogrig_thesis/cost.json")

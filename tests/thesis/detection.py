@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from analogrig.bench import Bench
 from analogrig.devices.device import DeviceDescription
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.registry import open_dut
 from analogrig.judging.verdict import SegmentEstimate, Verdict, judge
 from analogrig.rigs.description import open_rig

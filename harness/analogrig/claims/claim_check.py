@@ -23,8 +23,7 @@ from analogrig.claims.outputs import explain_outputs
 from analogrig.claims.sample_faults import Suspect, code_hypotheses, input_hypotheses, unit_hypotheses
 from analogrig.claims.wrong_settings import fitted, setting_hypotheses
 from analogrig.devices.catalogue_device import has_our_estimator
-from analogrig.devices.estimator import REPORTED
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import REPORTED, InprocDevice
 from analogrig.devices.registry import recorded
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import EstimatorConfig

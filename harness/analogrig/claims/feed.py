@@ -10,8 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.devices.estimator import Estimator
-from analogrig.devices.library import estimator_library_for
+from analogrig.devices.library import Estimator, estimator_library_for
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.run import Run

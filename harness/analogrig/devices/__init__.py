@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from analogrig.datasheet import Datasheet, ModelOrders
     from analogrig.devices.captured import CaptureDecoding, CapturedRun
     from analogrig.devices.device import AdaptedDescription, Capability, Device, DeviceDescription
-    from analogrig.devices.estimator import Estimator
+    from analogrig.devices.library import Estimator
     from analogrig.devices.processes import HostDevice
     from analogrig.devices.registry import trusted
     from analogrig.errors import DeviceRefused, LinkClosed, TimeLimitReached
@@ -49,7 +49,7 @@ else:
             "analogrig.datasheet": "Datasheet ModelOrders",
             "analogrig.devices.captured": "CaptureDecoding CapturedRun",
             "analogrig.devices.device": "AdaptedDescription Capability Device DeviceDescription",
-            "analogrig.devices.estimator": "Estimator",
+            "analogrig.devices.library": "Estimator",
             "analogrig.devices.processes": "HostDevice",
             "analogrig.devices.registry": "trusted",
             "analogrig.errors": "DeviceRefused LinkClosed TimeLimitReached",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import secrets
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,98 +11,15 @@ from typing import Any
 import can
 
 from analogrig.devices.child import Child
-from analogrig.devices.library import ALWAYS_ROOM, LIBRARY, LibraryDevice
+from analogrig.devices.library import LIBRARY, MemoryBus
 from analogrig.errors import LinkClosed
 from analogrig.links.can_bus import PythonCanBus
-from analogrig.links.line import CanLine
-from analogrig.links.link import VirtualClock
-
-MOST_BYTES = 64
-"""Data of the longest frame of CAN FD."""
 
 BUS_INPUT_BLOCKS = 64
 """Input blocks of a device with a connection of its own. The system buffers more frames than these for it."""
 
-_EXTENDED, _REMOTE, _FD, _ERROR = 1, 2, 4, 8
-"""Flags of estimator_c/device/can_frame.h."""
-
-_OUTPUT_N = 128
 _POLL_S = 0.05
 """Time between two checks of a device's thread for its end."""
-
-
-class _Frame(ctypes.Structure):
-    """can_frame_t of estimator_c/device/can_frame.h."""
-
-    _fields_ = (
-        ("id", ctypes.c_uint32),
-        ("flags", ctypes.c_uint8),
-        ("length", ctypes.c_uint8),
-        ("data", ctypes.c_uint8 * MOST_BYTES),
-    )
-
-
-def _to_c(frame: can.Message) -> _Frame:
-    flags = _EXTENDED * frame.is_extended_id | _REMOTE * frame.is_remote_frame
-    flags |= _FD * frame.is_fd | _ERROR * frame.is_error_frame
-    data = bytes(frame.data[:MOST_BYTES])
-    out = _Frame(frame.arbitration_id, flags, len(data))
-    ctypes.memmove(out.data, data, len(data))
-    return out
-
-
-def _from_c(frame: _Frame) -> can.Message:
-    return can.Message(
-        arbitration_id=frame.id,
-        is_extended_id=False,
-        is_fd=bool(frame.flags & _FD),
-        data=bytes(frame.data)[: frame.length],
-    )
-
-
-class MemoryBus(LibraryDevice):
-    """A bus with a device in this process as its only other node, on a virtual clock."""
-
-    name = "memory"
-    unread_n = None
-    damaged = 0
-
-    def __init__(
-        self,
-        boot_nonce: int,
-        *,
-        is_fd: bool = False,
-        line: CanLine | None = None,
-        input_blocks: int = ALWAYS_ROOM,
-        library: Path = LIBRARY,
-    ) -> None:
-        """Boot a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
-        port = ctypes.c_bool(is_fd)
-        super().__init__("can", port, boot_nonce=boot_nonce, input_blocks=input_blocks, library=library)
-        self.is_fd, self.line = is_fd, line
-        self.clock = VirtualClock()
-        self._output = (_Frame * _OUTPUT_N)()
-        self._answers: deque[can.Message] = deque()
-
-    def send(self, frame: can.Message) -> None:
-        waiting = [_to_c(frame)]
-        while True:
-            array = (_Frame * len(waiting))(*waiting)
-            progress = self.run(self.state, array, len(waiting), self._output, _OUTPUT_N)
-            self._answers.extend(_from_c(self._output[i]) for i in range(progress.given))
-            waiting = waiting[progress.taken :]
-            if not progress.given and not waiting:
-                return
-
-    def receive(self, timeout_s: float) -> can.Message | None:
-        """The next answer. Without any, the clock advances by the whole time-out, since none can follow."""
-        if self._answers:
-            return self._answers.popleft()
-        self.clock.advance(timeout_s)
-        return None
-
-    def close(self) -> None:
-        """Do nothing: nothing is held."""
 
 
 class InhabitedBus(PythonCanBus):

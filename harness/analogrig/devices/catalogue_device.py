@@ -10,7 +10,6 @@ import enum
 import secrets
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeGuard
 
 import numpy as np
@@ -35,9 +34,7 @@ from analogrig.catalogue import (
 )
 from analogrig.datasheet import Datasheet
 from analogrig.devices.device import Capability, Device, DeviceDescription
-from analogrig.devices.estimator import DirectDevice
 from analogrig.devices.exchange import Conversation, Exchange, Packing
-from analogrig.devices.library import estimator_library_for
 from analogrig.devices.pace import Pace, check_line
 from analogrig.errors import (
     CatalogueMismatch,
@@ -96,8 +93,6 @@ class CatalogueDescription(DeviceDescription):
         found: set[Capability] = {"configure", "faults", "identify", "pace"}
         if self.is_in_process:
             found.add("in-process")
-        if self.can_run_in_blocks:
-            found.add("blocks")
         return frozenset(found)
 
     def known_datasheet(self) -> Datasheet:
@@ -117,9 +112,6 @@ class CatalogueDescription(DeviceDescription):
 
     def open(self) -> Device:
         return CatalogueDevice(self.open_link(), self)
-
-    def direct(self, *, alarms_only: bool = False) -> Device:
-        return DirectDevice(self, alarms_only=alarms_only)
 
     @property
     def is_on_can(self) -> bool:
@@ -167,16 +159,6 @@ class CatalogueDescription(DeviceDescription):
         :raises ConfigurationError: the line has no such faults.
         """
         return WireFaults.parse(self.wire_faults, self.fault_kinds()) if self.wire_faults else None
-
-    @property
-    def estimator_library(self) -> Path:
-        """Shared library with the device's estimator, to be run in this process."""
-        return estimator_library_for(self.estimator)
-
-    @property
-    def can_run_in_blocks(self) -> bool:
-        """True if ``estimator_library``, given whole blocks, yields what the device answers sample by sample."""
-        return False
 
 
 def has_our_estimator(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:

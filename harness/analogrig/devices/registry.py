@@ -33,7 +33,7 @@ KINDS = Kinds(
     "analogrig.devices",
     {
         "host": "analogrig.devices.processes:HostDevice",
-        "inproc": "analogrig.devices.inproc:InprocDevice",
+        "inproc": "analogrig.devices.library:InprocDevice",
         "library": "analogrig.devices.estimator_library:EstimatorLibrary",
         "qemu-m3": "analogrig.devices.processes:QemuM3",
         "qemu-m4": "analogrig.devices.processes:QemuM4",

@@ -27,7 +27,7 @@ from analogrig.catalogue import (
     SampleBlock,
 )
 from analogrig.devices.catalogue_device import CatalogueDescription, has_our_estimator
-from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import InprocDevice
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, LinkTimeout
 from analogrig.estimator_config import EstimatorConfig
