@@ -55,7 +55,6 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "estimator_config",
         "storage",
         "entry_points",
-        "kinds",
         "program",
         "plant",
         "lazy",

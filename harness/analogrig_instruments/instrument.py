@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import ConfigurationError, RigError
+from analogrig.config import Kinds
 from analogrig.entry_points import INSTRUMENTS
 from analogrig.errors import RecordIncomplete
-from analogrig.kinds import Kinds
 from analogrig_emulator import Excitation
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from analogrig.config import Kinds
 from analogrig.devices.device import DeviceDescription
 from analogrig.devices.registry import KINDS
-from analogrig.kinds import Kinds
 from analogrig.run import Run
 
 ROOT = Path(__file__).parents[2]

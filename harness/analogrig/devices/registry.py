@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from analogrig import config
 from analogrig.devices.device import Device, DeviceDescription
 from analogrig.errors import ConfigurationError
-from analogrig.kinds import Kinds
 from analogrig.trust import Thing, Trust, file_of, folder_of
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ _WORD = re.compile(r"[\w-]{1,40}")
 _ELF = b"\x7fELF"
 """First bytes of libraries, programs and firmware."""
 
-KINDS = Kinds(
+KINDS = config.Kinds(
     DeviceDescription,
     "analogrig.devices",
     {

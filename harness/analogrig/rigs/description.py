@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from analogrig import config
+from analogrig.config import Kinds
 from analogrig.errors import ConfigurationError
-from analogrig.kinds import Kinds
 from analogrig.rigs.recording import RecordingDescription
 from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.trust import Trust
