@@ -529,10 +529,17 @@ def _try(mutant: Mutant) -> Outcome:
         return Outcome(mutant, "survived", "same bits" if same else "other bits")
 
 
-def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tell: Callable[[Outcome], None]) -> None:
+def try_all(
+    chosen: Sequence[Mutant],
+    jobs: int,
+    noticed: Mapping[str, int],
+    tell: Callable[[Outcome], None],
+    marked: str = "",
+) -> None:
     """Report each outcome as soon as it is known; RuntimeError if the tests fail on the core as it is.
 
     :param noticed: how many mutants each test is known to have noticed.
+    :param marked: which tests run, by their marks.
     """
     global _library  # noqa: PLW0603
     os.chdir(ROOT)
@@ -550,7 +557,7 @@ def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tel
                     tell(dataclasses.replace(outcome, source=sources()[where]))
 
         _load_tests()
-        Session(["-k", LONG, f"--rootdir={ROOT}", *TESTS], noticed, work).run()
+        Session(["-k", LONG, "-m", marked, f"--rootdir={ROOT}", *TESTS], noticed, work).run()
 
 
 def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:
@@ -566,7 +573,7 @@ def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:
 def main() -> int:
     """Prints what survived; the exit status is 1 if something is unexplained."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sample", type=int, help="so many mutants, by chance")
+    parser.add_argument("--sample", type=int, help="so many mutants, by chance, and no heavy test")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="mutants of the files whose name contains this")
     parser.add_argument("--jobs", type=int, default=2)
@@ -587,7 +594,7 @@ def main() -> int:
             print(shown(outcome.mutant.key), flush=True)
 
     if left := [mutant for mutant in chosen if mutant not in outcomes]:
-        try_all(left, arguments.jobs, noticed, tell)
+        try_all(left, arguments.jobs, noticed, tell, "not heavy" if arguments.sample else "")
     print(table(every, list(outcomes.values())))
     survivors = {outcome.mutant.key for outcome in outcomes.values() if outcome.fate == "survived"}
     stale = known.keys() - survivors if len(outcomes) == len(every) else set()

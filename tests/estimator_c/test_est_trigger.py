@@ -64,20 +64,28 @@ def suspension(
     force that toggles between 0 and 2900 N; independent of the emulator."""
     rng = np.random.default_rng(seed)
     starts = dict(plants)
-    plant, state, level, pending = starts[0], np.zeros(2), 0.0, edges.tolist()
+    plant, x, v, level = starts[0], 0.0, 0.0, 0.0
+    toggles = [*edges.tolist(), math.inf]
+    due = toggles[0]
+    passed = 0
     force, displacement = np.zeros(n), np.zeros(n)
+    whole = propagator(plant, 1.0).tolist()
     for k in range(n):
-        plant = starts.get(k, plant)
-        while pending and pending[0] <= k:
-            level = 2900.0 - level
-            pending.pop(0)
-        force[k], displacement[k] = level, state[0]
+        if k in starts:
+            plant = starts[k]
+            whole = propagator(plant, 1.0).tolist()
+        while due <= k:
+            level, passed = 2900.0 - level, passed + 1
+            due = toggles[passed]
+        force[k], displacement[k] = level, x
         at = float(k)
-        while pending and pending[0] < k + 1:
-            state = propagator(plant, pending[0] - at) @ np.append(state, level)
-            at = pending.pop(0)
-            level = 2900.0 - level
-        state = propagator(plant, k + 1 - at) @ np.append(state, level)
+        while due < k + 1:
+            (xx, xv, xf), (vx, vv, vf) = propagator(plant, due - at).tolist()
+            x, v = xx * x + xv * v + xf * level, vx * x + vv * v + vf * level
+            at, level, passed = due, 2900.0 - level, passed + 1
+            due = toggles[passed]
+        (xx, xv, xf), (vx, vv, vf) = whole if at == k else propagator(plant, k + 1 - at).tolist()
+        x, v = xx * x + xv * v + xf * level, vx * x + vv * v + vf * level
     u, y = force / N_PER_CODE, displacement / M_PER_CODE + 410.0
     return (np.round(u + rng.normal(0.0, noise_codes, n)), np.round(y + rng.normal(0.0, noise_codes, n)))
 

@@ -53,9 +53,8 @@ def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchang
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("first", range(0, 1000, 500))
-def test_faults_by_chance_never_lead_to_a_wrong_estimate(first: int) -> None:
-    assert outcomes_by_chance(range(first, first + 500)).total() == 500
+def test_faults_by_chance_never_lead_to_a_wrong_estimate() -> None:
+    assert outcomes_by_chance(range(500)).total() == 500
 
 
 @pytest.mark.parametrize("first", [1 + 8 * 56, 1 + 8 * 224])

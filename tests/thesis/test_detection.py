@@ -1,4 +1,4 @@
-"""Thesis profile over 100 seeds: no missed change, at most two false alarms, latencies near the information bound.
+"""Thesis profile over 50 seeds: no missed change, at most one false alarm, latencies near the information bound.
 
 The seeds are fixed, so the code alone decides these tests. 600 seeds, these among them, gave 4 false alarms in 750,000
 samples after the warm-up (ARL0 = 1e5 promises at most 7.5), no missed change, and no ratio above 1.3.
@@ -13,8 +13,8 @@ from tests.thesis.detection import Detection, detect
 
 pytestmark = pytest.mark.heavy
 
-SEEDS = range(100)
-CLIPPED_SEEDS = range(50)
+SEEDS = range(50)
+CLIPPED_SEEDS = range(30)
 
 
 @pytest.fixture(scope="module", params=["thesis", "thesis-free-running"])
@@ -23,10 +23,10 @@ def on_wide_range(request: pytest.FixtureRequest) -> Detection:
 
 
 @pytest.mark.xdist_group("detection")
-def test_no_change_is_missed_and_at_most_two_alarms_are_false(on_wide_range: Detection) -> None:
+def test_no_change_is_missed_and_at_most_one_alarm_is_false(on_wide_range: Detection) -> None:
     assert on_wide_range.inconclusive == 0
     assert on_wide_range.missed == 0
-    assert on_wide_range.false_alarms <= 2
+    assert on_wide_range.false_alarms <= 1
 
 
 @pytest.mark.xdist_group("detection")
