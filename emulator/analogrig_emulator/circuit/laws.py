@@ -7,8 +7,7 @@ by which one solution becomes the matrices of a state space.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -80,8 +79,7 @@ class Layout(NamedTuple):
     first_source: int
 
 
-@dataclass(frozen=True)
-class LawRecord:
+class LawRecord(NamedTuple):
     """Drive solution[plus] - solution[minus] + offset_v of a state or of a kink.
 
     For a state, farad divides the drive of a capacitor, rate multiplies that of an op-amp or multiplier, and leak
@@ -99,8 +97,7 @@ class LawRecord:
     product: int | None = None
 
 
-@dataclass(frozen=True)
-class KinkRecord:
+class KinkRecord(NamedTuple):
     """Kink and the law that is its argument.
 
     state: state that is the argument instead; slews: True if the value becomes the slope of the law's state; clamps:
@@ -160,17 +157,18 @@ def kink_records(parts: LawParts, layout: Layout) -> list[KinkRecord]:
     return kinks + [KinkRecord(Kink.none(name), law) for law, name in enumerate(factors, first_factor)]
 
 
-def _limits(part: OpAmp | Multiplier, state: int, out: int, excess: int | None) -> Iterator[KinkRecord]:
+def _limits(part: OpAmp | Multiplier, state: int, out: int, excess: int | None) -> list[KinkRecord]:
     """Limits of an output with a pole: its slew rate, swing and current."""
-    model = part.model
+    model, limits = part.model, []
     if model.slews:
-        yield KinkRecord(Kink.clip(model.slew_v_per_s, part.name), state, slews=True)
+        limits.append(KinkRecord(Kink.clip(model.slew_v_per_s, part.name), state, slews=True))
     if model.clamps:
-        yield KinkRecord(Kink.deadzone(*model.bounds_v, part.name), state, state, clamps=True)
+        limits.append(KinkRecord(Kink.deadzone(*model.bounds_v, part.name), state, state, clamps=True))
     if isinstance(model, OpAmpModel) and model.limits_current:
         drop_v = model.rout_ohm * model.current_limit_a
         kink = Kink.deadzone(-drop_v, drop_v, part.name)
-        yield KinkRecord(kink, state, state, clamps=True, loaded=out, excess=excess)
+        limits.append(KinkRecord(kink, state, state, clamps=True, loaded=out, excess=excess))
+    return limits
 
 
 class _Pairs(NamedTuple):
@@ -180,9 +178,7 @@ class _Pairs(NamedTuple):
     others: NDArray[np.intp]
 
     @classmethod
-    def of(cls, others: Iterable[int | None]) -> _Pairs:
-        """Pairs of those that have one."""
-        pairs = [(kink, other) for kink, other in enumerate(others) if other is not None]
+    def of(cls, pairs: Sequence[tuple[int, int]]) -> _Pairs:
         return cls(*np.array(pairs, np.intp).reshape(-1, 2).T)
 
 
@@ -217,11 +213,20 @@ class Laws(NamedTuple):
         first, states = len(parts.capacitors), len(parts.held)
         poles = slice(first, first + len(parts.poles))
         common = [law.common for law in laws[poles]]
-        slewing = _Pairs.of(each.law if each.slews else None for each in kinks)
-        clamped = _Pairs.of(each.state if each.clamps else None for each in kinks)
         g = np.zeros((states, len(kinks)))
-        g[slewing.others, slewing.kinks] = 1.0
-        g[clamped.others, clamped.kinks] = -CLAMP_RATE
+        slewing, held, loaded, lacking = [], [], [], []
+        for kink, each in enumerate(kinks):
+            if each.slews:
+                g[each.law, kink] = 1.0
+                slewing.append((kink, each.law))
+            if each.clamps:
+                g[each.law, kink] = -CLAMP_RATE
+            if each.state is not None:
+                held.append((kink, each.state))
+            if each.loaded is not None:
+                loaded.append((kink, each.loaded))
+            if each.excess is not None:
+                lacking.append((kink, each.excess))
         return cls(
             plus=np.array([law.plus for law in laws], np.intp),
             minus=np.array([law.minus for law in laws], np.intp),
@@ -233,10 +238,10 @@ class Laws(NamedTuple):
             products=[(row, law.product) for row, law in enumerate(laws) if law.product is not None],
             common=np.array(common).reshape(-1, 1) if any(common) else None,
             law_of_kink=np.array([each.law for each in kinks], np.intp),
-            slewing=slewing,
-            held=_Pairs.of(each.state for each in kinks),
-            loaded=_Pairs.of(each.loaded for each in kinks),
-            lacking=_Pairs.of(each.excess for each in kinks),
+            slewing=_Pairs.of(slewing),
+            held=_Pairs.of(held),
+            loaded=_Pairs.of(loaded),
+            lacking=_Pairs.of(lacking),
             g=g,
         )
 
