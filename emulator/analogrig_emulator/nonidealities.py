@@ -9,6 +9,7 @@ Rows of the multiplier have a spring that hardens with the cube of the displacem
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -67,12 +68,11 @@ FRONT_CHANGES: Sequence[PotTurn] = (
 )
 
 
-def _in_proportion(settings: Mapping[str, float]) -> dict[str, float]:
-    return {name: SHOCK.values[name] * value / FRONT.values[name] for name, value in settings.items()}
-
-
 _CHANGES: Mapping[str, Sequence[PotTurn]] = {
-    "shock": tuple(PotTurn(change.sample, _in_proportion(change.values)) for change in FRONT_CHANGES[:-1]),
+    "shock": tuple(
+        PotTurn(k, {name: SHOCK.values[name] * value / FRONT.values[name] for name, value in settings.items()})
+        for k, settings, _ in FRONT_CHANGES[:-1]
+    ),
     "front": FRONT_CHANGES,
 }
 
@@ -147,23 +147,18 @@ class _Setup:
         )
         rng = np.random.default_rng(seed)
         machine.set(**self.operator(machine, program.values, rng))
-        changes = [PotTurn(k, self.operator(machine, values, rng), n) for k, values, n in self._changes(program)]
-        volts = np.concatenate(
-            list(acquired(self._noisy(machine, rng), self.card, Excitation(), SAMPLES, changes, rng=rng))
-        )
+        slow = [PotTurn(200, {"K": 0.8 * program.values["K"]}, _SLOW_CHANGE_N)]
+        wanted = slow if self.turning else _CHANGES[program.name]
+        changes = [PotTurn(k, self.operator(machine, values, rng), n) for k, values, n in wanted]
+        played: Playable = machine
+        if self.noise is not None:
+            played = NoisySuspension(
+                machine, rng, op_amps=self.noise, temperature_c=self.temperature_c, supply=self.supply
+            )
+        volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, changes, rng=rng)))
         sampler = Sampler(self.card, rng)
         seen_lsb = sampler.seen_lsb(volts)
         return (sampler.convert(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
-
-    def _noisy(self, machine: SuspensionComputer, rng: np.random.Generator) -> Playable:
-        if self.noise is None:
-            return machine
-        return NoisySuspension(machine, rng, op_amps=self.noise, temperature_c=self.temperature_c, supply=self.supply)
-
-    def _changes(self, program: ProgramCircuit) -> Sequence[PotTurn]:
-        if self.turning:
-            return [PotTurn(200, {"K": 0.8 * program.values["K"]}, _SLOW_CHANGE_N)]
-        return _CHANGES[program.name]
 
 
 _Make = Callable[[int], _Setup]
@@ -172,7 +167,9 @@ _Make = Callable[[int], _Setup]
 
 def measure_effects(program: str) -> Iterator[Effect]:
     """Yield the rows for a program ("shock" or "front"), about 4 s in all."""
-    for chosen, rows in ((PROGRAMS[program], _rows()), (hardening(program), _multiplier_rows())):
+    linear = (_value_rows, _pot_rows, _op_amp_rows, _dielectric_rows, _card_rows)
+    every = itertools.chain.from_iterable(rows() for rows in linear)
+    for chosen, rows in ((PROGRAMS[program], every), (hardening(program), _multiplier_rows())):
         ideal_lsb = _Setup().displacement_lsb(chosen, 0)
         for name, draws, make in rows:
             figures = [make(seed).figure_lsb(chosen, seed, ideal_lsb) for seed in range(draws)]
@@ -211,14 +208,6 @@ cubic = {{ value = {cubic_per_m2 * values["K"]} }}
             program,
         )
     )
-
-
-def _rows() -> Iterator[tuple[str, int, _Make]]:
-    yield from _value_rows()
-    yield from _pot_rows()
-    yield from _op_amp_rows()
-    yield from _dielectric_rows()
-    yield from _card_rows()
 
 
 def _constant(setup: _Setup) -> _Make:

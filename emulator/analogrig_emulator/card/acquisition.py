@@ -89,7 +89,9 @@ def acquired(
     slow = on_card_clock(card, excitation)
     slow_changes = [PotTurn(k * count, values, ramp_n * count) for k, values, ramp_n in changes]
     if not ahead:
-        return _take_probes(machine.play(slow, samples * count, slow_changes, block_samples * count), card, count)
+        probed = machine.play(slow, samples * count, slow_changes, block_samples * count)
+        rows, channels = _rows(card, count), np.arange(card.channels)
+        return (block.reshape(-1, count, card.channels)[:, rows, channels] for block in probed)
     probed = machine.play(slow, samples * count, slow_changes, block_samples * count, ahead)
     return _take_samples(probed, card, count, ahead / TICKS_PER_SAMPLE, rng)
 
@@ -117,12 +119,6 @@ def _check_rate(machine: Playable, card: Card, count: int) -> None:
 def _rows(card: Card, count: int) -> NDArray[np.int64]:
     """Probe of each channel within a sample: (channels,)."""
     return np.rint(card.per_channel("skew_s") * card.rate_hz * count).astype(np.int64)
-
-
-def _take_probes(probed: Iterator[NDArray[np.float64]], card: Card, count: int) -> Iterator[NDArray[np.float64]]:
-    """Yield the sample voltages of each block of probes."""
-    rows, channels = _rows(card, count), np.arange(card.channels)
-    return (block.reshape(-1, count, card.channels)[:, rows, channels] for block in probed)
 
 
 def _take_samples(

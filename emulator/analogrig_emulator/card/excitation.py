@@ -231,7 +231,9 @@ class Excitation:
         starts = index - phases[:, None]
         if self.shape == "prbs":
             periods = starts
-            levels_v = np.tile(self._bit_levels_v(index), (len(phases), 1))
+            bits = _sequence(self.register_length)
+            of_bits_v = np.where(bits[(index + self.seed) % bits.size], self.high_v, self.low_v)
+            levels_v = np.tile(of_bits_v, (len(phases), 1))
         else:
             periods, levels_v = np.empty((2, len(phases), 2 * index.size))
             periods[:, 0::2], periods[:, 1::2] = starts, starts + self.duty
@@ -242,11 +244,6 @@ class Excitation:
         addresses = [array.ctypes.data for array in (periods, levels_v, ticks, counts)]
         binding.load().engine_edges(*periods.shape, grid, max(start_tick, 0), stop_tick, *addresses)
         return EdgeRows(counts, ticks, levels_v)
-
-    def _bit_levels_v(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Levels of these bits."""
-        bits = _sequence(self.register_length)
-        return np.where(bits[(index + self.seed) % bits.size], self.high_v, self.low_v)
 
     def _require(self, field: str, holds: object, what: str) -> None:
         if not holds:

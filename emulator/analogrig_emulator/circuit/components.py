@@ -421,7 +421,7 @@ class Components:
         return self.resistors, self.capacitors, self.dielectric, self.op_amps, self.pots, self.multipliers
 
     def _parts(self, element: Element) -> Iterator[Element]:
-        draws = self._draws(element.name)
+        draws = np.random.default_rng([self.seed, *element.name.lower().encode()]).uniform(-1.0, 1.0, _DRAWS)
         match element:
             case Resistor():
                 yield replace(element, ohm=element.ohm * self._factor(element.name, self.resistors, draws))
@@ -442,9 +442,6 @@ class Components:
                 yield element
             case _:
                 raise unknown_kind_error(element)
-
-    def _draws(self, name: str) -> NDArray[np.float64]:
-        return np.random.default_rng([self.seed, *name.lower().encode()]).uniform(-1.0, 1.0, _DRAWS)
 
     @property
     def _warming_k(self) -> float:

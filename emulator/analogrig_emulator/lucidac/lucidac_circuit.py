@@ -371,15 +371,13 @@ class _Calibration:
         out = {k: dict(trims) for k, trims in self.wiring.trims.multipliers.items()}
         for element in self.specimen.values():
             if isinstance(element, Multiplier):
-                left = {name: _rest(getattr(element.model, name), size) for name, size in errors.items()}
-                out.setdefault(int(element.name[1:]), {}).update(left)
+                trims = out.setdefault(int(element.name[1:]), {})
+                for name, size in errors.items():
+                    error = getattr(element.model, name)
+                    trims[name] = error - size * round(error / size)
         return out
 
     def _value(self, name: str) -> float:
         """Real ohms or farads of an element."""
         element = self.specimen[name]
         return element.ohm if isinstance(element, Resistor) else cast(Capacitor, element).farad
-
-
-def _rest(error: float, step: float) -> float:
-    return error - step * round(error / step)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.nodal import piecewise_linear
 from analogrig_emulator.engine.engine import Engine
-from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges, PiecewiseLinear
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Drive, Edges
 from analogrig_emulator.exceptions import CircuitError
 from analogrig_emulator.lucidac.configuration import ADC_CHANNELS, Configuration, SignalGenerator
 from analogrig_emulator.lucidac.lucidac_circuit import UNIT_V, LucidacCircuit, LucidacParts, Trims, calibrated
@@ -163,7 +163,8 @@ class _Run:
 
     def blocks(self, nodes: list[str]) -> Iterator[NDArray[np.float64]]:
         engine = Engine(self._operating, nodes, self._rate_hz, drives=self._ports.drives)
-        engine.state = self._charging.rest(self._levels_v(self._charging)).state
+        levels_v = np.array([self._ports.level_v(name) for name in self._charging.inputs])
+        engine.state = self._charging.rest(levels_v).state
         first = True
         while self._left:
             samples = min(self._left, max(1, _BLOCK_POINTS // self._points))
@@ -175,9 +176,6 @@ class _Run:
             yield engine.run(count, self._ports.edges(*engine.window(count)))
             self._left -= samples
             first = False
-
-    def _levels_v(self, system: PiecewiseLinear) -> NDArray[np.float64]:
-        return np.array([self._ports.level_v(name) for name in system.inputs])
 
 
 class _Ports:

@@ -298,10 +298,11 @@ class AnalogComputer:
         self._check_instants(samples, [tick for tick, _ in switches])
         volts = []
         stop = self.recorded + samples
-        for (tick, mode), taken in zip(switches, _split_at(edges, [tick for tick, _ in switches]), strict=False):
-            volts.append(self._play_to(tick, taken))
+        for tick, mode in switches:
+            volts.append(self._play_to(tick, _edges_until(edges, tick)))
+            edges = _edges_after(edges, tick)
             self._enter(mode)
-        volts.append(self._play(stop - self.recorded, _edges_after(edges, switches[-1][0])))
+        volts.append(self._play(stop - self.recorded, edges))
         return np.concatenate(volts)
 
     def run_jumping(
@@ -387,20 +388,19 @@ class AnalogComputer:
 
     def _run_ramps(self, stop: int, edges: Mapping[str, Edges]) -> Iterator[NDArray[np.float64]]:
         """Record samples up to stop, in stretches with the same pots turning."""
+
+        def during(sample: float) -> PiecewiseLinear:
+            return self._setting.nodal.at(self._setting.pots.during(sample), self._setting.closed)
+
         while self.is_turning and self.recorded < stop:
             pots = self._setting.pots
             last = min(stop - 1, pots.next_arrival)
             until = last * TICKS_PER_SAMPLE
-            yield self._engine.run_turning(
-                last + 1 - self.recorded, self._system_during_ramps, _edges_until(edges, until), pots.pieces
-            )
+            yield self._engine.run_turning(last + 1 - self.recorded, during, _edges_until(edges, until), pots.pieces)
             edges = _edges_after(edges, until)
             self._setting = self._setting._replace(pots=pots.at(last))
             self._update_system()
         yield self._engine.run(stop - self.recorded, edges)
-
-    def _system_during_ramps(self, sample: float) -> PiecewiseLinear:
-        return self._setting.nodal.at(self._setting.pots.during(sample), self._setting.closed)
 
     def _note_levels(self, edges: Mapping[str, Edges]) -> None:
         self._levels_v |= {name: float(train.levels_v[-1]) for name, train in edges.items() if train.ticks.size}
@@ -443,13 +443,6 @@ class AnalogComputer:
             levels = self._levels_at(max(engine.now_tick, 0))
             levels_v = [levels[name] for name in self._system.inputs]
             engine.state = self._system.rest(np.array(levels_v)).state
-
-
-def _split_at(edges: Mapping[str, Edges], ticks: Sequence[int]) -> Iterator[Mapping[str, Edges]]:
-    """Edges up to the first tick, from there up to the second, and so on."""
-    for tick in ticks:
-        yield _edges_until(edges, tick)
-        edges = _edges_after(edges, tick)
 
 
 def _edges_until(edges: Mapping[str, Edges], tick: int) -> dict[str, Edges]:

@@ -191,8 +191,12 @@ class Courses:
             return [last]
         start, step_n = shown.dials_between(before), -(-ramp_n // _MOST_STEPS)
         places = [(first, min(first + step_n, ramp_n)) for first in range(0, ramp_n, step_n)]
-        turns = [(first * self.probes, _between(start, goal, (first + end) / (2 * ramp_n))) for first, end in places]
-        return [*((probe, machine.machine.operating(dials)) for probe, dials in turns), last]
+        turns = []
+        for first, end in places:
+            part = (first + end) / (2 * ramp_n)
+            between = {pot: start[pot] + part * (dial - start[pot]) for pot, dial in goal.items()}
+            turns.append((first * self.probes, machine.machine.operating(between)))
+        return [*turns, last]
 
     def _tick(self, sample: int) -> int:
         return sample * self.probes * TICKS_PER_SAMPLE
@@ -238,11 +242,6 @@ class RepeatedCourses:
         engine = Engine(system, self._nodes, self._wired.machine.sample_rate_hz)
         plays = engine.play_all(schedule, constants, {SOURCE: edges}, states_v)
         return self._sign * plays.volts[:, 1:, 0], plays.states_v
-
-
-def _between(start: Mapping[str, float], goal: Mapping[str, float], part: float) -> dict[str, float]:
-    """Dials at a fraction of the way."""
-    return {pot: start[pot] + part * (dial - start[pot]) for pot, dial in goal.items()}
 
 
 @dataclass(frozen=True)

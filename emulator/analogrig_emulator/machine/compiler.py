@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from typing import assert_never
@@ -267,7 +267,10 @@ class _Patcher:
         self._ideal: dict[str, Mapping[str, Element | None]] = {}
         self._amplifiers: dict[str, int] = {}
         self._inverters: dict[str, int] = {}
-        self._uses = self._users(rows)
+        self._uses = Counter(
+            name for stage in rows for cord in stage.cords for name in stages.parameters_of(cord.factors)
+        )
+        """Number of cords by parameter."""
         self._pots: list[str] = []
         self._pot_numbers = itertools.count(1)
 
@@ -277,7 +280,8 @@ class _Patcher:
         self._number(rows, inverters)
         for place, name in enumerate(self._inputs):
             self._elements.append(VoltageSource(SOURCE if not place else f"{SOURCE}{place + 1}", self._nodes[name, 1]))
-        for sign in sorted({sign for stage in rows for sign in self._reference_signs(stage)}, reverse=True):
+        references = [(stage, cord) for stage in rows for cord in stage.cords if cord.source == REFERENCE]
+        for sign in sorted({self._source_sign(*each) for each in references}, reverse=True):
             name = "REFP" if sign > 0 else "REFM"
             self._nodes[REFERENCE, sign] = name.lower()
             self._elements.append(VoltageSource(name, name.lower(), dc_v=sign * MACHINE_V))
@@ -314,12 +318,6 @@ class _Patcher:
             self._inverters[name] = number
             self._nodes[name, -self._signs[name]] = f"u{number}"
 
-    def _users(self, rows: Sequence[PatchStage]) -> Counter[str]:
-        """Number of cords by parameter."""
-        return Counter(
-            name for stage in rows for cord in stage.cords for name in self._stages.parameters_of(cord.factors)
-        )
-
     def _pot_name(self, cord: Cord) -> str:
         """Name of the parameter, if it turns this pot alone; else P1, P2, ..."""
         names = self._stages.parameters_of(cord.factors)
@@ -330,11 +328,6 @@ class _Patcher:
             name = f"P{next(self._pot_numbers)}"
         self._pots.append(name)
         return name
-
-    def _reference_signs(self, stage: PatchStage) -> Iterator[int]:
-        for cord in stage.cords:
-            if cord.source == REFERENCE:
-                yield self._source_sign(stage, cord)
 
     def _source_sign(self, stage: PatchStage, cord: Cord) -> int:
         """Sign at which a cord takes its source."""

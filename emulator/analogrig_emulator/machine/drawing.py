@@ -12,7 +12,7 @@ from typing import NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
 from analogrig_emulator.machine.layout import BLOCK_WIDTH, ROW, Box, Point, WirePath, lay_out
-from analogrig_emulator.machine.patched_program import PatchedCord, PatchedElement, PatchedProgram
+from analogrig_emulator.machine.patched_program import PatchedElement, PatchedProgram
 from analogrig_emulator.machine.sheet import Inverter, input_text, inverters, signed
 from analogrig_emulator.machine.stages import StageKind
 
@@ -88,13 +88,16 @@ def _element(element: PatchedElement) -> _Drawn:
         kind.title + (f", {element.farad * 1e9:g} nF" if element.farad else ""),
         kind.symbol,
         kind is StageKind.INTEGRATOR,
-        tuple(_pin(element, cord) for cord in element.cords),
+        tuple(
+            _Pin(
+                cord.node,
+                input_text(element, cord),
+                f"{cord.pot} {cord.coefficient / cord.gain:.4f}" if cord.pot else "",
+                cord.gain,
+            )
+            for cord in element.cords
+        ),
     )
-
-
-def _pin(element: PatchedElement, cord: PatchedCord) -> _Pin:
-    pot = f"{cord.pot} {cord.coefficient / cord.gain:.4f}" if cord.pot else ""
-    return _Pin(cord.node, input_text(element, cord), pot, cord.gain)
 
 
 def _inverter(inverter: Inverter) -> _Drawn:

@@ -53,7 +53,8 @@ def _elements(program: PatchedProgram) -> Iterator[Sequence[str]]:
         head = (element.name, element.stage.kind.title, output, f"{element.full:g}")
         farad = f"{element.farad * 1e9:g} nF" if element.farad else ""
         for cord in element.cords:
-            yield *head, input_text(element, cord), cord.node, cord.pot, _gain(element, cord), farad
+            gain = f"{cord.gain:g}" if element.stage.kind.has_amplifier else ""
+            yield *head, input_text(element, cord), cord.node, cord.pot, gain, farad
             head, farad = ("", "", "", ""), ""
     for each in inverters(program):
         outputs = signed(-each.sign, each.quantity), f"{program.fulls[each.quantity]:g}"
@@ -85,10 +86,6 @@ def input_text(element: PatchedElement, cord: PatchedCord) -> str:
     if element.stage.kind.adds:
         return cord.cord.text
     return signed(cord.sign, cord.cord.source)
-
-
-def _gain(element: PatchedElement, cord: PatchedCord) -> str:
-    return f"{cord.gain:g}" if element.stage.kind.has_amplifier else ""
 
 
 def _pots(program: PatchedProgram) -> Iterator[Sequence[str]]:
