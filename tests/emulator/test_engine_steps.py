@@ -126,7 +126,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., CDLL]:
     "options",
     [
         ("-O1", "-DENGINE_NARROW"),
-        ("-O3", "-march=native"),
+        pytest.param(("-O3", "-march=native"), marks=pytest.mark.heavy, id="-O3 -march=native"),
         ("-O1", "-fsanitize=undefined", "-fsanitize-undefined-trap-on-error"),  # undefined behaviour ends the process
     ],
     ids=" ".join,

@@ -37,6 +37,15 @@ THESIS_CHANGES = (
     PotTurn(600, {"M": 30.0}),
 )
 AMPLIFIERS = ("u1", "u2", "u3", "u4", "u5")
+LINEAR_PLAYS = pytest.mark.parametrize(
+    ("program", "changes", "samples"),
+    [
+        ("front", THESIS_CHANGES, 800),
+        ("shock", (), 200),
+        pytest.param("front", (), 800, marks=pytest.mark.heavy),
+        pytest.param("shock", (), 800, marks=pytest.mark.heavy),
+    ],
+)
 
 
 def deck_of(
@@ -58,25 +67,25 @@ def every_amplifier(computer: SuspensionComputer, excitation: Excitation, sample
     return engine.run(samples, {"F": excitation.edges(*engine.window(samples), SAMPLE_RATE_HZ)})
 
 
-@pytest.mark.parametrize(("program", "changes"), [("front", THESIS_CHANGES), ("front", ()), ("shock", ())])
+@LINEAR_PLAYS
 def test_displacement_and_velocity_agree_with_ngspice_at_every_sample(
-    ngspice: NgSpice, program: str, changes: Sequence[PotTurn]
+    ngspice: NgSpice, program: str, changes: Sequence[PotTurn], samples: int
 ) -> None:
     computer = SuspensionComputer(program)
-    reference = ngspice(deck_of(computer, Excitation(), 800, changes), ("u5", "u2"), 800)
-    volts = np.concatenate(list(computer.play(Excitation(), 800, changes)))
+    reference = ngspice(deck_of(computer, Excitation(), samples, changes), ("u5", "u2"), samples)
+    volts = np.concatenate(list(computer.play(Excitation(), samples, changes)))
     assert np.abs(volts[:, 1:3] - reference).max() < 0.05 * LSB_V
 
 
-@pytest.mark.parametrize(("program", "changes"), [("front", THESIS_CHANGES), ("front", ()), ("shock", ())])
+@LINEAR_PLAYS
 def test_every_amplifier_agrees_with_ngspice_at_every_sample(
-    ngspice: NgSpice, program: str, changes: Sequence[PotTurn]
+    ngspice: NgSpice, program: str, changes: Sequence[PotTurn], samples: int
 ) -> None:
     """The edges come between samples: at an edge's own instant ngspice still shows the level before it."""
     computer, excitation = SuspensionComputer(program), Excitation(clock="free", phase=0.637)
-    reference = ngspice(deck_of(computer, excitation, 800, changes), AMPLIFIERS, 800)
+    reference = ngspice(deck_of(computer, excitation, samples, changes), AMPLIFIERS, samples)
     turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in changes]
-    volts = played_with_turns(computer.circuit, excitation, 800, turns)
+    volts = played_with_turns(computer.circuit, excitation, samples, turns)
     assert np.abs(volts - reference).max() < 0.05 * LSB_V
 
 
@@ -97,7 +106,7 @@ def test_slewing_and_clamping_amplifiers_agree_with_ngspice(ngspice: NgSpice) ->
     assert np.abs(volts - reference).max() < 0.05 * LSB_V
 
 
-@pytest.mark.parametrize("seed", range(50))
+@pytest.mark.parametrize("seed", [*range(12), *(pytest.param(seed, marks=pytest.mark.heavy) for seed in range(12, 50))])
 def test_random_machines_agree_with_ngspice_at_every_amplifier(ngspice: NgSpice, seed: int) -> None:
     """Parts, op-amps, pots turned, edges at any instant: all drawn from the seed in the test's name."""
     rng = np.random.default_rng(seed)

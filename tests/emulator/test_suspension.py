@@ -50,11 +50,12 @@ def plant(program: ProgramCircuit, force_n: Volts, changes: Sequence[PotTurn] = 
     rows = []
     for k, force in enumerate(force_n):
         rows.append(x)
-        values = {**values, **turns.get(k, {})}
-        mass, damping, stiffness = values["M"], values["B"], values["K"]
-        a = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
-        b = np.array([[0.0], [1.0 / mass]])
-        step, drive, *_ = scipy.signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), 200 * 50e-6)
+        if k in turns or not k:
+            values = {**values, **turns.get(k, {})}
+            mass, damping, stiffness = values["M"], values["B"], values["K"]
+            a = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
+            b = np.array([[0.0], [1.0 / mass]])
+            step, drive, *_ = scipy.signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), 200 * 50e-6)
         x = step @ x + drive[:, 0] * force
     return np.array(rows)
 
