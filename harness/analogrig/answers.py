@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analogrig.catalogue import SteppedFlag
 
-__all__ = ["LARGEST_FLOAT32", "AlarmIs", "AlarmLevel"]
+__all__ = ["LARGEST_FLOAT32", "AlarmIs", "AlarmLevel", "not_finite_text", "plausible_orders", "raised_alarms"]
 """Names for packages beside the core."""
 
 LARGEST_FLOAT32 = float(np.finfo(np.float32).max)

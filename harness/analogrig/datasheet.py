@@ -14,6 +14,9 @@ from typing import Any, Self
 
 from analogrig import config
 
+__all__ = ["MOST_THETA"]
+"""Names for packages beside the core."""
+
 MOST_THETA = 64
 """Largest number of elements of theta."""
 

@@ -21,6 +21,9 @@ from analogrig.errors import LinkClosed, LinkError
 if TYPE_CHECKING:  # importing pyserial takes longer than all other imports together
     from analogrig.links.link import Wire
 
+__all__ = ["Child", "ChildWire"]
+"""Names for packages beside the core."""
+
 PROGRAMS = Path(__file__).parents[1] / "bin"
 """Folder of the programs that the package brings."""
 TETHER = PROGRAMS / "analogrig-tether"

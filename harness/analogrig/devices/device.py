@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from analogrig.links.link import CanListener
     from analogrig.links.wire_faults import FaultyLine
 
-__all__ = ["MOST_TIMEOUTS", "Causes", "Stated"]
+__all__ = ["KEEPS_MEMORY", "MOST_TIMEOUTS", "Causes", "Stated"]
 """Names for packages beside the core."""
 
 KEEPS_MEMORY = "a state left from before the record"

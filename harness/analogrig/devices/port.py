@@ -14,6 +14,9 @@ from analogrig.errors import ConfigurationError, LinkError
 from analogrig.links.link import DEFAULT_BAUD, PortWire, Wire
 from analogrig.trust import Thing, absolute_port
 
+__all__ = ["Port"]
+"""Names for packages beside the core."""
+
 _OF_PYSERIAL = frozenset({"timeout"})
 """Parameters of pyserial's URLs that look like a field of a device."""
 

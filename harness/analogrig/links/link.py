@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from analogrig.links.line import Line, SerialLine
     from analogrig.links.wire_faults import FaultyLine
 
-__all__ = ["CanListener", "Identifier", "identifier_text"]
+__all__ = ["CanListener", "DescriptorWire", "Identifier", "Wire", "identifier_text"]
 """Names for packages beside the core."""
 
 DEFAULT_BAUD = 115_200
