@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import anycrc
 
-from analogrig.devices.templates import checksum_of
 from analogrig_ecu.readings import layout_of
+from analogrig_lines.templates import checksum_of
 
 _J1850_BARE = anycrc.CRC(8, 0x1D, 0, False, False, 0)  # noqa: FBT003 - anycrc names none of its parameters
 _H2F = anycrc.Model("CRC8-AUTOSAR")

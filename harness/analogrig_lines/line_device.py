@@ -16,18 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers, Samples
-from analogrig.catalogue import SteppedFlag
-from analogrig.datasheet import Datasheet
-from analogrig.devices.device import MOST_TIMEOUTS, Device
+from analogrig import DeviceError, LinkError, LinkTimeout
+from analogrig.devices import Answers, Datasheet, Device, LinkClosed, Samples, SteppedFlag, TimeLimitReached
+from analogrig.devices.device import MOST_TIMEOUTS
 from analogrig.devices.pace import Pace
-from analogrig.devices.rows import INDEX, LOST_ON_THE_WAY, NO_ANSWER, AnswerAssembler, ToCodes
-from analogrig.devices.template_description import TemplateDescription
-from analogrig.devices.templates import ChecksumError, SampleWriter, checksum_of, fitting_checksums, hexadecimal
-from analogrig.errors import DeviceError, LinkClosed, LinkError, LinkTimeout, TimeLimitReached
-from analogrig.links.framing import MOST_FRAME
 from analogrig.run import Channel
 from analogrig.wording import number_of
+from analogrig_lines.answer_form import INDEX, LOST_ON_THE_WAY, NO_ANSWER, AnswerAssembler, ToCodes
+from analogrig_lines.framing import MOST_FRAME
+from analogrig_lines.template_description import TemplateDescription
+from analogrig_lines.templates import ChecksumError, SampleWriter, checksum_of, fitting_checksums, hexadecimal
 
 MOST_UNANSWERED = 1 << 20
 """Bytes that the device may send without an answer among them."""

@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
+from analogrig import LinkError
+from analogrig.devices import Device, Thing
 from analogrig.devices.child import Child, ChildWire
-from analogrig.devices.device import Device
-from analogrig.devices.line_device import LineDevice
 from analogrig.devices.port import Port
-from analogrig.devices.template_description import TemplateDescription
-from analogrig.errors import LinkError
-from analogrig.links.framing import Framing
-from analogrig.links.link import DEFAULT_BAUD, DescriptorWire, Wire
-from analogrig.trust import Thing, absolute_path
+from analogrig.links import DEFAULT_BAUD
+from analogrig.links.link import DescriptorWire, Wire
+from analogrig.trust import absolute_path
+from analogrig_lines.framing import Framing
+from analogrig_lines.line_device import LineDevice
+from analogrig_lines.template_description import TemplateDescription
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,10 +13,12 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from analogrig.datasheet import Datasheet
-from analogrig.devices.device import KEEPS_MEMORY, DeviceDescription, Stated
-from analogrig.devices.rows import INDEX, AnswerForm
-from analogrig.devices.templates import (
+from analogrig.devices import Datasheet, DeviceDescription
+from analogrig.devices.device import KEEPS_MEMORY, Stated
+from analogrig.links.link import Wire
+from analogrig_lines.answer_form import INDEX, AnswerForm
+from analogrig_lines.framing import FrameLayout, Framer, Framing
+from analogrig_lines.templates import (
     CHECKSUM,
     TYPES,
     AnswerReader,
@@ -31,8 +33,6 @@ from analogrig.devices.templates import (
     checksum_of,
     parse,
 )
-from analogrig.links.framing import FrameLayout, Framer, Framing
-from analogrig.links.link import Wire
 
 MOST_WINDOW = 4096
 MOST_STARTING_S = 600.0

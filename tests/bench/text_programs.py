@@ -9,7 +9,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from analogrig.devices.device import Device
-from analogrig.devices.lines import ProgramDevice
+from analogrig_lines.lines import ProgramDevice
 
 ALARM_ONLY = r"""
 #include <stdio.h>

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from analogrig.answers import Answers, Samples
-from analogrig.devices.line_device import LineDevice
-from analogrig.devices.lines import FramesDevice, LinesDevice
 from analogrig.errors import DeviceError, LinkError
 from analogrig.links.link import VirtualClock, Wire
+from analogrig_lines.line_device import LineDevice
+from analogrig_lines.lines import FramesDevice, LinesDevice
 
 Firmware = Callable[[bytes], bytes | list[bytes]]
 """Function of the bytes of one write. A list holds what each read of the harness returns; b"" is a time-out."""

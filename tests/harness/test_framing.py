@@ -16,7 +16,7 @@ import pytest
 
 from analogrig.answers import Answers, Samples
 from analogrig.devices.registry import from_table
-from analogrig.links.framing import FrameLayout
+from analogrig_lines.framing import FrameLayout
 from tests.harness.own_protocols import DESCRIPTIONS
 from tests.harness.processes import LONG_S
 

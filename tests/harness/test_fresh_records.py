@@ -18,11 +18,11 @@ from analogrig.answers import Samples
 from analogrig.devices.device import KEEPS_MEMORY, Device, DeviceDescription
 from analogrig.devices.estimator_library import EstimatorLibrary
 from analogrig.devices.library import InprocDevice
-from analogrig.devices.lines import LinesDevice, ProgramDevice
 from analogrig.devices.python import PythonDescription
 from analogrig.devices.registry import describe
 from analogrig.run import Run
 from analogrig_ecu.can_dbc import CanDbcDevice
+from analogrig_lines.lines import LinesDevice, ProgramDevice
 from tests.harness.library_builds import OWN, build
 from tests.harness.remembering import PLACES
 

@@ -18,15 +18,15 @@ import pytest
 from analogrig.answers import Answers, Samples
 from analogrig.bench import Bench
 from analogrig.config import read_toml
-from analogrig.devices.lines import LinesDevice, ProgramDevice
 from analogrig.devices.port import SerialDevice
 from analogrig.devices.registry import describe, from_table, recorded, trusted
-from analogrig.devices.templates import Reader, Writer, checksum_of
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
 from analogrig.rigs.description import open_rig
 from analogrig.run import Channel
 from analogrig.scenario import Scenario
 from analogrig.trust import Trust
+from analogrig_lines.lines import LinesDevice, ProgramDevice
+from analogrig_lines.templates import Reader, Writer, checksum_of
 from tests.harness.processes import LONG_S
 from tests.soak import line_faults
 from tests.soak.line_faults import COMMON, EXPECTED, FLOODS, PROTOCOLS, N, Scripted, cases, check_clean, outcome

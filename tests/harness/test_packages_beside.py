@@ -39,6 +39,7 @@ def test_there_are_packages_beside_the_core() -> None:
         "analogrig_ecu",
         "analogrig_imports",
         "analogrig_instruments",
+        "analogrig_lines",
         "analogrig_live",
         "analogrig_lucidac",
         "analogrig_thesis",

@@ -20,12 +20,12 @@ from analogrig.bench import Bench
 from analogrig.catalogue import SteppedFlag
 from analogrig.devices import child
 from analogrig.devices.device import Device
-from analogrig.devices.lines import ProgramDevice
 from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError, LinkError, LinkTimeout
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig_lines.lines import ProgramDevice
 from tests.harness.processes import LONG_S, descendants, ends
 
 ROOT = Path(__file__).parents[2]

@@ -23,11 +23,11 @@ import numpy as np
 
 from analogrig.answers import Answers, Samples
 from analogrig.catalogue import SteppedFlag
-from analogrig.devices.line_device import LineDevice
-from analogrig.devices.lines import LinesDevice
 from analogrig.errors import DeviceError, LinkError
 from analogrig.links.link import PortWire, VirtualClock, Wire
 from analogrig.run import LOST
+from analogrig_lines.line_device import LineDevice
+from analogrig_lines.lines import LinesDevice
 
 N = 8
 """Samples of a record."""

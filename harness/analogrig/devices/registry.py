@@ -41,9 +41,6 @@ KINDS = config.Kinds(
         "serial": "analogrig.devices.port:SerialDevice",
         "can": "analogrig.devices.can:CanDevice",
         "python": "analogrig.devices.python:PythonDescription",
-        "lines": "analogrig.devices.lines:LinesDevice",
-        "frames": "analogrig.devices.lines:FramesDevice",
-        "exec": "analogrig.devices.lines:ProgramDevice",
     },
 )
 """Description of each kind of device."""
