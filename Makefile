@@ -44,7 +44,7 @@ BOARD_f405 := stm32f405
 board = $(addprefix estimator_c/ports/,$(or $(BOARD_$*),mps2))
 FIRMWARE_FOLDERS := $(addprefix estimator_c/,core isolation fit device ports/loop ports/cortex_m)
 FIRMWARE_CFLAGS := -std=c99 -O2 -mthumb -ffreestanding -ffp-contract=off -ffunction-sections -DNDEBUG \
-    -Wall -Wextra -Wdouble-promotion -Werror $(FIRMWARE_FOLDERS:%=-I%) -Iestimator_c/ports/cortex_m/include \
+    -Wall -Wextra -Wdouble-promotion -Werror $(FIRMWARE_FOLDERS:%=-I%) -Iestimator_c/ports/loop/include \
     -I$(BUILD)/generated
 FIRMWARE_LDFLAGS := -nostdlib -nostartfiles -Wl,--gc-sections,-z,noexecstack -T estimator_c/ports/cortex_m/image.ld
 

@@ -962,10 +962,16 @@ static void dispatch_equation(est_t* const self, const float y, est_step_t* cons
 
 // ---------------------------------------------          API           ---------------------------------------------
 
-est_config_t est_config_default(void) {
-    static const est_config_t config = EST_CONFIG_DEFAULT;
-    return config;
+static const est_config_t default_config = EST_CONFIG_DEFAULT;
+
+est_config_t est_config_for_codes(const float low, const float high) {
+    est_config_t out = default_config;
+    out.code_low     = low;
+    out.code_high    = high;
+    return out;
 }
+
+est_config_t est_config_default(void) { return default_config; }
 
 bool est_init(est_t* const self, const est_config_t* const config) {
     EST_ASSERT((self != NULL) && (config != NULL));

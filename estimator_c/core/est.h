@@ -134,6 +134,7 @@ extern "C" {
     EST_NAME_EXPANDED(name, EST_NA_MAX, EST_NB_MAX, EST_NK_MAX, EST_NC_MAX, EST_THETA_MAX, EST_NAME_BUILD)
 #define est_init EST_NAME(est_init)
 #define est_config_default EST_NAME(est_config_default)
+#define est_config_for_codes EST_NAME(est_config_for_codes)
 
 /// Warning if the result of a function is ignored. Private.
 #ifdef __GNUC__
@@ -288,8 +289,8 @@ typedef struct {
 /// est_init() refuses noise and edges that do not fit in between: the defaults in a range of volts, for example. The
 /// configuration is for a generator on a clock of its own: ARX(2, 3) with delay 0 and offset; forgetting 0.995; C from
 /// A, starting at (1 - 0.8 z^-1)^2; noise of any variance; cumulative sum with ARL0 = 1e5, armed after 550 samples. A
-/// build with less room drops the offset first, then b's. In C++, needs designated initialisers: C++20, or the
-/// extension of gcc and clang. To change a value, define the object without const and assign before est_init().
+/// build with less room drops the offset first, then b's. For static objects of C; elsewhere, and in C++ before C++20,
+/// use est_config_for_codes(). To change a value, define the object without const and assign before est_init().
 #define EST_CONFIG_FOR_CODES(low, high)                                                                                \
     {                                                                                                                  \
         .na = (uint8_t)EST_DEFAULT_NA, .nb = (uint8_t)EST_DEFAULT_NB, .nk = (uint8_t)EST_DEFAULT_NK,                   \
@@ -488,8 +489,11 @@ typedef struct {
 
 // ---------------------------------------------       FUNCTIONS        ---------------------------------------------
 
-/// A copy of EST_CONFIG_DEFAULT, with the features of the build of est.c. Assign it to a static object: see est_init().
-/// Cannot fail. Cost: a copy. May be called from an interrupt.
+/// EST_CONFIG_FOR_CODES() of these codes, with the features of the build of est.c. Assign it to a static object: see
+/// est_init(). Cannot fail. Cost: a copy. May be called from an interrupt.
+est_config_t est_config_for_codes(float low, float high);
+
+/// The same of EST_CONFIG_DEFAULT.
 est_config_t est_config_default(void);
 
 /// True iff every value of the configuration is in the range stated at its field, and this build supports it. Cannot

@@ -7,6 +7,10 @@
 
 #include "est.h"
 
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0))
+#error "compile without -ffast-math, -Ofast and -ffinite-math-only: bad samples are detected by NaN and infinities"
+#endif
+
 #ifdef EST_FIXED_NA
 #if (EST_FIXED_NA > EST_NA_MAX) || (EST_FIXED_NB > EST_NB_MAX) || (EST_FIXED_NK > EST_NK_MAX) ||                       \
     (EST_FIXED_NC > EST_NC_MAX)

@@ -180,7 +180,7 @@ static bool isolate(device_t* const self) {
     return est_isolation_diagnosis(&self->isolation).change != before;
 }
 
-static void enter_gap(device_t* const self, const uint16_t lost_n) {
+static void step_over_gap(device_t* const self, const uint16_t lost_n) {
     const est_sample_t missing = { .u = 0.0F, .y = 0.0F, .valid = false };
     for (uint16_t i = 0U; (i < lost_n) && (i < DEVICE_GAP_MAX); i++) {
         (void)step(self, missing);
@@ -200,14 +200,14 @@ static bool report_is_due(device_t* const self) {
 }
 
 /// Step the estimator, and record the answers that are due.
-static void enter_sample(device_t* const self, const uint16_t index, const est_sample_t sample) {
+static void step_sample(device_t* const self, const uint16_t index, const est_sample_t sample) {
     const uint16_t ahead = (uint16_t)(index - self->next_index);
     if (ahead > (UINT16_MAX / 2U)) {
         add_saturating(&self->counters.samples_ignored, 1U);
         return;
     }
     if (ahead > 0U) {
-        enter_gap(self, ahead);
+        step_over_gap(self, ahead);
     }
     const uint32_t restarts = est_counters(&self->estimator).restarts;
     self->stepped           = step(self, sample);
@@ -286,7 +286,7 @@ static void on_sample(device_t* const self, const uint8_t* const payload) {
     const est_sample_t sample = { .u     = (float)message.force,
                                   .y     = (float)message.displacement,
                                   .valid = message.missing == 0U };
-    enter_sample(self, message.sample_index, sample);
+    step_sample(self, message.sample_index, sample);
     self->job       = DEVICE_STEPPING;
     self->job_next  = 1U;
     self->job_count = 1U;
@@ -316,7 +316,7 @@ static void step_block(device_t* const self) {
     const est_sample_t sample = { .u     = (float)read_word(force),
                                   .y     = (float)read_word(displacement),
                                   .valid = (((uint32_t)self->job_missing >> i) & 1U) == 0U };
-    enter_sample(self, (uint16_t)(self->job_index + i), sample);
+    step_sample(self, (uint16_t)(self->job_index + i), sample);
     self->job_next++;
 }
 
@@ -374,7 +374,7 @@ static void reset(device_t* const self) {
     (void)accepted;
 }
 
-static uint8_t start(device_t* const self, const uint32_t run) {
+static uint8_t start_run(device_t* const self, const uint32_t run) {
     if (self->running) {
         return ANALOGRIG_CONTROLLED_RESULT_RUNNING_CHOICE;
     }
@@ -393,7 +393,7 @@ static uint8_t start(device_t* const self, const uint32_t run) {
     return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
 }
 
-static void stop(device_t* const self) {
+static void stop_run(device_t* const self) {
     if (self->running) {
         self->stopped = est_counters(&self->estimator);
         self->running = false;
@@ -412,9 +412,9 @@ static uint8_t set_report_interval(device_t* const self, const uint32_t interval
 static uint8_t control(device_t* const self, const uint8_t command, const uint32_t argument) {
     switch (command) {
     case ANALOGRIG_CONTROL_COMMAND_START_CHOICE:
-        return start(self, argument);
+        return start_run(self, argument);
     case ANALOGRIG_CONTROL_COMMAND_STOP_CHOICE:
-        stop(self);
+        stop_run(self);
         return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
     case ANALOGRIG_CONTROL_COMMAND_RESET_CHOICE:
         reset(self);

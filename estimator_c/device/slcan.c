@@ -38,7 +38,7 @@ static uint8_t character(const uint32_t value) {
 }
 
 /// Parse a number of n hexadecimal digits. Return false if there is another character.
-static bool number(const uint8_t* const text, const uint8_t n, uint32_t* const out) {
+static bool parse_number(const uint8_t* const text, const uint8_t n, uint32_t* const out) {
     uint32_t value = 0U;
     for (uint8_t i = 0U; i < n; i++) {
         const uint8_t next = digit(text[i]);
@@ -87,7 +87,7 @@ static bool kind_flags(const uint8_t kind, uint8_t* const flags) {
 static bool decode_data(const uint8_t* const text, can_frame_t* const frame) {
     for (uint8_t i = 0U; i < frame->length; i++) {
         uint32_t byte = 0U;
-        if (!number(&text[2U * i], 2U, &byte)) {
+        if (!parse_number(&text[2U * i], 2U, &byte)) {
             return false;
         }
         frame->data[i] = (uint8_t)byte;
@@ -104,7 +104,7 @@ static bool decode(const uint8_t* const line, const uint8_t n, can_frame_t* cons
     const bool    is_extended = (frame->flags & CAN_FRAME_EXTENDED) != 0U;
     const uint8_t digits      = is_extended ? EXTENDED_DIGITS : STANDARD_DIGITS;
     const uint8_t head        = (uint8_t)(digits + 2U);
-    if ((n < head) || !number(&line[1], digits, &frame->id) ||
+    if ((n < head) || !parse_number(&line[1], digits, &frame->id) ||
         (frame->id > (is_extended ? EXTENDED_MAX : STANDARD_MAX))) {
         return false;
     }

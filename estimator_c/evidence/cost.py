@@ -29,7 +29,7 @@ FLOAT_ROUTINES = HERE.parent / "ports" / "cortex_m0" / "float.S"
 ISOLATION = HERE.parent / "isolation"
 FIT = HERE.parent / "fit"
 DEVICE = HERE.parent / "device"
-LIBC = HERE.parent / "ports" / "cortex_m" / "include"
+LIBC = HERE.parent / "ports" / "loop" / "include"
 CODECS = Path("build/generated")
 RESULTS = Path("build/cost.json")
 

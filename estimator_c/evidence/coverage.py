@@ -37,7 +37,7 @@ ELSEWHERE = {
 }
 """Branches on a line with such a word cannot both be taken there, or in one build."""
 
-OWN_BUILDS = ("test_est_builds.py", "test_est_users.py")
+OWN_BUILDS = ("test_est_builds.py", "test_est_embedding.py", "test_est_layouts.py", "test_est_users.py")
 """They compile the core for themselves, without counters."""
 RATES = (
     "test_changed_parameter_is_named_in_time_and_its_extent_told",

@@ -77,7 +77,7 @@
 
 /// Variance that a noisy force exceeds, in usual variances, and the largest square that counts, in such variances.
 #define UNUSUAL 4.0F
-#define CLIP 25.0F
+#define UNREST_MAX 25.0F
 
 /// Halvings that suffice for the largest arcosh of a plant, 7.6 with a2 = 1e-6.
 #define HALVINGS_N 8U
@@ -138,17 +138,13 @@ static void from_moments(float* const out, const float sum, const float first, c
     out[0] = sum - out[1] - out[2];
 }
 
-/// Derive the plant from theta. The poles of A are exp(-p/2 +- w) with p = B T / M and p^2/4 - w^2 = q = K T^2 / M. A
-/// force that deflects the plant by 1, t or t^2 when static is answered by 1, t - D and t^2 - 2 D t + 2 (D^2 - 1/q),
-/// with the lag D = B / K. The coefficients are those that give the same answers at the samples. Return false if
-/// theta is not a plant.
-static bool derive_plant(est_plant_t* const self, const est_config_t* const config, const float force_zero) {
-    const float a1  = self->theta[0];
-    const float a2  = self->theta[1];
+/// Compute p = B T / M and q = K T^2 / M of the plant of thesis Equ 4.2, M x'' + B x' + K x = F. Sampled every T, its
+/// poles are exp(-p/2 +- w) with p^2/4 - w^2 = q, so that a2 = exp(-p) and -a1 = 2 exp(-p/2) cosh(w). Return false if
+/// theta is not such a plant.
+static bool poles_of(const float* const theta, float* const p_out, float* const q_out) {
+    const float a1  = theta[0];
+    const float a2  = theta[1];
     const float sum = 1.0F + a1 + a2;
-    self->a[0]      = 1.0F;
-    self->a[1]      = a1;
-    self->a[2]      = a2;
     if ((a2 < 1.0e-6F) || (a2 >= 1.0F) || (sum < 1.0e-6F)) {
         return false;
     }
@@ -159,6 +155,26 @@ static bool derive_plant(est_plant_t* const self, const est_config_t* const conf
     }
     const float q = (0.25F * p * p) - squared_arcosh(cosh_w);
     if (q <= 0.0F) {
+        return false;
+    }
+    *p_out = p;
+    *q_out = q;
+    return true;
+}
+
+/// Derive the plant from theta. A force that deflects the plant by 1, t or t^2 when static is answered by 1, t - D and
+/// t^2 - 2 D t + 2 (D^2 - 1/q), with the lag D = B / K. The coefficients are those that give the same answers at the
+/// samples. Return false if theta is not a plant.
+static bool derive_plant(est_plant_t* const self, const est_config_t* const config, const float force_zero) {
+    const float a1  = self->theta[0];
+    const float a2  = self->theta[1];
+    const float sum = 1.0F + a1 + a2;
+    float       p   = 0.0F;
+    float       q   = 0.0F;
+    self->a[0]      = 1.0F;
+    self->a[1]      = a1;
+    self->a[2]      = a2;
+    if (!poles_of(self->theta, &p, &q)) {
         return false;
     }
     const float first  = a1 + (2.0F * a2);
@@ -325,7 +341,7 @@ static void enter_habits(est_isolation_t* const self) {
     const float* const f     = self->force;
     const float* const x     = self->displacement;
     const float        ratio = squared_step(f[0], f[1], f[2]) / (UNUSUAL * (self->habits.unrest + least_unrest(self)));
-    const float        counted = (ratio < CLIP) ? ratio : CLIP;
+    const float        counted = (ratio < UNREST_MAX) ? ratio : UNREST_MAX;
     self->unrest               = (self->habits.known_n < HABITS_N) ? 0.0F : ((0.375F * counted) - LN_2);
     self->same_n[FORCE]        = equal(f[0], f[1]) ? count_up(self->same_n[FORCE]) : 0U;
     self->same_n[DISPLACEMENT] = equal(x[0], x[1]) ? count_up(self->same_n[DISPLACEMENT]) : 0U;
@@ -887,4 +903,27 @@ bool est_isolation_work(est_isolation_t* const self) {
 est_diagnosis_t est_isolation_diagnosis(const est_isolation_t* const self) {
     EST_ASSERT(self != NULL);
     return self->diagnosis;
+}
+
+bool est_isolation_parameters(const est_t* const estimator, const est_units_t units, est_parameters_t* const out) {
+    EST_ASSERT((estimator != NULL) && (out != NULL));
+    const est_config_t* const config = estimator->config;
+    float                     theta[EST_THETA_MAX];
+    float                     b = 0.0F;
+    float                     p = 0.0F;
+    float                     q = 0.0F;
+    if (config->na != 2U) {
+        return false;
+    }
+    est_copy_theta(estimator, theta);
+    for (uint_fast8_t i = 0U; i < config->nb; i++) {
+        b += theta[2U + i];
+    }
+    if (!(b > 0.0F) || !poles_of(theta, &p, &q)) {
+        return false;
+    }
+    out->stiffness = (units.force * (1.0F + theta[0] + theta[1])) / (units.displacement * b);
+    out->mass      = (out->stiffness * units.period * units.period) / q;
+    out->damping   = (out->mass * p) / units.period;
+    return true;
 }

@@ -87,6 +87,20 @@ typedef struct {
     uint16_t     onset_high_n;  ///< from the first such onset; far from onset_low_n if the change had no effect yet
 } est_diagnosis_t;
 
+/// Units of the codes, from which parameters are computed.
+typedef struct {
+    float period;        ///< time between two samples [s]
+    float force;         ///< force per code of u [N]
+    float displacement;  ///< displacement per code of y [m]
+} est_units_t;
+
+/// Parameters of the plant M x'' + B x' + K x = F.
+typedef struct {
+    float mass;       ///< M [kg]
+    float damping;    ///< B [N s/m]
+    float stiffness;  ///< K [N/m]
+} est_parameters_t;
+
 /// A stored sample. Private.
 typedef struct {
     float u;
@@ -198,6 +212,14 @@ bool est_isolation_work(est_isolation_t* self);
 /// until 100 samples after the alarm. Faults that cannot be told apart remain undecided. Cost: constant. May be called
 /// from an interrupt.
 est_diagnosis_t est_isolation_diagnosis(const est_isolation_t* self);
+
+/// Compute M, B and K from the present theta: the inverse of the zero-order hold that leads from thesis Equ 4.2 to 4.3.
+/// With p = B T / M and q = K T^2 / M, a2 = exp(-p), -a1 = 2 exp(-p/2) cosh(w), w^2 = p^2/4 - q, and 1/K = sum of the
+/// b's / (1 + a1 + a2), in codes. Needs no state of isolation. Other quantities serve as well: for an RLC circuit, L, R
+/// and 1/C with u in volts and y in coulombs.
+/// Returns false iff na is not 2 or theta describes no such plant, as before the first edge; *out is then unchanged.
+/// Cost: at most 230 divisions. May be called from an interrupt.
+EST_RESULT_USED bool est_isolation_parameters(const est_t* estimator, est_units_t units, est_parameters_t* out);
 
 #ifdef __cplusplus
 }

@@ -240,6 +240,17 @@ void driver_counters(unsigned out[10]) {
     }
 }
 
+/* out, (3,): M, B, K from the present theta, or unchanged. */
+int driver_parameters(double period, double force, double displacement, double* out) {
+    const est_units_t units = { .period = (float)period, .force = (float)force, .displacement = (float)displacement };
+    est_parameters_t  found = { .mass = (float)out[0], .damping = (float)out[1], .stiffness = (float)out[2] };
+    const bool        has   = est_isolation_parameters(&self, units, &found);
+    out[0]                  = (double)found.mass;
+    out[1]                  = (double)found.damping;
+    out[2]                  = (double)found.stiffness;
+    return has ? 1 : 0;
+}
+
 int driver_can_isolate(void) {
     static est_isolation_t isolation;
     return est_isolation_init(&isolation, &config, 0.0F) ? 1 : 0;

@@ -242,6 +242,14 @@ class Estimator:
         self._c.driver_watch(ctypes.c_size_t(runs), ctypes.c_size_t(samples), *pointers)
         return alarm, theta
 
+    def parameters(self, period_s: float, n_per_code: float, m_per_code: float) -> tuple[float, ...] | None:
+        """est_isolation_parameters(): M, B and K, or None if it returns false."""
+        out = np.full(3, -1.0)
+        units = (ctypes.c_double(unit) for unit in (period_s, n_per_code, m_per_code))
+        found = bool(self._c.driver_parameters(*units, ctypes.c_void_p(out.ctypes.data)))
+        assert found or (out == -1.0).all()
+        return tuple(out.tolist()) if found else None
+
     def can_isolate(self) -> bool:
         """est_isolation_init() with the configuration of the last init()."""
         return bool(self._c.driver_can_isolate())

@@ -25,7 +25,7 @@ static est_isolation_t isolation;
 static est_fit_watch_t watch;
 int main(void) {
     return (est_init(&estimator, &config) && est_isolation_init(&isolation, &config, 0.0F) &&
-            est_fit_init(&watch, &config) && est_config_default().na) ? 0 : 1;
+            est_fit_init(&watch, &config) && est_config_default().na && est_config_for_codes(0.0F, 1.0F).na) ? 0 : 1;
 }
 """
 
@@ -93,7 +93,7 @@ def test_builds_link_if_and_only_if_they_agree_about_the_layout(built: dict[str,
             assert first.layout == second.layout, (library, caller)
         else:
             missing = set(re.findall(r"undefined reference to `(est\w*?)_na\d", done.stderr))
-            assert missing == {*INITS, "est_config_default"}, (library, caller)
+            assert missing == {*INITS, "est_config_default", "est_config_for_codes"}, (library, caller)
 
 
 @pytest.mark.parametrize("source", SOURCES[1:], ids=lambda source: source.stem)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -253,31 +255,79 @@ def test_rtos_port_asks_for_room_once(rtos: Rtos) -> None:
     assert (rtos.control, rtos.task.value) == (1, 1)
 
 
-# ---- size
+# ---- the commands of the page
+
+
+def commands() -> list[str]:
+    """Those of the first block, which compile the device."""
+    (block,) = re.findall(r"```console\n(   \$ EST=.*?)```", BOARD.read_text(encoding="utf-8"), re.DOTALL)
+    return [line.strip().removeprefix("$ ") for line in block.splitlines() if line.strip()]
+
+
+ROWS = re.findall(r"^\| ([^|]*) \| `(-m[^`]*)` \| ([\d.]+), ([\d.]+) kB \|$", BOARD.read_text("utf-8"), re.MULTILINE)
+"""Processor, its options, flash at -Os and at -O2."""
+
+
+def built(folder: Path, processor: str, level: str = "-Os", compiler: str = "arm-none-eabi-gcc") -> Path:
+    """Image of the port to a UART, by the commands of the page with these options of the compiler."""
+    (folder / "port.c").write_text(port_of("a UART"))
+    fault = "void board_fail(const char* line);\nvoid board_fail(const char* line) { (void)line; for (;;) { } }"
+    (folder / "registers.c").write_text(f"#include <stdint.h>\n{UART}\n{fault}\n")
+    script = "\n".join(commands())
+    for old, new in ((r'CPU=".*"', f'CPU="{processor}"'), ("-Os", level), ("arm-none-eabi-gcc", compiler)):
+        script, count = re.subn(old, new, script)
+        assert count == 1, old
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "-euc", script], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / "device.elf"
+
+
+def flash_and_ram(image: Path) -> tuple[float, float]:
+    """Both in kB."""
+    size = subprocess.run(["arm-none-eabi-size", str(image)], capture_output=True, text=True, check=True).stdout
+    text, data, bss, *_ = map(int, size.splitlines()[1].split()[:3])
+    return (text + data) / 1000, (data + bss) / 1000
+
+
+@pytest.mark.tools("arm-none-eabi-gcc")
+def test_commands_of_the_page_build_the_device(tmp_path: Path) -> None:
+    (cpu,) = re.findall(r'CPU="(.*)"', "\n".join(commands()))
+    assert cpu in {options for _, options, *_ in ROWS}
+    assert built(tmp_path, cpu).exists()
 
 
 @pytest.mark.heavy
 @pytest.mark.tools("arm-none-eabi-gcc")
-def test_port_to_a_uart_takes_the_flash_and_ram_of_the_page(tmp_path: Path) -> None:
-    told = re.search(r"takes ([\d.]+) kB of flash at `-Os`, ([\d.]+) kB at `-O2`, and ([\d.]+) kB of RAM", flat(BOARD))
-    assert told is not None
-    (tmp_path / "port.c").write_text(port_of("a UART"))
-    fault = "void board_fail(const char* line);\nvoid board_fail(const char* line) { (void)line; for (;;) { } }"
-    (tmp_path / "registers.c").write_text(f"#include <stdint.h>\n{UART}\n{fault}\n")
-    ports = ESTIMATOR / "ports"
-    flags = ["-std=c99", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-mthumb", "-ffp-contract=off"]
-    flags += ["-DNDEBUG", "-ffreestanding", "-nostdlib", "-nostartfiles", "-ffunction-sections", "-Wl,--gc-sections"]
-    flags += [f"-I{part}" for part in (*FOLDERS, CODECS, ports / "cortex_m", ports / "cortex_m" / "include")]
-    flags += [f"-L{ports / 'stm32f405'}", f"-T{ports / 'cortex_m' / 'image.ld'}"]
-    sources = [*tmp_path.glob("*.c"), *(path for part in (*FOLDERS, CODECS) for path in part.glob("*.c"))]
-    sources.append(ports / "cortex_m" / "start.c")
-    for level, flash in zip(("-Os", "-O2"), told.groups(), strict=False):
-        image = tmp_path / "image.elf"
-        subprocess.run(["arm-none-eabi-gcc", level, *flags, *map(str, sources), "-lgcc", "-o", str(image)], check=True)
-        size = subprocess.run(["arm-none-eabi-size", str(image)], capture_output=True, text=True, check=True).stdout
-        text, data, bss, *_ = map(int, size.splitlines()[1].split()[:3])
-        assert (text + data) / 1000 == pytest.approx(float(flash), rel=0.05)
-        assert (data + bss) / 1000 == pytest.approx(float(told[3]), rel=0.05)
+@pytest.mark.parametrize(("name", "options", "small", "fast"), ROWS, ids=[row[0] for row in ROWS])
+def test_port_to_a_uart_takes_the_flash_and_ram_of_the_page(
+    name: str, options: str, small: str, fast: str, tmp_path: Path
+) -> None:
+    (ram,) = re.findall(r"takes ([\d.]+) kB of RAM", flat(BOARD))
+    library = f" {ESTIMATOR / 'ports/cortex_m0/float.S'}" if "float.S" in name else ""
+    for level, flash in (("-Os", small), ("-O2", fast)):
+        found = flash_and_ram(built(tmp_path, options + library, level))
+        assert found == pytest.approx((float(flash), float(ram)), rel=0.02)
+
+
+@pytest.mark.tools("riscv64-linux-gnu-gcc")
+def test_device_compiles_for_a_32_bit_risc_v_with_the_options_of_the_page(tmp_path: Path) -> None:
+    """Linked without libgcc, of which this compiler has none for 32 bits: nothing of it is needed."""
+    (options,) = re.findall(r"`CPU` is `(-march[^`]*)`", flat(BOARD))
+    (tmp_path / "port.c").write_text(
+        port_of("a UART").replace("int main(void)", "void _start(void);\nvoid _start(void)")
+    )
+    (tmp_path / "registers.c").write_text(f"#include <stdint.h>\n{UART}\n")
+    parts = [*FOLDERS, CODECS]
+    sources = [*tmp_path.glob("*.c"), *(path for part in parts for path in part.glob("*.c"))]
+    flags = re.findall(r'FLAGS="(.*)"', "\n".join(commands()))[0].split()
+    include = [f"-I{part}" for part in (*parts, ESTIMATOR / "ports/loop/include")]
+    command = ["riscv64-linux-gnu-gcc", *options.split(), *flags, "-Wall", "-Wextra", "-Werror", *include]
+    command += ["-nostdlib", "-static", "-Wl,--gc-sections", "-o", str(tmp_path / "device.elf")]
+    done = subprocess.run([*command, *map(str, sources)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def flat(page: Path) -> str:

@@ -197,8 +197,9 @@ def image(folder: Path, board: str, main: str) -> Path:
     ports = Path(__file__).parents[2] / "estimator_c" / "ports"
     (folder / "main.c").write_text(main)
     options = ["-std=c99", "-mcpu=cortex-m4", "-mthumb", "-ffreestanding", "-nostdlib", "-nostartfiles"]
-    paths = [f"-I{ports}/cortex_m", f"-I{ports}/cortex_m/include", f"-L{ports}/{board}", f"-T{ports}/cortex_m/image.ld"]
-    shared = [ports / "cortex_m" / "start.c", ports / "cortex_m" / "uart.c", *(ports / board).glob("*.c")]
+    paths = [f"-I{ports}/cortex_m", f"-I{ports}/loop/include", f"-L{ports}/{board}", f"-T{ports}/cortex_m/image.ld"]
+    shared = [*(ports / part for part in ("cortex_m/start.c", "cortex_m/uart.c", "loop/memory.c"))]
+    shared += (ports / board).glob("*.c")
     product = folder / "program.elf"
     subprocess.run([GCC, *options, *paths, folder / "main.c", *shared, "-lgcc", "-o", product], check=True)
     return product

@@ -6,7 +6,6 @@
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
-#include <string.h>
 
 int main(void);
 
@@ -60,34 +59,3 @@ __attribute__((section(".vectors"), used)) static const struct {
     .system = { start_reset, unexpected, fault, fault, fault, fault, NULL, NULL, NULL, NULL, unexpected, unexpected,
                 NULL, unexpected, unexpected },
 };
-
-// Functions that the compiler calls implicitly. The pointers are volatile, because gcc would replace the loops by calls
-// of the same functions.
-
-void* memset(void* const to, const int value, const size_t n) {
-    volatile uint8_t* const bytes = to;
-    for (size_t i = 0U; i < n; i++) {
-        bytes[i] = (uint8_t)value;
-    }
-    return to;
-}
-
-void* memcpy(void* const restrict to, const void* const restrict from, const size_t n) {
-    volatile uint8_t* const bytes  = to;
-    const uint8_t* const    source = from;
-    for (size_t i = 0U; i < n; i++) {
-        bytes[i] = source[i];
-    }
-    return to;
-}
-
-void* memmove(void* const to, const void* const from, const size_t n) {
-    volatile uint8_t* const bytes   = to;
-    const uint8_t* const    source  = from;
-    const bool              is_down = (uintptr_t)to < (uintptr_t)from;
-    for (size_t i = 0U; i < n; i++) {
-        const size_t at = is_down ? i : (n - 1U - i);  // never overwrites a byte that is still to be read
-        bytes[at]       = source[at];
-    }
-    return to;
-}

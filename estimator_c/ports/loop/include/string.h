@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-/// Part of a C library that the generated codecs need; a bare compiler has none. Defined in start.c.
+/// Part of a C library that the generated codecs need, for targets without one. Defined in ports/loop/memory.c.
 
 #ifndef STRING_H_INCLUDED
 #define STRING_H_INCLUDED
