@@ -459,8 +459,7 @@ def ngspice_figures() -> Iterator[Figure]:
 
 GNUCAP_SETTINGS = tuple(
     itertools.starmap(
-        gnucap.Setting,
-        itertools.product(("trap", "gear"), (1e-3, 1e-4, 1e-6), (7.0, 1.0), (50e-6, 25e-6, 12e-6, 8e-6)),
+        gnucap.Setting, itertools.product(("trap", "gear"), (1e-3, 1e-4, 1e-6), (7.0, 1.0), (50e-6, 25e-6, 12e-6, 8e-6))
     )
 )
 

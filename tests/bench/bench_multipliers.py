@@ -56,12 +56,7 @@ SETTINGS = tuple(
     itertools.starmap(
         Setting,
         itertools.product(
-            METHODS,
-            OP_AMPS,
-            ("every sample", "start"),
-            (1e-4, 1e-6, 1e-7),
-            (7.0, 1.0, 0.1),
-            (50e-6, 12e-6, 4e-6),
+            METHODS, OP_AMPS, ("every sample", "start"), (1e-4, 1e-6, 1e-7), (7.0, 1.0, 0.1), (50e-6, 12e-6, 4e-6)
         ),
     )
 )

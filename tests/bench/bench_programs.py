@@ -15,10 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analogrig_emulator import (
-    Circuit,
-    Multiplier,
-)
+from analogrig_emulator import Circuit, Multiplier
 from analogrig_emulator.exceptions import ProgramError
 from analogrig_emulator.machine.program_loader import compile_program, parse_program
 from tests.emulator.random_programs import random_program

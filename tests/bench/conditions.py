@@ -215,12 +215,7 @@ OWN: Sequence[Condition] = (
         ("noise",),
     ),
     Condition("warming", "K falls by 2 % in 10,000 samples", Emulated(SQUARE, wander=warming(-0.02)), ("drift",)),
-    Condition(
-        "two-mass",
-        "suspension on its tyre, four poles",
-        Emulated(SQUARE, program=TWO_MASS),
-        ("nonlinear",),
-    ),
+    Condition("two-mass", "suspension on its tyre, four poles", Emulated(SQUARE, program=TWO_MASS), ("nonlinear",)),
     Condition(
         "loop-100",
         "ground loop of 2 LSB at 100 Hz on both channels",

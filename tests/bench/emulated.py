@@ -24,15 +24,7 @@ from analogrig_emulator import (
     probes_per_sample,
 )
 
-from .played import (
-    CARD,
-    DISPLACEMENT,
-    FORCE,
-    Array,
-    Change,
-    Played,
-    accumulate,
-)
+from .played import CARD, DISPLACEMENT, FORCE, Array, Change, Played, accumulate
 
 DISTURBANCE_STREAM = 10
 """First random stream of a seed beside those of the emulated rig."""

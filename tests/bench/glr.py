@@ -127,10 +127,7 @@ class KnownPlantsGlr:
 
 
 def _stationary(
-    transition: NDArray[np.float64],
-    response: NDArray[np.float64],
-    force_variance: float,
-    displacement_variance: float,
+    transition: NDArray[np.float64], response: NDArray[np.float64], force_variance: float, displacement_variance: float
 ) -> tuple[NDArray[np.float64], float]:
     """Gain of the measurement update and variance of the innovation, with white noise on force and displacement."""
     output = np.array([[1.0, 0.0]])

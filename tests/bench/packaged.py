@@ -86,10 +86,7 @@ class _Device:
     """Device of the kind ``python``: the errors of an estimator go to a detector."""
 
     def __init__(
-        self,
-        estimator: _Estimator,
-        make_detector: Callable[[], Any],
-        statistic: Callable[[Any], float] | None = None,
+        self, estimator: _Estimator, make_detector: Callable[[], Any], statistic: Callable[[Any], float] | None = None
     ) -> None:
         self._estimator = estimator
         self._make_detector = make_detector

@@ -18,9 +18,7 @@ from tests.served.serving import serving
 RATE_HZ, CHANNELS = 62_500, 8
 
 OSCILLATOR = Configuration(
-    (Integrator(-0.875), *[Integrator()] * 7),
-    {0: LucidacLane(0, 1, 0.05), 1: LucidacLane(1, 0, -0.05)},
-    adc=(0, 1) * 4,
+    (Integrator(-0.875), *[Integrator()] * 7), {0: LucidacLane(0, 1, 0.05), 1: LucidacLane(1, 0, -0.05)}, adc=(0, 1) * 4
 )
 LORENZ = Configuration(
     (Integrator(0.1), Integrator(), Integrator(0.3), *[Integrator()] * 5),

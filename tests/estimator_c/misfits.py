@@ -10,15 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import signal
 
 from tests.estimator_c.est_driver import CAUSES
-from tests.estimator_c.plants import (
-    CODES,
-    DISPLACEMENT_RANGE_M,
-    FRONT,
-    NOISE_LSB,
-    PERIOD_S,
-    Excitation,
-    simulate,
-)
+from tests.estimator_c.plants import CODES, DISPLACEMENT_RANGE_M, FRONT, NOISE_LSB, PERIOD_S, Excitation, simulate
 
 __all__ = ["CAUSES", "CONDITIONS", "Condition", "whitened"]
 

@@ -102,13 +102,7 @@ VAGUE = {"p0": 1e3, "forgetting": 0.5, "ceiling": 1e6, "warm_up_n": 150, "edge_i
 
 @pytest.mark.parametrize(
     "settings",
-    [
-        {},
-        {"kind": 0, "warm_up_n": 0},
-        {"warm_up_n": 2000},
-        {"warm_up_n": 2000, "edge_instants": 1},
-        {"nc": 2, "nb": 2},
-    ],
+    [{}, {"kind": 0, "warm_up_n": 0}, {"warm_up_n": 2000}, {"warm_up_n": 2000, "edge_instants": 1}, {"nc": 2, "nb": 2}],
     ids=["sum", "none", "held", "in doubt", "residuals"],
 )
 def test_theta_that_overflows_begins_anew(estimator: Estimator, settings: dict[str, float]) -> None:

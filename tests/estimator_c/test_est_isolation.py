@@ -181,9 +181,7 @@ def test_zero_of_the_force_may_lie_anywhere_in_its_range(estimator: Estimator) -
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [{"na": 1}, {"kind": PREDICTION_ERROR}, {"nb": 3, "nk": 1}, {"edge_instants": ANYWHERE}],
-    ids=str,
+    "settings", [{"na": 1}, {"kind": PREDICTION_ERROR}, {"nb": 3, "nk": 1}, {"edge_instants": ANYWHERE}], ids=str
 )
 def test_what_is_no_suspension_or_hides_its_edges_is_refused(estimator: Estimator, settings: Settings) -> None:
     assert estimator.init(**{"c": (0.0, 0.0), **settings})

@@ -36,11 +36,7 @@ TRIES = 40
 FREQUENCY_UNITS, STRENGTH_UNITS, MISFIT_ROUNDING = 65_536, 256, 1e-3
 """Units of a Misfit, and largest deviation of its strength, relative to it."""
 
-LINES: dict[str, dict[str, Any]] = {
-    "serial": {},
-    "can": {"link": "can"},
-    "can fd": {"link": "can", "fd": True},
-}
+LINES: dict[str, dict[str, Any]] = {"serial": {}, "can": {"link": "can"}, "can fd": {"link": "can", "fd": True}}
 
 
 def play(case: PlayedCase, seed: int) -> Run:
@@ -100,8 +96,7 @@ def check_hums(run: Run, case: PlayedCase, disturbance: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("script", "line"),
-    [(script, line) for script in SCRIPTS for line in LINES if is_for(script, can=line != "serial")],
+    ("script", "line"), [(script, line) for script in SCRIPTS for line in LINES if is_for(script, can=line != "serial")]
 )
 def test_device_answers_messages_as_the_reference(script: str, line: str) -> None:
     assert next(wrong_answers(InprocDevice(name="inproc", **LINES[line]), script), "") == ""

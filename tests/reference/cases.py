@@ -172,10 +172,7 @@ CASES: Mapping[str, PlayedCase] = {
     "M falls at an edge": PlayedCase(
         scenario_of("M falls at an edge", dataclasses.replace(FREE, phase=0.968), 530, **CHANGES["M falls"]), ARMED
     ),
-    "M falls, one clock": PlayedCase(
-        scenario_of("M falls, one clock", SQUARE, 530, **CHANGES["M falls"]),
-        ONE_CLOCK,
-    ),
+    "M falls, one clock": PlayedCase(scenario_of("M falls, one clock", SQUARE, 530, **CHANGES["M falls"]), ONE_CLOCK),
     "ringing plant": PlayedCase(
         dataclasses.replace(scenario_of("ringing", FREE, 530, B=1250.0), set=RINGING), SHORT_MEMORY
     ),

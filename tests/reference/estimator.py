@@ -15,16 +15,7 @@ from numpy.typing import NDArray
 
 from analogrig.catalogue import SteppedFlag
 from analogrig.estimator_config import EstimatorConfig
-from tests.reference.regression import (
-    Covariance,
-    Vector,
-    Whitener,
-    differences,
-    dot,
-    is_stable,
-    to_delta,
-    to_plain,
-)
+from tests.reference.regression import Covariance, Vector, Whitener, differences, dot, is_stable, to_delta, to_plain
 from tests.reference.trigger import Meaning, ReferenceTrigger
 
 DOUBT_N = 12

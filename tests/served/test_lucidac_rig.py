@@ -372,11 +372,7 @@ def test_program_whose_output_has_no_integrator_is_one_line() -> None:
 
 @pytest.mark.parametrize(
     ("said", "why"),
-    [
-        (b"", "connection closed"),
-        (b"\xff" * 20, "at most"),
-        (b"\x03\xff\xff\xff", "sent no message of this protocol"),
-    ],
+    [(b"", "connection closed"), (b"\xff" * 20, "at most"), (b"\x03\xff\xff\xff", "sent no message of this protocol")],
 )
 def test_malformed_device_is_one_line(said: bytes, why: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:

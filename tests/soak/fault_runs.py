@@ -160,11 +160,7 @@ def play(case: Case, opened: Opened | None = None, timeout_s: float = TIMEOUT_S)
     line = faulty(opened or _in_memory(case.link), case.faults)
     clock, started_s = line.clock, line.clock()
     description = InprocDevice(
-        name="bob",
-        exchange=case.exchange,
-        timeout_s=timeout_s,
-        most_lost_n=case.most_lost_n,
-        estimator=ESTIMATOR,
+        name="bob", exchange=case.exchange, timeout_s=timeout_s, most_lost_n=case.most_lost_n, estimator=ESTIMATOR
     )
     link = _link(line, case.link)
     played = _play(link, description, case)

@@ -318,10 +318,7 @@ def survive_all(served: ServedByProcess, attacks: Sequence[Attack], seconds: flo
     print(f"{'client':18} {'times':>9} {'grown kB':>9} {'slowest answer s':>17}")
     for attack in attacks:
         survival = survive(served, attack, seed, seconds, query)
-        print(
-            f"{attack.__name__:18} {survival.times:9d} {survival.grown_kb:9d} {survival.slowest_s:17.2f}",
-            flush=True,
-        )
+        print(f"{attack.__name__:18} {survival.times:9d} {survival.grown_kb:9d} {survival.slowest_s:17.2f}", flush=True)
     served.process.terminate()
     if (output := ended(served, [130])) != "analogrig: interrupted\n":
         raise AssertionError(output)

@@ -29,9 +29,7 @@ lines = st.one_of(st.binary(max_size=300), right, st.lists(st.one_of(commands, r
 
 @settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(lines, max_size=12))
-def test_random_input_gets_whole_lines_or_errors_and_the_next_record_is_right(
-    said: list[bytes],
-) -> None:
+def test_random_input_gets_whole_lines_or_errors_and_the_next_record_is_right(said: list[bytes]) -> None:
     speaking = interpreter()
     for line in said:
         answer = b"".join(speaking.enter(line.replace(b"\n", b"")))

@@ -47,11 +47,7 @@ from tests.thesis.oracle import (
 
 Claims = dict[str, Any]
 
-FIGURES = (
-    *(f"3.{i}" for i in range(5, 9)),
-    *(f"4.{i}" for i in range(1, 11)),
-    *(f"5.{i}" for i in range(4, 11)),
-)
+FIGURES = (*(f"3.{i}" for i in range(5, 9)), *(f"4.{i}" for i in range(1, 11)), *(f"5.{i}" for i in range(4, 11)))
 
 RECORDED = ("fig-5.4", "fig-5.5", "fig-5.7", "fig-5.7-quantised")
 
@@ -473,10 +469,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
         ),
     ),
     "3.5-slow": ("holds", _slow),
-    "3.6-sluggish": (
-        "holds",
-        lambda m, o: m["reconverged_n"] == reconverged(o.example(forgetting=0.97)[0], o.EXAMPLE),
-    ),
+    "3.6-sluggish": ("holds", lambda m, o: m["reconverged_n"] == reconverged(o.example(forgetting=0.97)[0], o.EXAMPLE)),
     "3.6-variance": (
         "holds",
         lambda m, o: (
@@ -542,14 +535,8 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
         ),
     ),
     "4.6-theory": ("holds with a reading", lambda m, o: m["samples_from_the_alarm"] == _from_the_alarm(o)),
-    "4.4-outliers": (
-        "holds",
-        lambda m, o: _least_outliers(m, o, ERROR) and _noise_alarms(m, o, ERROR),
-    ),
-    "4.5-robust": (
-        "holds with a reading",
-        lambda m, o: _least_outliers(m, o, MEAN) and _noise_alarms(m, o, MEAN),
-    ),
+    "4.4-outliers": ("holds", lambda m, o: _least_outliers(m, o, ERROR) and _noise_alarms(m, o, ERROR)),
+    "4.5-robust": ("holds with a reading", lambda m, o: _least_outliers(m, o, MEAN) and _noise_alarms(m, o, MEAN)),
     "4.9-sample-rate": ("holds with a reading", _sample_rate),
     "4.8-never-zero": (
         "holds with a reading",
@@ -562,10 +549,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
         "does not hold",
         lambda m, o: near(m["samples_above_300"], int((o.mean_since_start > 300.0).sum())),
     ),
-    "4.9-false-alarms": (
-        "holds with a reading",
-        lambda m, o: o.finds(m, MEAN),
-    ),
+    "4.9-false-alarms": ("holds with a reading", lambda m, o: o.finds(m, MEAN)),
     "4.9-ceiling": (
         "holds with a reading",
         lambda m, o: (
@@ -589,10 +573,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "4.9-level": ("not reproduced", lambda m, _: m["alarms"] == 0),
     "5.3-parity": ("holds", _parity),
     "5.4-skew": ("holds with a reading", _skewed),
-    "5.4-variance": (
-        "holds with a reading",
-        lambda m, o: near(m["variances"], _variances(o.runs["skewed"]).tolist()),
-    ),
+    "5.4-variance": ("holds with a reading", lambda m, o: near(m["variances"], _variances(o.runs["skewed"]).tolist())),
     "5.6-agreement": ("holds with a reading", _second_half),
     "5.5-tracking": ("does not hold", _tracking),
     "5.9-forgetting": (
