@@ -86,7 +86,7 @@ def test_other_skips_fail_and_keep_their_reason(
 
 
 @pytest.mark.parametrize("options", [(), ("-p", "xdist.plugin", "-n", "2")], ids=["alone", "xdist"])
-def test_session_ends_with_a_table_of_the_missing_tools(options: tuple[str, ...], waiting: pytest.Pytester) -> None:
+def test_missing_tools_are_named_by_test_and_in_a_table(options: tuple[str, ...], waiting: pytest.Pytester) -> None:
     result = waiting.runpytest_subprocess("-rs", *options)
     result.assert_outcomes(passed=1, skipped=4)
     result.stdout.fnmatch_lines(
@@ -102,10 +102,6 @@ def test_session_ends_with_a_table_of_the_missing_tools(options: tuple[str, ...]
         ],
         consecutive=True,
     )
-
-
-def test_reason_of_a_skip_names_every_missing_tool(waiting: pytest.Pytester) -> None:
-    result = waiting.runpytest_subprocess("-rs")
     result.stdout.fnmatch_lines_random(
         [
             "SKIPPED*needs qemu-arm, cppcheck: apt-get install --no-install-recommends qemu-user cppcheck",

@@ -10,14 +10,17 @@ import pytest
 
 from analogrig.cli import main
 from analogrig_thesis.reproduction import CLAIMS
+from tests.wheels import made_once
 
 
 @pytest.fixture(scope="session")
 def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder written by ``analogrig thesis``."""
-    folder = tmp_path_factory.mktemp("thesis")
-    assert main(["thesis", "--out", str(folder)]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        assert main(["thesis", "--out", str(folder)]) == 0
+
+    return made_once(tmp_path_factory, "thesis", make)
 
 
 @pytest.fixture(scope="session")
