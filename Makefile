@@ -13,6 +13,8 @@ FAULTS_SEED ?= 0
 STRICT_CC ?= gcc clang
 CLANG_FORMAT ?= clang-format-14
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
+STRICT_LEVEL_gcc := -O1
+STRICT_LEVEL_clang := -O0
 
 BIN := $(VENV)/bin
 ZIG := $(BUILD)/zig
@@ -320,6 +322,6 @@ $(PRODUCTS) &: $(NATIVE_SOURCES) | $(VENV)/.base
 $(BUILD)/strict/%.ok: $(NATIVE_SOURCES) setup.py Makefile | $(VENV)/.installed
 	@mkdir -p $(@D)
 	@if command -v $* >/dev/null; then \
-	    CC=$* CFLAGS="$(STRICT_CFLAGS)" $(BIN)/python setup.py --quiet build_products \
+	    CC=$* CFLAGS="$(STRICT_LEVEL_$*) $(STRICT_CFLAGS)" $(BIN)/python setup.py --quiet build_products \
 	        --build-lib $(@D)/$* --build-temp $(@D)/$* && touch $@; \
 	else echo "$* is absent, so the C is not checked with it: make tools"; fi
