@@ -55,7 +55,12 @@ def test_netlist_has_the_slopes_of_the_equations(name: str) -> None:
 
 @pytest.mark.parametrize("seed", [*SEEDS[:3], *(pytest.param(seed, marks=pytest.mark.heavy) for seed in SEEDS[3:])])
 def test_random_programs_have_the_slopes_of_their_equations(seed: int) -> None:
-    assert_slopes(advised(random_program(seed))[1], np.random.default_rng(seed))
+    assert_slopes(compiled_random(seed), np.random.default_rng(seed))
+
+
+def compiled_random(seed: int) -> PatchedProgram:
+    """Random program of a seed, with all advice followed."""
+    return advised(random_program(seed))[1]
 
 
 def assert_slopes(program: PatchedProgram, rng: np.random.Generator) -> None:

@@ -66,7 +66,7 @@ class LawParts(NamedTuple):
         return len(self.limiters) + bends + len(self.recovering)
 
 
-class Layout(NamedTuple):
+class LinearLayout(NamedTuple):
     """Rows and columns of the linear system.
 
     row: of each node, ground last, which is left out of the solution; branch: row of each unknown current;
@@ -114,7 +114,7 @@ class KinkRecord(NamedTuple):
     excess: int | None = None
 
 
-def law_records(parts: LawParts, layout: Layout) -> list[LawRecord]:
+def law_records(parts: LawParts, layout: LinearLayout) -> list[LawRecord]:
     """Law of each state, limiter, bend, recovery and factor of a product, in this order."""
     row, ground = layout.row, layout.row[GROUND]
     products = {part.name: column for column, part in enumerate(parts.multipliers, layout.first_product)}
@@ -135,7 +135,7 @@ def law_records(parts: LawParts, layout: Layout) -> list[LawRecord]:
     return laws
 
 
-def kink_records(parts: LawParts, layout: Layout) -> list[KinkRecord]:
+def kink_records(parts: LawParts, layout: LinearLayout) -> list[KinkRecord]:
     """Kinks: limits of op-amps and multipliers with a pole, then limiters, bends, recoveries, factors of products."""
     states = {part.name: state for state, part in enumerate(parts.held)}
     first_excess = layout.first_source + parts.sources - len(parts.recovering)
@@ -171,14 +171,14 @@ def _limits(part: OpAmp | Multiplier, state: int, out: int, excess: int | None) 
     return limits
 
 
-class _Pairs(NamedTuple):
+class _KinkPairs(NamedTuple):
     """Kinks, and the row or column of each."""
 
     kinks: NDArray[np.intp]
     others: NDArray[np.intp]
 
     @classmethod
-    def of(cls, pairs: Sequence[tuple[int, int]]) -> _Pairs:
+    def of(cls, pairs: Sequence[tuple[int, int]]) -> _KinkPairs:
         return cls(*np.array(pairs, np.intp).reshape(-1, 2).T)
 
 
@@ -201,10 +201,10 @@ class Laws(NamedTuple):
     products: Sequence[tuple[int, int]]
     common: Matrix | None
     law_of_kink: NDArray[np.intp]
-    slewing: _Pairs
-    held: _Pairs
-    loaded: _Pairs
-    lacking: _Pairs
+    slewing: _KinkPairs
+    held: _KinkPairs
+    loaded: _KinkPairs
+    lacking: _KinkPairs
     g: Matrix
 
     @classmethod
@@ -238,10 +238,10 @@ class Laws(NamedTuple):
             products=[(row, law.product) for row, law in enumerate(laws) if law.product is not None],
             common=np.array(common).reshape(-1, 1) if any(common) else None,
             law_of_kink=np.array([each.law for each in kinks], np.intp),
-            slewing=_Pairs.of(slewing),
-            held=_Pairs.of(held),
-            loaded=_Pairs.of(loaded),
-            lacking=_Pairs.of(lacking),
+            slewing=_KinkPairs.of(slewing),
+            held=_KinkPairs.of(held),
+            loaded=_KinkPairs.of(loaded),
+            lacking=_KinkPairs.of(lacking),
             g=g,
         )
 

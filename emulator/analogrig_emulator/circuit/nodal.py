@@ -33,7 +33,7 @@ from analogrig_emulator.circuit.elements import (
     Switch,
     VoltageSource,
 )
-from analogrig_emulator.circuit.laws import LawParts, Laws, Layout, kink_records, law_records
+from analogrig_emulator.circuit.laws import LawParts, Laws, LinearLayout, kink_records, law_records
 from analogrig_emulator.circuit.nonlinear import Multiplier
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
 from analogrig_emulator.engine import binding
@@ -120,7 +120,7 @@ class Nodal:
         self._state = {element.name: i for i, element in enumerate(parts.held)}
         first_product = len(self._state) + len(self._inputs)
         self._columns = first_product + len(parts.multipliers) + 1
-        layout = Layout(self._row, self._branch, first_product, self._columns)
+        layout = LinearLayout(self._row, self._branch, first_product, self._columns)
         kinks = kink_records(parts, layout)
         self._kinks = tuple(each.kink for each in kinks)
         last_source = len(kinks) - 2 * len(parts.multipliers)
