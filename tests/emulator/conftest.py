@@ -5,16 +5,14 @@ from __future__ import annotations
 import re
 import signal
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
-
-SAMPLE_RATE_HZ = 20e3
+from tests.emulator.plays import SAMPLE_RATE_HZ, NgSpice
 
 
 class UnfinishedError(Exception):

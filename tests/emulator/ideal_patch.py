@@ -9,16 +9,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import root
 
 from analogrig_emulator import Capacitor, DiodeLimiter, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.circuit.pot import legs_ohm
+from tests.emulator.plays import Volts
 
 _LEAST_INTEGRATOR_FARAD = 0.9e-9
-
-Volts = NDArray[np.float64]
 
 
 @dataclass

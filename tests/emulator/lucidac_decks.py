@@ -7,8 +7,8 @@ import numpy as np
 from analogrig_emulator import piecewise_linear
 from analogrig_emulator.circuit.spice import Accuracy, Deck
 from analogrig_emulator.lucidac.machine import Lucidac
-from tests.emulator.conftest import NgSpice
 from tests.emulator.ideal_lucidac import random_configuration
+from tests.emulator.plays import NgSpice
 
 SAMPLES = 20
 LSB_V = 5.0 / 65536

@@ -24,7 +24,8 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.spice import Accuracy
 from tests.emulator.conftest import UnfinishedError, ngspice_in
-from tests.emulator.test_compiler import LSB_V, RATE_HZ, levels_v
+from tests.emulator.plays import LSB_V
+from tests.emulator.test_compiler import RATE_HZ, levels_v
 
 SAMPLES = 120
 

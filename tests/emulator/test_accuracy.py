@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from analogrig_emulator import (
     TICKS_PER_SAMPLE,
@@ -24,11 +21,10 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.nonlinear import Function, Multiplier
 from analogrig_emulator.machine.program_loader import compile_program, parse_program
+from tests.emulator.plays import LSB_V, NgSpice
 from tests.emulator.random_programs import REFUSED
 from tests.emulator.real_parts import off_ngspice_lsb
-from tests.emulator.test_compiler import LSB_V, RATE_HZ, compiled_random, levels_v, off_equations_lsb
-
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
+from tests.emulator.test_compiler import RATE_HZ, compiled_random, levels_v, off_equations_lsb
 
 MOST_LSB = 0.05
 TIGHT = 1e-11

@@ -42,10 +42,10 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.circuit.opamp import CLAMP_RATE, PRESETS
+from tests.emulator.plays import LSB_V
 
 from .conftest import NgSpice
 
-LSB_V = 10.0 / 4096
 TL07X = PRESETS["tl07x"]
 
 

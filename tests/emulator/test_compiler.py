@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from analogrig_emulator import (
+    COMPONENTS,
+    MULTIPLIERS,
     PROGRAMS,
     TICKS_PER_SAMPLE,
     Deck,
@@ -31,14 +35,11 @@ from analogrig_emulator.machine.sheet import dials
 from analogrig_emulator.machine.stages import StageKind, stages_of
 from analogrig_emulator.machine.trial import reaches, settings
 from tests.emulator.ideal_patch import IdealPatch
+from tests.emulator.plays import LSB_V, NgSpice, Volts
 from tests.emulator.programs import FILES, program_of
 from tests.emulator.random_programs import REFUSED, random_program
 from tests.emulator.test_tried_advice import advised
 
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
-Volts = NDArray[np.float64]
-
-LSB_V = 10.0 / 4096
 RATE_HZ = 20e3
 SAMPLES = 300
 SEEDS = [seed for seed in range(7) if seed not in REFUSED]
@@ -420,3 +421,218 @@ def test_pots_reach_the_ends_of_every_range(name: str) -> None:
     program = program_of(name)
     for values in settings(program.equations):
         assert all(0 <= dial <= 1 for dial in dials(program, values).values())
+
+
+# ---- pots of compiled programs stay away from the ends of their tracks, so that real parts of any draw can play them
+
+
+TRACK_ENDS_SEEDS = 4
+
+CASES = {
+    "a value at the upper stop": ("y' = a*u - y", "a = { value = 1.0 }"),
+    "a value just below the upper stop": ("y' = a*u - y", "a = { value = 0.9999 }"),
+    "a range up to the upper stop": ("y' = a*u - y", "a = { value = 0.8, range = [0.5, 1.0] }"),
+    "a reciprocal at the upper stop": ("y' = (u - y)/T", "T = { value = 1.0 }"),
+    "a reciprocal whose least value is at the stop": ("y' = (u - y)/T", "T = { value = 2.0, range = [1.0, 4.0] }"),
+    "two parameters at the upper stop": ("y' = a*c*u - y", "a = { value = 0.5 }\nc = { value = 2.0 }"),
+    "corners of two ranges": (
+        "y' = a*c*u - y",
+        "a = { value = 0.5, range = [0.4, 0.625] }\nc = { value = 1.5, range = [1.0, 1.6] }",
+    ),
+    "a value at the lower stop": ("y' = u - y - b*y", "b = { value = 4e-4 }"),
+    "a range down to the lower stop": ("y' = u - y - b*y", "b = { value = 0.01, range = [3e-4, 0.02] }"),
+    "a constant at the lower stop": ("y' = u - y + b", "b = { value = 4e-3 }"),
+    "a number at the lower stop": ("y' = u - y - 0.00045*y", ""),
+    "a wide range": ("y' = u - y - b*y", "b = { value = 0.05, range = [4e-4, 0.1] }"),
+    "a summer at the upper stop": ("S = g*u - 0.5*y\ny' = S - y", "g = { value = 1.0 }"),
+    "a summer at the upper stop of gain 10": ("S = g*u - 0.5*y\ny' = 0.1*S - y", "g = { value = 10.0 }"),
+    "a product at the upper stop": ("y' = a*u*y/10 - y + u", "a = { value = 1.0 }"),
+}
+
+
+def program(equations: str, parameters: str, speed: float = 10.0) -> PatchedProgram:
+    signals = "[signals]\nS = { full = 10.0 }\n" if "S = " in equations else ""
+    return compile_program(
+        parse_program(
+            f"name = 'ends'\nspeed = {speed}\nperiod_s = 20.0\nequations = '''\n{equations}\n'''\n"
+            "[inputs]\nu = { full = 10.0, trial = [0.0, 1.0] }\n[states]\ny = { full = 10.0 }\n"
+            f"{signals}[parameters]\n{parameters}",
+            "ends",
+        )
+    )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_real_parts_set_every_value_of_a_range(name: str) -> None:
+    assert_settable(program(*CASES[name]))
+
+
+def test_a_fast_integrator_at_the_upper_stop_of_gain_10() -> None:
+    assert_settable(program("y' = a*u - 0.5*y", "a = { value = 0.999 }", 1e5))
+
+
+def assert_settable(patched: PatchedProgram) -> None:
+    """Machines of drawn parts set every end of a range; the slopes are those of the equations."""
+    assert_slopes(patched, np.random.default_rng(1))
+    for seed in range(TRACK_ENDS_SEEDS):
+        machine = real_machine(patched, seed)
+        assert all(0.0 < dial < 1.0 for dial in machine.dials.values())
+        for name, row in patched.equations.parameters.items():
+            for value in (row.low, row.high):
+                assert all(0.0 < dial < 1.0 for dial in machine.dials_for(**{name: value}).values())
+
+
+def real_machine(patched: PatchedProgram, seed: int) -> SuspensionComputer:
+    components = replace(COMPONENTS["polypropylene"], seed=seed, temperature_c=40.0)
+    return SuspensionComputer(patched, components=components, multiplier=MULTIPLIERS["ad633"])
+
+
+@pytest.mark.parametrize(("name", "asked"), [("dc-motor", "k"), ("dc-motor", "J"), ("rc-battery", "R2")])
+def test_the_limit_in_an_error_is_one_that_can_be_set(name: str, asked: str) -> None:
+    """The stated limit is set, and a value beyond the next digit is not."""
+    machine = real_machine(program_of(name), 3)
+    row = machine.program.equations.parameters[asked]  # type: ignore[attr-defined]
+    for value in (row.low, row.high):
+        try:
+            machine.dials_for(**{asked: value})
+        except PotError as error:
+            limit = float(str(error).partition(f"whose {asked} is at ")[2].split(":")[0].split()[1])
+            assert limit != value
+            machine.dials_for(**{asked: limit})
+            with pytest.raises(PotError, match=f"{asked} = .* cannot be set"):
+                machine.dials_for(**{asked: limit + 0.5 * (value - limit)})
+            return
+    pytest.fail("every value can be set")
+
+
+def test_the_limit_at_the_lower_stop_is_a_least_value() -> None:
+    machine = real_machine(program_of("silverbox"), 3)
+    with pytest.raises(PotError, match="square = 1 cannot be set on program silverbox, whose square is at least 1.2"):
+        machine.dials_for(square=1.0)
+
+
+SHIPPED = {
+    "bump-stop": "5a3204392d78586c",
+    "dc-motor": "4ef1e4a5f55c8796",
+    "duffing": "1f192a2a5a9077c0",
+    "front": "a27c7fd536bb4ff9",
+    "pendulum": "2e9a0dccc06e2f49",
+    "rc-battery": "9ea8268f635380ef",
+    "shock": "73e5f63521e16aad",
+    "silverbox": "328347d90b82e073",
+    "two-mass": "c9957764ad215ffe",
+    "two-tanks": "a14aa7d4d75a3a90",
+    "van-der-pol": "a2fa8379e492c661",
+}
+"""Digest of a patch by program: resistors, capacitors, pots, full scales. Recorded hashes of runs depend on them."""
+
+
+def digest(patched: PatchedProgram) -> str:
+    values = [
+        (part.name, part.nodes, getattr(part, "ohm", None), getattr(part, "farad", None)) for part in patched.elements
+    ]
+    pots = [(pot, patched.pot_coefficient(pot, patched.values)) for pot in patched.pots]
+    return hashlib.sha256(repr((values, pots, sorted(patched.fulls.items()))).encode()).hexdigest()[:16]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_patches_of_shipped_programs_stay(name: str) -> None:
+    assert digest(program_of(name)) == SHIPPED[name]
+
+
+# ---- the front suspension on its tyre, against the equations of the thesis and against ngspice
+
+
+PROGRAM = program_of("two-mass")
+TWO_MASS_N = 400
+TIME_SCALE = 200.0
+QUANTITIES = (
+    "force",
+    "displacement",
+    "velocity",
+    "net_force",
+    "suspension_force",
+    "compression",
+    "rate",
+    "tyre_net_force",
+    "tyre_velocity",
+    "tyre_displacement",
+)
+CHANGES: tuple[PotTurn, ...] = (
+    PotTurn(120, {"K2": 18000.0}),
+    PotTurn(200, {"M1": 14.0, "B2": 3453.0}),
+    PotTurn(280, {"K1": 150e3, "M2": 90.0}),
+)
+
+
+READ_NODES = [PROGRAM.scales.quantities[quantity].node for quantity in QUANTITIES]
+
+
+def deck_of(computer: SuspensionComputer, changes: Sequence[PotTurn] = CHANGES) -> Deck:
+    edges = Excitation().edges(0, TWO_MASS_N * TICKS_PER_SAMPLE, RATE_HZ)
+    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in changes]
+    return Deck(computer.circuit, TWO_MASS_N, RATE_HZ, {"F": edges}, turns, title="two masses")
+
+
+def by_equations(changes: Sequence[PotTurn]) -> Volts:
+    """Equ 2.1 and 2.2 stepped exactly: (samples, quantities in the order of QUANTITIES), in V at their nodes."""
+    values, scales = dict(PROGRAM.values), PROGRAM.scales
+    edges = Excitation().edges(0, TWO_MASS_N * TICKS_PER_SAMPLE, RATE_HZ)
+    force_v = edges.levels_v[np.searchsorted(edges.ticks, np.arange(TWO_MASS_N) * TICKS_PER_SAMPLE, side="right") - 1]
+    settings = {change.sample: change.values for change in changes}
+    rows: list[list[float]] = []
+    state: Volts = np.zeros(4)
+    for k in range(TWO_MASS_N):
+        force_n = force_v[k] * scales.full("force") / 10.0
+        rows.append(quantities(values, state, force_n))
+        values |= settings.get(k, {})
+        state = stepped(values, state, force_n)
+    return np.array(rows) * [scales.volts_at_node(quantity) for quantity in QUANTITIES]
+
+
+def quantities(values: Mapping[str, float], state: Volts, force_n: float) -> list[float]:
+    x2, v2, x1, v1 = state
+    s = values["B2"] * (v2 - v1) + values["K2"] * (x2 - x1)
+    tyre = values["B1"] * v1 + values["K1"] * x1
+    return [force_n, x2, v2, force_n - s, s, x2 - x1, v2 - v1, s - tyre, v1, x1]
+
+
+def stepped(values: Mapping[str, float], state: Volts, force_n: float) -> Volts:
+    m2, b2, k2, m1, b1, k1 = (values[name] for name in ("M2", "B2", "K2", "M1", "B1", "K1"))
+    a = np.zeros((5, 5))
+    a[:4] = [
+        [0.0, 1.0, 0.0, 0.0, 0.0],
+        [-k2 / m2, -b2 / m2, k2 / m2, b2 / m2, force_n / m2],
+        [0.0, 0.0, 0.0, 1.0, 0.0],
+        [k2 / m1, b2 / m1, -(k1 + k2) / m1, -(b1 + b2) / m1, 0],
+    ]
+    step: Volts = expm(a * TIME_SCALE / RATE_HZ)
+    following: Volts = (step @ np.append(state, 1.0))[:4]
+    return following
+
+
+def test_with_ideal_amplifiers_it_solves_the_equations_of_the_thesis() -> None:
+    volts = deck_of(SuspensionComputer(PROGRAM, opamp="ideal")).volts(READ_NODES)
+    np.testing.assert_allclose(volts, by_equations(CHANGES), atol=1e-9)
+
+
+def test_with_real_amplifiers_it_stays_within_25_lsb_of_them() -> None:
+    # Bandwidth: the tyre rings at 3.4 kHz of machine time, and the summers have inputs of gain 10.
+    volts = deck_of(SuspensionComputer(PROGRAM)).volts(READ_NODES)
+    deviation = dict(zip(QUANTITIES, np.abs(volts - by_equations(CHANGES)).max(axis=0) / LSB_V, strict=True))
+    moving = ("displacement", "velocity", "compression", "tyre_velocity", "tyre_displacement")
+    assert max(deviation[name] for name in moving) < 25.0
+
+
+def test_no_amplifier_exceeds_10_v() -> None:
+    deck = deck_of(SuspensionComputer(PROGRAM))
+    assert np.abs(deck.volts([amp.out for amp in deck.circuit.of(OpAmp)])).max() < 10.0
+
+
+def test_both_springs_in_series_carry_a_constant_force() -> None:
+    computer = SuspensionComputer(PROGRAM)
+    computer.set(K1=215e3, M1=15.0)
+    scale = PROGRAM.scales.quantities["displacement"]
+    volts = deck_of(computer, ()).volts([scale.node])
+    static_m = 2940.0 / PROGRAM.values["K2"] + 2940.0 / 215e3
+    assert volts[49, 0] / PROGRAM.scales.volts_at_node("displacement") == pytest.approx(static_m, rel=0.002)

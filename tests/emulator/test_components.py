@@ -40,10 +40,9 @@ from analogrig_emulator import (
     to_spice,
 )
 from analogrig_emulator.circuit.circuit import Element
+from tests.emulator.plays import LSB_V
 
 from .conftest import NgSpice
-
-LSB_V = 10.0 / 4096
 
 NETLIST: tuple[Element, ...] = (
     VoltageSource("F", "in"),

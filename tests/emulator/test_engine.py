@@ -10,25 +10,33 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from numpy.typing import NDArray
 
 from analogrig_emulator import (
+    CARDS,
+    OP_AMP_GRADES,
     TICKS_PER_SAMPLE,
     Capacitor,
+    Card,
     Circuit,
     Edges,
     Engine,
     EngineError,
+    Excitation,
+    NoisySuspension,
     OpAmp,
     OpAmpModel,
     PiecewiseLinear,
+    PotTurn,
     Resistor,
+    SuspensionComputer,
     VoltageSource,
+    acquired,
+    ahead_ticks,
     piecewise_linear,
 )
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from tests.emulator.plays import LSB_V, Volts
 
-Volts = NDArray[np.float64]
 Slope = Callable[[float, Volts, float], tuple[float, ...]]
 
 SOURCE = VoltageSource("V1", "in")
@@ -336,3 +344,156 @@ def test_what_cannot_be_recorded_is_refused_with_the_number() -> None:
         Engine(follower(), ["out"], sample_rate_hz=float("inf"))
     with pytest.raises(EngineError, match="cannot record -3 samples"):
         Engine(follower(), ["out"]).run(-3)
+
+
+# ---- stopping between two samples, and the watch over amplifiers at their limits
+
+
+def low_pass(ohm: float) -> PiecewiseLinear:
+    return piecewise_linear(Circuit([SOURCE, Resistor("R1", "in", "out", ohm), Capacitor("C1", "out", "0", 1e-9)]))
+
+
+def follower_engine_watch() -> Engine:
+    model = OpAmpModel(gbw_hz=1e6, slew_v_per_s=SLEW)
+    return Engine(piecewise_linear(Circuit([SOURCE, OpAmp("U1", "in", "out", "out", model)])), ["out"])
+
+
+def edges(*changes: tuple[float, float]) -> dict[str, Edges]:
+    instants, levels_v = np.array(changes).T
+    return {"V1": Edges(np.rint(instants * TICKS_PER_SAMPLE).astype(np.int64), levels_v)}
+
+
+def test_a_circuit_changed_between_two_samples_follows_both_exponentials() -> None:
+    engine = Engine(low_pass(100e3), ["out"])
+    engine.run(1, edges((0.0, 10.0)))
+    engine.advance(TICKS_PER_SAMPLE // 4)
+    engine.set_system(low_pass(20e3))
+    volts = engine.run(2)[:, 0]
+    expected = 10.0 * (1 - math.exp(-12.5e-6 / 100e-6) * np.exp(-np.array([37.5e-6, 87.5e-6]) / 20e-6))
+    np.testing.assert_allclose(volts, expected, rtol=1e-12)
+
+
+def test_edges_on_the_way_are_taken_and_the_window_begins_after_them() -> None:
+    engine = Engine(low_pass(1.0), ["in"])
+    engine.run(1, edges((0.0, 1.0)))
+    engine.advance(TICKS_PER_SAMPLE // 2, edges((0.25, 2.0)))
+    assert engine.window(2) == (TICKS_PER_SAMPLE // 2 + 1, 2 * TICKS_PER_SAMPLE + 1)
+    assert engine.run(2, edges((1.5, 3.0)))[:, 0].tolist() == [2.0, 3.0]
+
+
+@pytest.mark.parametrize("tick", [-1, 2 * TICKS_PER_SAMPLE - 1, 3 * TICKS_PER_SAMPLE])
+def test_an_instant_past_or_not_before_the_next_sample_is_refused(tick: int) -> None:
+    engine = Engine(low_pass(1e3), ["in"])
+    engine.run(3)
+    with pytest.raises(EngineError, match="after 3 samples"):
+        engine.advance(tick)
+
+
+def test_the_watch_tells_when_patience_ended() -> None:
+    engine = follower_engine_watch()
+    engine.watch(TICKS_PER_SAMPLE // 4)
+    engine.run(3, edges((1.5, 10.0)))
+    assert engine.overdue_ticks.tolist() == [pytest.approx(1.75 * TICKS_PER_SAMPLE, abs=1)]
+
+
+def test_patience_counts_unbroken_stretches_only() -> None:
+    engine = follower_engine_watch()
+    engine.watch(TICKS_PER_SAMPLE // 2)
+    engine.run(6, edges((0.0, 10.0), (1.0, 0.0), (2.0, 10.0)))
+    assert engine.overdue_ticks.tolist() == [-1]
+
+
+def test_a_kink_that_is_outside_still_is_told_of_too() -> None:
+    engine = follower_engine_watch()
+    engine.watch(TICKS_PER_SAMPLE // 4)
+    engine.run(1, edges((0.0, 10.0)))
+    engine.advance(TICKS_PER_SAMPLE * 3 // 10)
+    assert engine.overdue_ticks.tolist() == [TICKS_PER_SAMPLE // 4]
+    engine.watch(TICKS_PER_SAMPLE // 20)
+    assert engine.overdue_ticks.tolist() == [-1]
+    engine.run(1)
+    assert engine.overdue_ticks.tolist() == [TICKS_PER_SAMPLE * 3 // 10 + TICKS_PER_SAMPLE // 20]
+
+
+# ---- voltages a little after each sample: of the engine, of the machine, and of the card that needs them
+
+
+RATE_HZ, NODES = 20e3, ("in", "u5", "u2", "u1")
+FINER = 64
+AHEAD_TICKS = TICKS_PER_SAMPLE // FINER
+SQUARE, FREE = Excitation(), Excitation(clock="free", phase=0.137, drift_ppm=20.0)
+PRBS = Excitation(shape="prbs", frequency_hz=10e3)
+CHANGES = (PotTurn(60, {"K": 18000.0}), PotTurn(99, {"M": 30.0}, 20))
+
+
+def engine(rate_hz: float = RATE_HZ, ahead: int = 0) -> Engine:
+    return Engine(piecewise_linear(SuspensionComputer("front").circuit), NODES, rate_hz, ahead_ticks=ahead)
+
+
+@pytest.mark.parametrize("excitation", [SQUARE, FREE, PRBS])
+def test_looking_ahead_is_running_on_and_changes_no_sample(excitation: Excitation) -> None:
+    """With a finer grid the samples of the engine itself lie at the later instants."""
+    samples = 300
+    edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)
+    looking, counts = engine(ahead=AHEAD_TICKS), (1, 70, samples - 71)
+    volts = np.concatenate([looking.run(n, {"F": edges.within(*looking.window(n))}) for n in counts])
+    start, stop = 0, (samples - 1) * TICKS_PER_SAMPLE + 1
+    assert np.array_equal(volts, engine(ahead=AHEAD_TICKS).run(samples, {"F": edges.within(start, stop)}))
+    assert np.array_equal(volts[:, :4], engine().run(samples, {"F": edges.within(start, stop)}))
+    finer = Edges(edges.ticks * FINER, edges.levels_v).within(start, stop * FINER)
+    later = engine(RATE_HZ * FINER).run((samples - 1) * FINER + 2, {"F": finer})[1::FINER]
+    after_sample = edges.ticks % TICKS_PER_SAMPLE
+    assert not ((after_sample > 0) & (after_sample <= AHEAD_TICKS)).any()
+    np.testing.assert_allclose(volts[:, 4:], later, rtol=0, atol=1e-7)
+
+
+def test_a_play_that_looks_ahead_has_the_same_samples_through_changes_and_ramps() -> None:
+    plain = np.concatenate(list(SuspensionComputer("front").play(FREE, 200, CHANGES)))
+    for block in (33, 200):
+        blocks = SuspensionComputer("front").play(FREE, 200, CHANGES, block, AHEAD_TICKS)
+        volts = np.concatenate(list(blocks))
+        assert np.array_equal(volts[:, :4], plain)
+        assert 0.0 < np.abs(volts[:, 4:] - plain).max() < 10.0
+
+
+def test_a_delayed_sample_is_that_of_a_machine_sampled_faster() -> None:
+    """50 ns is a thousandth of the sample period, and the op-amps slew meanwhile."""
+    samples, faster = 60, 1000
+    card = Card(aperture_delay_s=50e-9)
+    blocks = acquired(SuspensionComputer("front"), card, SQUARE, samples, rng=np.random.default_rng(1))
+    edges = SQUARE.edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)
+    computer = SuspensionComputer("front")
+    fast = Engine(piecewise_linear(computer.circuit), computer.program.channel_nodes, RATE_HZ * faster)
+    every = fast.run((samples - 1) * faster + 2, {"F": Edges(edges.ticks * faster, edges.levels_v)})
+    expected = every[1::faster] * computer.program.channel_signs
+    np.testing.assert_allclose(np.concatenate(list(blocks)), expected, rtol=0, atol=0.001 * LSB_V)
+
+
+def test_an_early_sample_lies_on_the_line_from_the_one_before() -> None:
+    """Half of the samples without a delay are early. The force has its edges at sample instants."""
+    card = Card(aperture_jitter_s=5e-9)
+    blocks = acquired(SuspensionComputer("front"), card, SQUARE, 400, rng=np.random.default_rng(1), block_samples=64)
+    force = np.concatenate(list(blocks))[:, 0]
+    level = np.concatenate(list(SuspensionComputer("front").play(SQUARE, 400)))[:, 0]
+    off = np.flatnonzero(np.abs(force - level) > 1e-9)
+    assert set(off) <= {k for k in range(1, 400) if level[k] != level[k - 1]}
+    assert 0 < len(off) < 16
+    assert np.abs(force - level).max() < 10.0 * 25e-9 * RATE_HZ
+
+
+def test_noise_of_the_circuit_is_the_same_in_both_voltages_of_a_row() -> None:
+    def rows(*, noisy: bool) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        computer = SuspensionComputer("front")
+        rng = np.random.default_rng(1)
+        machine = NoisySuspension(computer, rng, op_amps=OP_AMP_GRADES["tl07x"]) if noisy else computer
+        return np.concatenate(list(machine.play(SQUARE, 100, (), 32, AHEAD_TICKS)))
+
+    noise_v = rows(noisy=True) - rows(noisy=False)
+    assert np.abs(noise_v[:, :4]).max() > 0.0
+    np.testing.assert_allclose(noise_v[:, :4], noise_v[:, 4:], rtol=0, atol=1e-14)
+
+
+def test_only_a_card_with_aperture_errors_looks_ahead() -> None:
+    assert ahead_ticks(Card()) == ahead_ticks(CARDS["skewed"]) == 0
+    assert ahead_ticks(CARDS["dt2821"]) / TICKS_PER_SAMPLE / RATE_HZ == pytest.approx(50e-9, rel=1e-3)
+    assert ahead_ticks(Card(aperture_jitter_s=1e-6, skew_s=(0.0, 1e-6, 0.0, 0.0))) == TICKS_PER_SAMPLE

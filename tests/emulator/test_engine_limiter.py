@@ -30,10 +30,8 @@ from analogrig_emulator import (
     to_spice,
 )
 from analogrig_emulator.circuit.nodal import Nodal
+from tests.emulator.plays import LSB_V, NgSpice
 
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
-
-LSB_V = 10.0 / 4096
 SOURCE = VoltageSource("V1", "in")
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from analogrig_emulator import (
     FRONT,
@@ -37,12 +35,7 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.pot import dial_for
-
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
-Volts = NDArray[np.float64]
-
-LSB_V = 10.0 / 4096
-SAMPLE_RATE_HZ = 20e3
+from tests.emulator.plays import LSB_V, SAMPLE_RATE_HZ, NgSpice, Volts
 
 programs = st.sampled_from((FRONT, SHOCK))
 factors = st.tuples(*[st.floats(0.5, 1.2)] * 3)

@@ -9,7 +9,6 @@ import pytest
 import scipy.integrate
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from analogrig_emulator import (
     TICKS_PER_SAMPLE,
@@ -28,10 +27,8 @@ from analogrig_emulator import (
     piecewise_linear,
 )
 from analogrig_emulator.circuit.nodal import Nodal
+from tests.emulator.plays import SAMPLE_RATE_HZ, Volts
 
-Volts = NDArray[np.float64]
-
-SAMPLE_RATE_HZ = 20e3
 NODES = ("u1", "u2", "u3", "u4", "u5", "wm", "wb", "wk")
 
 

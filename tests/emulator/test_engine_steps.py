@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg
-from numpy.typing import NDArray
 
 from analogrig_emulator import (
     TICKS_PER_SAMPLE,
@@ -28,9 +27,8 @@ from analogrig_emulator import (
     sample_plays,
 )
 from analogrig_emulator.engine import binding
+from tests.emulator.plays import Volts
 from tests.emulator.programs import circuit_of
-
-Volts = NDArray[np.float64]
 
 OVERLOAD = Excitation(low_v=-10.0, high_v=10.0)
 PRBS = Excitation(shape="prbs", frequency_hz=7e3, clock="free", phase=0.3)

@@ -21,9 +21,9 @@ from analogrig_emulator.lucidac.configuration import (
 )
 from analogrig_emulator.lucidac.lucidac_circuit import LucidacParts
 from analogrig_emulator.lucidac.machine import Lucidac
-from tests.emulator.conftest import NgSpice
 from tests.emulator.ideal_lucidac import ideal_solution
 from tests.emulator.lucidac_decks import ngspice_error_lsb
+from tests.emulator.plays import NgSpice
 
 Values = NDArray[np.float64]
 

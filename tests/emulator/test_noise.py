@@ -28,10 +28,10 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.machine.noise import BOLTZMANN_J_PER_K
+from tests.emulator.plays import LSB_V
 from tests.emulator.programs import circuit_of
 
 KT_J = BOLTZMANN_J_PER_K * (25.0 + 273.15)
-LSB_V = 10.0 / 4096
 TL07X = OP_AMP_GRADES["tl07x"]
 NODES = ("in", "u5", "u2", "u1")
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from analogrig_emulator import (
     MULTIPLIERS,
@@ -41,12 +39,8 @@ from analogrig_emulator.circuit.components import MULTIPLIER_GRADES, OP_AMP_GRAD
 from analogrig_emulator.circuit.spice import Accuracy
 from analogrig_emulator.engine import engine as engine_module
 from analogrig_emulator.engine.system import Law, Product
+from tests.emulator.plays import LSB_V, SAMPLE_RATE_HZ, NgSpice, Volts
 
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
-Volts = NDArray[np.float64]
-
-LSB_V = 10.0 / 4096
-SAMPLE_RATE_HZ = 20e3
 IDEAL, AD633, TL07X = MULTIPLIERS["ideal"], MULTIPLIERS["ad633"], preset("tl07x")
 FINE = Accuracy(reltol=1e-8, max_step_s=2e-6)
 AMPLIFIERS = ("u1", "u2", "u3", "u4", "m1", "m2")

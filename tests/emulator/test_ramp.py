@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from analogrig_emulator import (
@@ -28,10 +27,8 @@ from analogrig_emulator import (
     acquired,
     probes_per_sample,
 )
+from tests.emulator.plays import LSB_V, Volts
 
-Volts = NDArray[np.float64]
-
-LSB_V = 10.0 / 4096
 PERIOD_S = 50e-6
 BUSY = Excitation(low_v=1.0, high_v=9.0)
 K_RAMP: PotTurn = PotTurn(120, {"K": 18000.0}, 80)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,11 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from analogrig_emulator import Deck
+from tests.emulator.plays import LSB_V, NgSpice
 
 ROOT = Path(__file__).parents[2]
 README = "emulator/README.md"
 OWN_CIRCUIT = "harness/docs/howto/write-a-netlist.md"
-
-NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
-LSB_V = 10.0 / 4096
 
 
 def names_after(page: str) -> dict[str, Any]:

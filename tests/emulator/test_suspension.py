@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import scipy.signal
-from numpy.typing import NDArray
 
 from analogrig_emulator import (
     FRONT,
@@ -24,16 +23,7 @@ from analogrig_emulator import (
     ProgramCircuit,
     SuspensionComputer,
 )
-
-Volts = NDArray[np.float64]
-
-LSB_V = 10.0 / 4096
-THESIS_CHANGES: tuple[PotTurn, ...] = (
-    PotTurn(200, {"K": 18000.0}),
-    PotTurn(400, {"B": 3453.0}),
-    PotTurn(500, {"B": 2123.0, "K": 20000.0}),
-    PotTurn(600, {"M": 30.0}),
-)
+from tests.emulator.plays import LSB_V, THESIS_CHANGES, Volts
 
 
 def played(
