@@ -122,5 +122,6 @@ def test_fault_leads_to_the_same_over_a_real_line(
     case = Case(WireFaults((WireFault(kind, direction, number),)), link=link)
     open_line = opened.wire if link == "serial" else opened.bus
     is_process = not device.startswith("can:")
-    played = play(case, (lambda: IdleClocked(open_line())) if is_process else open_line, timeout_s=1.0)
+    idle_clocked, timeout_s = (lambda: IdleClocked(open_line())), 0.2  # whose time-outs depend on no load
+    played = play(case, idle_clocked, timeout_s) if is_process else play(case, open_line, timeout_s=1.0)
     assert played.outcome in documented(link)[kind, direction][step], played.why
