@@ -117,12 +117,21 @@ def of(kind: type[M], messages: Iterable[Message]) -> list[M]:
 
 
 @pytest.fixture
-def device() -> Device:
+def idle() -> Device:
+    device = Device()
+    device.tell(Identify(0))
+    return device
+
+
+def started() -> Device:
     """One that runs."""
     out = Device()
     out.tell(Identify(0))
     assert out.control(Command.START) == Result.APPLIED
     return out
+
+
+device = pytest.fixture(started)
 
 
 def codes(n: int, change_at: int | None = None) -> tuple[list[int], list[int]]:
@@ -278,32 +287,11 @@ def test_zero_of_the_force_is_taken_from_the_configuration(idle: Device) -> None
     assert said.extent == pytest.approx(0.8, rel=0.03)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{Key.ISOLATION: 0.0}, {Key.TRIGGER: float(Trigger.PREDICTION_ERROR), Key.CEILING: 12.0}],
-    ids=["switched off", "no cumulative sum"],
-)
-def test_nothing_is_diagnosed_where_it_is_off_or_cannot_be(idle: Device, settings: dict[Key, float]) -> None:
-    for key, value in settings.items():
-        assert idle.configure(key, value).result == Result.APPLIED
-    assert idle.control(Command.START) == Result.APPLIED
-    assert diagnosed(idle, *changed_codes({"K": 0.8})) == []
-
-
 def test_skipped_sample_after_the_alarm_leaves_it_undiagnosed(device: Device) -> None:
     u, y = changed_codes({"K": 0.8})
     answers = [message for k in range(len(u)) if k != CHANGED_AT + 8 for message in device.sample(k, u[k], y[k])]
     assert of(Alarm, answers)[0].sample_index < CHANGED_AT + 8
     assert of(Diagnosis, answers) == []
-
-
-def test_diagnosis_leaves_the_estimates_alone(idle: Device, device: Device) -> None:
-    u, y = changed_codes({"K": 0.8})
-    idle.configure(Key.ISOLATION, 0.0)
-    idle.control(Command.START)
-    with_it, without = ([m for k in range(len(u)) for m in each.sample(k, u[k], y[k])] for each in (device, idle))
-    assert of(Diagnosis, with_it)
-    assert np.array_equal(theta_of(with_it), theta_of(without))
 
 
 # ---- misfits
@@ -352,20 +340,44 @@ def test_start_begins_the_watch_anew(device: Device) -> None:
     assert [each._replace(seq=0) for each in misfits_of(device, u, y)] == [each._replace(seq=0) for each in before]
 
 
-@pytest.mark.parametrize("settings", [{Key.MISFIT: 0.0}, {Key.NA: 1.0, Key.C2: 0.0, Key.C1: -0.5}], ids=str)
-def test_fit_is_not_watched_where_it_is_off_or_cannot_be(idle: Device, settings: dict[Key, float]) -> None:
+ISOLATED, WATCHED = changed_codes({"K": 0.8}), hum_codes(3000, 3000)
+
+
+def sampled(device: Device, codes: tuple[list[int], list[int]]) -> list[Message]:
+    return [message for k, pair in enumerate(zip(*codes, strict=True)) for message in device.sample(k, *pair)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "codes", "settings"),
+    [
+        (Diagnosis, ISOLATED, {Key.ISOLATION: 0.0}),
+        (Diagnosis, ISOLATED, {Key.TRIGGER: float(Trigger.PREDICTION_ERROR), Key.CEILING: 12.0}),
+        (Misfit, WATCHED, {Key.MISFIT: 0.0}),
+        (Misfit, WATCHED, {Key.NA: 1.0, Key.C2: 0.0, Key.C1: -0.5}),
+    ],
+    ids=["no isolation", "no cumulative sum", "no watch", "first order"],
+)
+def test_diagnosis_or_watch_that_is_off_or_cannot_be_says_nothing(
+    idle: Device, kind: type[Message], codes: tuple[list[int], list[int]], settings: dict[Key, float]
+) -> None:
     for key, value in settings.items():
         assert idle.configure(key, value).result == Result.APPLIED
     assert idle.control(Command.START) == Result.APPLIED
-    assert misfits_of(idle, *hum_codes(3000, 3000)) == []
+    assert of(kind, sampled(idle, codes)) == []
 
 
-def test_watch_of_the_fit_leaves_the_estimates_alone(idle: Device, device: Device) -> None:
-    u, y = hum_codes(3000, 3000)
-    idle.configure(Key.MISFIT, 0.0)
+@pytest.mark.parametrize(
+    ("kind", "codes", "key"),
+    [(Diagnosis, ISOLATED, Key.ISOLATION), (Misfit, WATCHED, Key.MISFIT)],
+    ids=["fault", "fit"],
+)
+def test_diagnosis_and_watch_leave_the_estimates_alone(
+    idle: Device, device: Device, kind: type[Message], codes: tuple[list[int], list[int]], key: Key
+) -> None:
+    idle.configure(key, 0.0)
     idle.control(Command.START)
-    with_it, without = ([m for k in range(len(u)) for m in each.sample(k, u[k], y[k])] for each in (device, idle))
-    assert of(Misfit, with_it)
+    with_it, without = sampled(device, codes), sampled(idle, codes)
+    assert of(kind, with_it)
     assert np.array_equal(theta_of(with_it), theta_of(without))
 
 
@@ -399,9 +411,7 @@ def blocks(u: list[int], y: list[int], missing: list[bool], size: int) -> Iterat
 def test_block_is_answered_as_its_samples_would_be(device: Device, size: int) -> None:
     u, y = codes(200, change_at=120)
     missing = [k % 31 == 7 for k in range(200)]
-    one_by_one = Device()
-    one_by_one.tell(Identify(0))
-    one_by_one.control(Command.START)
+    one_by_one = started()
     single = [m for k in range(200) for m in one_by_one.sample(k, u[k], y[k], missing=missing[k])]
     assert [m for block in blocks(u, y, missing, size) for m in device.tell(block)] == single
 
@@ -429,9 +439,7 @@ def test_samples_before_start_and_after_stop_are_refused() -> None:
 
 def test_repeated_and_late_samples_are_counted_and_leave_theta_untouched(device: Device) -> None:
     u, y = codes(300)
-    clean = Device()
-    clean.tell(Identify(0))
-    clean.control(Command.START)
+    clean = started()
     disturbed: list[Message] = []
     for k in range(300):
         disturbed += device.sample(k, u[k], y[k])
@@ -475,9 +483,7 @@ def test_skipped_samples_are_missing_to_the_estimator(device: Device, estimator:
 
 def test_huge_gap_costs_bounded_time_and_gives_the_same_estimate(device: Device) -> None:
     u, y = codes(100)
-    other = Device()
-    other.tell(Identify(0))
-    other.control(Command.START)
+    other = started()
     last: list[list[Message]] = []
     for dut, gap in ((device, 1500), (other, 32000)):
         for k in range(50):
@@ -557,13 +563,6 @@ def current(device: Device, key: Key) -> float:
     answer = device.configure(key, math.nan)
     assert answer.result == Result.OUT_OF_RANGE
     return answer.value
-
-
-@pytest.fixture
-def idle() -> Device:
-    device = Device()
-    device.tell(Identify(0))
-    return device
 
 
 @pytest.mark.parametrize(("key", "value"), VALUES.items())

@@ -111,27 +111,31 @@ def test_page_of_many_false_alarms_changes_and_ramps_has_at_most_five_megabytes(
     assert "alarms are marked" in Page(page).text
 
 
-@pytest.mark.parametrize("name", ["force", "displacement", "velocity", "net_force", "statistic", "M"])
-def test_spike_of_a_single_sample_is_in_the_page_of_a_long_run(name: str) -> None:
-    at, samples = 123_457, 300_000
-    run = long_run(samples, false_alarms=0, changes=0)
-    signals = ("force", "displacement", "velocity", "net_force")
-    if name in signals:
-        run.codes[at, signals.index(name)] = 4090
-    elif name == "statistic":
-        run.statistic[at] = 9e3
-    else:
-        run.theta[at, 2:5] *= 0.9  # of the gain: mass and stiffness are more by a ninth
-    page = Page(render(run, judge(run)))
-    column = next(each for each in page.data()["columns"] if each["name"] == name)
-    shown = page.columns()[name]
-    if name in signals:
+SPIKE_AT, SPIKED_SAMPLES = 123_457, 300_000
+SIGNALS = ("force", "displacement", "velocity", "net_force")
+
+
+@pytest.fixture(scope="module")
+def spiked() -> Page:
+    """Page of a long run with a spike in every signal, of a single sample."""
+    run = long_run(SPIKED_SAMPLES, false_alarms=0, changes=0)
+    run.codes[SPIKE_AT] = 4090
+    run.statistic[SPIKE_AT] = 9e3
+    run.theta[SPIKE_AT, 2:5] *= 0.9  # of the gain: mass and stiffness are more by a ninth
+    return Page(render(run, judge(run)))
+
+
+@pytest.mark.parametrize("name", [*SIGNALS, "statistic", "M"])
+def test_spike_of_a_single_sample_is_in_the_page_of_a_long_run(spiked: Page, name: str) -> None:
+    column = next(each for each in spiked.data()["columns"] if each["name"] == name)
+    shown = spiked.columns()[name]
+    if name in SIGNALS:
         assert np.nanmax(shown) == pytest.approx(column["offset"] + column["scale"] * 4090)
     elif name == "statistic":
         assert np.nanmax(shown) == 9e3
     else:
         assert np.nanmax(np.abs(shown - FIRM.parameters()["M"])) > 5.0  # noise alone: less than 2 kg
-    assert len(shown) < 0.4 * samples
+    assert len(shown) < 0.4 * SPIKED_SAMPLES
 
 
 def test_clipped_and_missing_samples_are_in_the_page_of_a_long_run() -> None:
