@@ -42,9 +42,7 @@ from analogrig_emulator import (
 )
 from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.circuit.opamp import CLAMP_RATE, PRESETS
-from tests.emulator.plays import LSB_V
-
-from .conftest import NgSpice
+from tests.emulator.plays import LSB_V, NgSpice
 
 TL07X = PRESETS["tl07x"]
 

@@ -40,9 +40,7 @@ from analogrig_emulator import (
     to_spice,
 )
 from analogrig_emulator.circuit.circuit import Element
-from tests.emulator.plays import LSB_V
-
-from .conftest import NgSpice
+from tests.emulator.plays import LSB_V, NgSpice
 
 NETLIST: tuple[Element, ...] = (
     VoltageSource("F", "in"),

@@ -39,9 +39,7 @@ from analogrig_emulator import (
     piecewise_linear,
 )
 from analogrig_emulator.engine.system import Drive
-from tests.emulator.plays import AMPLIFIERS, LSB_V, Volts
-
-from .conftest import NgSpice
+from tests.emulator.plays import AMPLIFIERS, LSB_V, NgSpice, Volts
 
 RATE_HZ = 20e3
 
