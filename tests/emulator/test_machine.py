@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,29 +121,31 @@ def test_operate_integrates_from_the_initial_voltage() -> None:
     np.testing.assert_allclose(volts, 4.0 - 2.0 * coefficient * np.arange(10) * SAMPLE_S / 1e-3, rtol=0, atol=1e-9)
 
 
-def test_hold_holds_whatever_the_inputs_do() -> None:
-    computer = machine(ic_ohm=None)
-    computer.switch(HOLD)
-    np.testing.assert_allclose(computer.run(1000, level(10.0))[:, 0], 4.0, rtol=0, atol=1e-12)
+HELD_S: Volts = np.arange(1000) * SAMPLE_S
+BIAS = (VoltageSource("U1_minus_bias", "u1b", dc_v=-16.0), Resistor("U1_minus_ohm", "s", "u1b", 2e8))
+HELD: Mapping[str, tuple[Circuit, Volts]] = {
+    "whatever the inputs do": (integrator(), np.full(1000, 4.0)),
+    # In INITIAL CONDITION the leak is across the resistor.
+    "with a leaking capacitor": (
+        integrator([Resistor("RLEAK", "s", "out", 1e8)]),
+        4.0 * 1e8 / (1e8 + 10e3) * np.exp(-HELD_S / 1.0),
+    ),
+    # An input resistance to ground drains the capacitor through a junction that stands at -v / Avol.
+    "with an amplifier of little gain": (
+        integrator([Resistor("RIN", "s", "0", 1e6)], OpAmpModel(avol=1e4)),
+        4.0 / (1.0 + (2.0 + 10e3 / 1e6) / 1e4) * np.exp(-HELD_S / (1e6 * 10e-9 * (1e4 + 1))),
+    ),
+    # 80 nA into 10 nF are 8 V/s; -16 V behind 200 M is how such a current is wired.
+    "with a bias current": (integrator(BIAS), 4.0 + 80e-9 * 10e3 + 8.0 * HELD_S),
+}
 
 
-def test_hold_droops_by_the_leakage_of_the_capacitor() -> None:
-    computer = machine(integrator([Resistor("RLEAK", "s", "out", 1e8)]), ic_ohm=None)
-    computer.switch(HOLD)
-    volts = computer.run(1000, level(10.0))[:, 0]
-    start_v = 4.0 * 1e8 / (1e8 + 10e3)  # in INITIAL CONDITION the leak is across the resistor
-    np.testing.assert_allclose(volts, start_v * np.exp(-np.arange(1000) * SAMPLE_S / 1.0), rtol=0, atol=1e-9)
-
-
-def test_hold_droops_by_the_gain_of_the_amplifier() -> None:
-    """An input resistance to ground drains the capacitor through a junction that stands at -v / Avol."""
-    circuit = integrator([Resistor("RIN", "s", "0", 1e6)], OpAmpModel(avol=1e4))
+@pytest.mark.parametrize("name", HELD)
+def test_hold_holds_and_droops_by_its_parts_alone(name: str) -> None:
+    circuit, expected = HELD[name]
     computer = machine(circuit, ic_ohm=None)
     computer.switch(HOLD)
-    volts = computer.run(2000)[:, 0]
-    tau_s = 1e6 * 10e-9 * (1e4 + 1)
-    np.testing.assert_allclose(volts, volts[0] * np.exp(-np.arange(2000) * SAMPLE_S / tau_s), rtol=0, atol=1e-9)
-    assert volts[0] - volts[-1] > 1e-3
+    np.testing.assert_allclose(computer.run(1000, level(10.0))[:, 0], expected, rtol=0, atol=1e-9)
 
 
 def test_the_relays_may_switch_at_any_tick() -> None:
@@ -455,16 +458,6 @@ def test_a_pot_with_resistance_at_its_ends_is_read_at_its_terminals() -> None:
     assert computer.coefficient("P1") == pytest.approx(loaded, rel=1e-9)
 
 
-def test_hold_droops_by_the_bias_current_of_the_amplifier() -> None:
-    """80 nA into 10 nF are 8 V/s; -16 V behind 200 M is how such a current is wired."""
-    bias: list[Element] = [VoltageSource("U1_minus_bias", "u1b", dc_v=-16.0), Resistor("U1_minus_ohm", "s", "u1b", 2e8)]
-    computer = machine(integrator(bias), ic_ohm=None)
-    computer.switch(HOLD)
-    volts = computer.run(1000, level(10.0))[:, 0]
-    start_v = 4.0 + 80e-9 * 10e3
-    np.testing.assert_allclose(volts, start_v + 8.0 * np.arange(1000) * SAMPLE_S, rtol=0, atol=1e-9)
-
-
 def test_pot_set_sets_coefficients_under_load() -> None:
     computer = SuspensionComputer("front", rng=np.random.default_rng(1))
     computer.machine.switch(POT_SET)
@@ -507,18 +500,32 @@ def test_coefficients_are_for_pot_set_and_for_pots_that_are_there() -> None:
     assert computer.dials == {"P1": 0.5}
 
 
+AT_REST_V = {"U2": 0.0, "U3": 0.0}
+IMPOSSIBLE: Sequence[tuple[dict[str, Any], type[Exception], str]] = [
+    *(({"sample_rate_hz": each}, EngineError, "sample_rate_hz must be") for each in (math.nan, math.inf, 0.0)),
+    *(({"lamp_delay_s": each}, EngineError, "lamp_delay_s must be finite") for each in (math.nan, math.inf, -1.0)),
+    ({"ic_ohm": -1.0}, CircuitError, "ic_ohm must be positive"),
+    ({"readings": ["u5", "u9"]}, CircuitError, "readings: no node is called 'u9'; there are in, s1, u1"),
+    ({"initial_v": {"U2": 0.0}}, CircuitError, r"OpAmp U3 .* an integrator needs an initial voltage, if only U3: 0.0"),
+    ({"initial_v": AT_REST_V | {"U3": 50.0}}, CircuitError, "U3: initial voltage 50 V is beyond the reference of 10 V"),
+    ({"initial_v": AT_REST_V | {"U3": math.nan}}, CircuitError, "U3: initial voltage nan is not finite"),
+    ({"initial_v": {"U4": 1.0}}, CircuitError, r"OpAmp U4 \(0 s4 u4\): .* without a capacitor .* s4 and u4"),
+    ({"initial_v": {"U9": 1.0}}, CircuitError, "no amplifier is called 'U9'; there are U1, U2, U3, U4, U5"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "error", "message"), IMPOSSIBLE)
+def test_a_machine_that_cannot_be_is_refused(wrong: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        AnalogComputer(SuspensionComputer().circuit, **{"readings": ["u1"], "initial_v": AT_REST_V} | wrong)
+
+
 @pytest.mark.parametrize("initial_v", [{"U1": math.nan}, {"U2": 1.0}])
-def test_initial_voltages_that_cannot_be_are_refused(initial_v: Mapping[str, float]) -> None:
+def test_an_initial_voltage_that_cannot_be_is_refused_and_not_set(initial_v: Mapping[str, float]) -> None:
+    computer = machine(ic_ohm=None)
     with pytest.raises(CircuitError):
-        machine().set_initial(initial_v)
-    with pytest.raises(CircuitError, match="ic_ohm must be positive"):
-        machine(ic_ohm=-1.0)
-
-
-@pytest.mark.parametrize("rate_hz", [math.nan, math.inf, 0.0])
-def test_a_sample_rate_that_cannot_be_is_refused(rate_hz: float) -> None:
-    with pytest.raises(EngineError, match="sample_rate_hz must be positive and finite"):
-        AnalogComputer(SuspensionComputer().circuit, ["u1"], sample_rate_hz=rate_hz)
+        computer.set_initial(initial_v)
+    assert computer.read()["out"] == pytest.approx(4.0, abs=1e-12)
 
 
 def test_a_circuit_too_large_is_refused_before_its_patching_is_looked_at() -> None:
@@ -527,12 +534,6 @@ def test_a_circuit_too_large_is_refused_before_its_patching_is_looked_at() -> No
     circuit = Circuit([VoltageSource("V1", "n0"), *ladder, Resistor("Rend", "n4000", "0", 1.0)])
     with pytest.raises(CircuitError, match="4002 nodes and branches; the engine takes at most 640"):
         AnalogComputer(circuit, ["n1"])
-
-
-@pytest.mark.parametrize("delay_s", [math.nan, math.inf, -1.0])
-def test_a_lamp_delay_that_cannot_be_is_refused(delay_s: float) -> None:
-    with pytest.raises(EngineError, match="lamp_delay_s must be finite and not negative"):
-        AnalogComputer(SuspensionComputer().circuit, ["u1"], lamp_delay_s=delay_s)
 
 
 # ---- overload
@@ -653,16 +654,6 @@ def test_a_coefficient_is_read_beyond_the_wiper_whatever_its_load_is_called(load
     machine = AnalogComputer(Circuit(parts.fit(elements)), ["out"], components=parts)
     machine.switch(Mode.POT_SET)
     assert machine.coefficient("M") == pytest.approx(0.5 / 1.025 * 0.95, rel=1e-5)
-
-
-def test_integrator_whose_initial_voltage_was_forgotten_is_refused() -> None:
-    with pytest.raises(CircuitError, match=r"OpAmp U3 .* an integrator needs an initial voltage, if only U3: 0.0"):
-        AnalogComputer(SuspensionComputer("front").circuit, ["u3"], initial_v={"U2": 0.0})
-
-
-def test_initial_voltage_beyond_the_reference_is_refused() -> None:
-    with pytest.raises(CircuitError, match="integrator U3: initial voltage 50 V is beyond the reference of 10 V"):
-        AnalogComputer(SuspensionComputer("front").circuit, ["u3"], initial_v={"U2": 0.0, "U3": 50.0})
 
 
 # ---- overloads: the table of the background page on the circuit
