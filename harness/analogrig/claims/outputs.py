@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -104,15 +104,15 @@ def _forms(expected: Values, found: Values, all_found: Values) -> Iterator[tuple
     """Forms in which a value may arrive; ``expected`` and ``found`` are some of the values."""
     yield from _FORMS
     low, high = all_found.min(), all_found.max()
-    yield f"limited to {low:g} .. {high:g}", functools.partial(np.clip, a_min=low, a_max=high)
-    yield f"limited to {high:g}", functools.partial(np.minimum, high)
-    yield f"limited from {low:g} on", functools.partial(np.maximum, low)
+    yield f"limited to {low:g} .. {high:g}", partial(np.clip, a_min=low, a_max=high)
+    yield f"limited to {high:g}", partial(np.minimum, high)
+    yield f"limited from {low:g} on", partial(np.maximum, low)
     yield from _OVERFLOWS
     if (big := np.abs(expected) > 0.5 * np.abs(expected).max()).any():
         ratio = float(np.median(found[big] / expected[big]))
-        yield f"scaled by {ratio:.4g}", functools.partial(np.multiply, ratio)
+        yield f"scaled by {ratio:.4g}", partial(np.multiply, ratio)
     shift = float(np.median(found - expected))
-    yield f"shifted by {shift:.4g}", functools.partial(np.add, shift)
+    yield f"shifted by {shift:.4g}", partial(np.add, shift)
 
 
 def _unpadded(digits: int, rounding: Form) -> Form:
@@ -126,14 +126,6 @@ def _unpadded(digits: int, rounding: Form) -> Form:
     return form
 
 
-def _rounded(digits: int) -> Form:
-    return lambda x: np.round(x, digits)
-
-
-def _cut(digits: int) -> Form:
-    return lambda x: np.trunc(x * 10.0**digits) / 10.0**digits
-
-
 def _of_bits(change: Callable[[NDArray[np.uint32]], NDArray[Any]]) -> Form:
     """Change of the bits of the float."""
 
@@ -145,24 +137,21 @@ def _of_bits(change: Callable[[NDArray[np.uint32]], NDArray[Any]]) -> Form:
     return form
 
 
-def _overflowing(bits: int, unit: float, rounding: Form) -> Form:
-    """Signed whole number of so many bits that overflows."""
-    half = float(1 << bits - 1)
-    return lambda x: ((rounding(x * unit) + half) % (2.0 * half) - half) / unit
-
-
 _FORMS: Sequence[tuple[str, Form]] = (
     ("", np.asarray),
     ("with the other sign", np.negative),
-    *((f"scaled by {factor:g}", functools.partial(np.multiply, factor)) for factor in _FACTORS),
+    *((f"scaled by {factor:g}", partial(np.multiply, factor)) for factor in _FACTORS),
     ("without its sign", np.abs),
     ("without its sign between -1 and 0", lambda x: np.where(np.abs(x) < 1.0, np.abs(x), x)),
     *(
         (f"zeros after the point lost: {digits} digits printed as a whole number", _unpadded(digits, rounding))
         for digits, rounding in itertools.product((6, 5, 4, 3, 2), (np.rint, np.trunc))
     ),
-    *((f"rounded to {digits} digits after the point", _rounded(digits)) for digits in range(6)),
-    *((f"cut to {digits} digits after the point", _cut(digits)) for digits in range(6)),
+    *((f"rounded to {n} digits after the point", partial(lambda n, x: np.round(x, n), n)) for n in range(6)),
+    *(
+        (f"cut to {n} digits after the point", partial(lambda n, x: np.trunc(x * 10.0**n) / 10.0**n, n))
+        for n in range(6)
+    ),
     ("squared", np.square),
     ("of the square root", lambda x: np.sqrt(np.abs(x))),
     ("byte-swapped float", _of_bits(lambda bits: bits.byteswap())),
@@ -173,7 +162,15 @@ _FORMS: Sequence[tuple[str, Form]] = (
 )
 
 _OVERFLOWS: Sequence[tuple[str, Form]] = [
-    (f"in units of {1.0 / unit:g} that overflow {bits} bits", _overflowing(bits, unit, rounding))
+    (
+        f"in units of {1.0 / unit:g} that overflow {bits} bits",
+        partial(
+            lambda unit, rounding, half, x: ((rounding(x * unit) + half) % (2.0 * half) - half) / unit,
+            unit,
+            rounding,
+            float(1 << bits - 1),
+        ),
+    )
     for bits, unit, rounding in itertools.product((8, 16), _UNITS, (np.rint, np.trunc, np.floor))
 ]
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,15 +67,17 @@ def code_hypotheses() -> Iterator[Suspect]:
     for (cause, change), (names, what) in itertools.product(_CHANGES.items(), _WHICH.items()):
         yield Suspect(f"{what} {cause}", changed(names, change))
     for (cause, test), (names, what) in itertools.product(_TESTS.items(), _WHICH.items()):
-        where = _any(names, test)
+        where = partial(
+            lambda names, test, feed: np.any([test(getattr(feed, each)) for each in names], axis=0), names, test
+        )
         samples = f"where {what.replace('and', 'or')} {cause}"
         yield Suspect(f"samples treated as missing {samples}", on(where, treat_as_missing))
         yield Suspect(f"samples lost {samples}", on(where, Feed.without))
     for name, (cause, step) in itertools.product(_BOTH, _MISALIGNED.items()):
-        yield Suspect(f"{name} read one byte off: {cause}", _misread(name, step))
+        yield Suspect(f"{name} read one byte off: {cause}", partial(_misread, name, step))
     for names, what in _WHICH.items():
         cause = f"repeated values of {what} lost: a sample equal to the one before is taken for a repetition"
-        yield Suspect(cause, _without_repetitions(names))
+        yield Suspect(cause, on(partial(_are_repeated, names), Feed.without))
 
 
 def unit_hypotheses(channels: Mapping[str, Channel]) -> Iterator[Suspect]:
@@ -87,9 +89,8 @@ def unit_hypotheses(channels: Mapping[str, Channel]) -> Iterator[Suspect]:
             by = factor or channel.unit_per_v
             scales[name] = np.float32(channel.lsb_v * by), np.float32(zero * channel.low_v * by)
         for names, what in _WHICH.items():
-            yield Suspect(
-                f"{what} in {unit}{offset} instead of codes", _in_units({name: scales[name] for name in names})
-            )
+            chosen = {name: scales[name] for name in names}
+            yield Suspect(f"{what} in {unit}{offset} instead of codes", partial(_rescaled, chosen))
 
 
 # ------------------------------------------------------------------------------------------------------ building blocks
@@ -218,16 +219,12 @@ def _after_valid(feed: Feed) -> Mask:
     return np.concatenate([[True], feed.valid[:-1]])
 
 
-def _ends_of_gaps(length: int) -> Where:
+def _ends_of_gaps(length: int, feed: Feed) -> Mask:
     """Valid steps after a gap of at least so many."""
-
-    def where(feed: Feed) -> Mask:
-        index = np.arange(len(feed.u))
-        last = np.maximum.accumulate(np.where(feed.valid, index, -1))
-        since = index - np.concatenate([[-1], last[:-1]]) - 1
-        return np.asarray(feed.valid & (since >= length))
-
-    return where
+    index = np.arange(len(feed.u))
+    last = np.maximum.accumulate(np.where(feed.valid, index, -1))
+    since = index - np.append(-1, last[:-1]) - 1
+    return np.asarray(feed.valid & (since >= length))
 
 
 _AS_MEASURED = "missing samples treated as measured"
@@ -246,26 +243,18 @@ _MISSING: Mapping[str, Alter] = {
     ),
     "the mark of a missing sample is one sample late": lambda feed: feed.altered(valid=_after_valid(feed)),
     "the mark of a missing sample is one sample early": lambda feed: feed.altered(valid=_following(feed.valid)),
-    "reset after each gap": on(_ends_of_gaps(1), _reset),
-    **{f"reset after each gap of {n} samples or more": on(_ends_of_gaps(n), _reset) for n in _LONG_GAPS_N},
-    **_treated("sample after each gap", _ends_of_gaps(1)),
+    "reset after each gap": on(partial(_ends_of_gaps, 1), _reset),
+    **{f"reset after each gap of {n} samples or more": on(partial(_ends_of_gaps, n), _reset) for n in _LONG_GAPS_N},
+    **_treated("sample after each gap", partial(_ends_of_gaps, 1)),
     **_treated("sample before each gap", lambda feed: np.asarray(feed.valid & ~np.append(feed.valid[1:], True))),
 }
 
 # ---------------------------------------------------------------------------------------------------- order of samples
 
 
-def _late(names: Sequence[str], by: int, fill: float | None) -> Alter:
-    def shifted(x: Codes) -> Codes:
-        head = np.full(by, x[0] if fill is None else fill, np.float32)
-        return np.concatenate([head, x[:-by]])[: len(x)]
-
-    def alter(feed: Feed) -> Feed:
-        late = changed(names, shifted)(feed)
-        is_marked_late = len(names) > 1
-        return late.altered(valid=[*[True] * by, *feed.valid[:-by]][: len(feed.u)]) if is_marked_late else late
-
-    return alter
+def _late(names: Sequence[str], by: int, fill: float | None, feed: Feed) -> Feed:
+    late = changed(names, lambda x: np.append(np.full(by, x[0] if fill is None else fill), x[:-by])[: len(x)])(feed)
+    return late.altered(valid=[*[True] * by, *feed.valid[:-by]][: len(feed.u)]) if len(names) > 1 else late
 
 
 def _pairs_reversed(feed: Feed) -> Feed:
@@ -288,7 +277,7 @@ _ORDER: Sequence[tuple[str, Alter]] = (
     ("u taken for y", lambda feed: feed.altered(y=feed.u)),
     ("y taken for u", lambda feed: feed.altered(u=feed.y)),
     *(
-        (f"{late}: {what} of an earlier sample", _late(names, by, fill))
+        (f"{late}: {what} of an earlier sample", partial(_late, names, by, fill))
         for by, late in ((1, "one sample late"), (2, "two samples late"), (3, "three samples late"))
         for names, what in _OF.items()
         for fill in (None, 0.0)
@@ -304,32 +293,30 @@ _ORDER: Sequence[tuple[str, Alter]] = (
 def _in_cycles(cycle: int) -> dict[str, Alter]:
     found: dict[str, Alter] = {}
     for phase in (0, -1):
-        which = f"each {cycle}th sample ({cycle + phase}, {2 * cycle + phase}, ...)"
-        found |= _treated(which, _each(cycle, phase))
-        found[f"reset at {which}"] = on(_each(cycle, phase), _reset)
-
-    def beyond(feed: Feed) -> Mask:
-        return _since_restart(feed) >= cycle
+        which, where = (
+            f"each {cycle}th sample ({cycle + phase}, {2 * cycle + phase}, ...)",
+            partial(_each, cycle, phase),
+        )
+        found |= {**_treated(which, where), f"reset at {which}": on(where, _reset)}
 
     def gap_each(feed: Feed) -> Feed:
-        times = 1 + _each(cycle, 0)(feed) * _GAP_N
+        times = 1 + _each(cycle, 0, feed) * _GAP_N
         longer = feed.times(times)
         return longer.altered(valid=longer.valid & longer.at(*np.cumsum(times) - 1))
 
     return {
         **found,
-        f"nothing entered after {cycle} samples": on(beyond, Feed.without),
-        f"samples treated as missing after {cycle} samples": on(beyond, treat_as_missing),
+        f"nothing entered after {cycle} samples": lambda feed: feed.without(_since_restart(feed) >= cycle),
+        f"samples treated as missing after {cycle} samples": (
+            lambda feed: treat_as_missing(feed, _since_restart(feed) >= cycle)
+        ),
         f"a gap taken for where the index wraps at {cycle}": gap_each,
     }
 
 
-def _each(cycle: int, phase: int) -> Where:
-    def where(feed: Feed) -> Mask:
-        index = _since_restart(feed)
-        return np.asarray((index > 0) & ((index - phase) % cycle == 0))
-
-    return where
+def _each(cycle: int, phase: int, feed: Feed) -> Mask:
+    index = _since_restart(feed)
+    return np.asarray((index > 0) & ((index - phase) % cycle == 0))
 
 
 # ---------------------------------------------------------------------------------------------------------------- codes
@@ -348,41 +335,26 @@ def torn(now: Codes, other: Codes, mask: int) -> Codes:
     return (now.astype(np.int64) & ~mask | other.astype(np.int64) & mask).astype(np.float32)
 
 
-def _torn_with(neighbour: Change, mask: int) -> Change:
-    return lambda x: torn(x, neighbour(x), mask)
+def _signed(half: int, x: Codes) -> Codes:
+    return ((x.astype(np.int64) + half & 2 * half - 1) - half).astype(np.float32)
 
 
-def _whole(change: Callable[[NDArray[np.int64]], NDArray[np.int64]]) -> Change:
-    """Change of the codes as whole numbers."""
-    return lambda x: change(x.astype(np.int64)).astype(np.float32)
+def _shifted(right: int, left: int, x: Codes) -> Codes:
+    return (x.astype(np.int64) >> right << left).astype(np.float32)
 
 
-def _signed(bits: int) -> Change:
-    return _whole(lambda x: (x + (1 << bits - 1) & (1 << bits) - 1) - (1 << bits - 1))
+def _remainder(of: float, x: Codes) -> Codes:
+    return np.remainder(x, np.float32(of))
 
 
-def _shifted(right: int, left: int) -> Change:
-    return _whole(lambda x: x >> right << left)
+def _first_digits(digits: int, x: Codes) -> Codes:
+    length = np.floor(np.log10(np.maximum(x, 1.0).astype(np.float64)) + 1e-12) + 1.0
+    return np.floor(x / 10.0 ** np.maximum(length - digits, 0.0)).astype(np.float32)
 
 
-def _remainder(of: float) -> Change:
-    return lambda x: np.remainder(x, np.float32(of))
-
-
-def _first_digits(digits: int) -> Change:
-    def change(x: Codes) -> Codes:
-        length = np.floor(np.log10(np.maximum(x, 1.0).astype(np.float64)) + 1e-12) + 1.0
-        return np.floor(x / 10.0 ** np.maximum(length - digits, 0.0)).astype(np.float32)
-
-    return change
-
-
-def _averaged(number: int) -> Change:
-    def change(x: Codes) -> Codes:
-        padded = np.concatenate([np.repeat(x[:1], number - 1), x]).astype(np.float64)
-        return (np.convolve(padded, np.ones(number), "valid") / number).astype(np.float32)
-
-    return change
+def _averaged(number: int, x: Codes) -> Codes:
+    padded = np.concatenate([np.repeat(x[:1], number - 1), x]).astype(np.float64)
+    return (np.convolve(padded, np.ones(number), "valid") / number).astype(np.float32)
 
 
 _NEIGHBOURS: Mapping[str, Change] = {
@@ -392,49 +364,47 @@ _NEIGHBOURS: Mapping[str, Change] = {
 }
 
 _CHANGES: Mapping[str, Change] = {
-    **{f"scaled by {factor:g}": functools.partial(np.multiply, np.float32(factor)) for factor in _SCALES},
-    **{f"shifted by {offset:g} codes": functools.partial(np.add, np.float32(offset)) for offset in _OFFSETS},
+    **{f"scaled by {factor:g}": partial(np.multiply, np.float32(factor)) for factor in _SCALES},
+    **{f"shifted by {offset:g} codes": partial(np.add, np.float32(offset)) for offset in _OFFSETS},
     f"inverted: {_TOP} - code": lambda x: _TOP - x,
     # where several agree, that of the converter
-    **{f"read as signed codes of {bits} bits": _signed(bits) for bits in (12, 16, 13, 11, 10, 8)},
-    **{f"cut to the low {bits} bits: the code overflows": _remainder(1 << bits) for bits in (11, 10, 8)},
-    **{f"without the low {bits} bits": _shifted(bits, bits) for bits in (1, 2, 3, 4, 8)},
-    **{f"shifted right by {bits} bits": _shifted(bits, 0) for bits in (1, 2, 3, 4, 8)},
-    **{f"cut to the first {digits} digits": _first_digits(digits) for digits in (1, 2, 3)},
-    **{f"cut to the last {digits} digits": _remainder(10**digits) for digits in (1, 2, 3)},
+    **{f"read as signed codes of {bits} bits": partial(_signed, 1 << bits - 1) for bits in (12, 16, 13, 11, 10, 8)},
+    **{f"cut to the low {bits} bits: the code overflows": partial(_remainder, 1 << bits) for bits in (11, 10, 8)},
+    **{f"without the low {bits} bits": partial(_shifted, bits, bits) for bits in (1, 2, 3, 4, 8)},
+    **{f"shifted right by {bits} bits": partial(_shifted, bits, 0) for bits in (1, 2, 3, 4, 8)},
+    **{f"cut to the first {digits} digits": partial(_first_digits, digits) for digits in (1, 2, 3)},
+    **{f"cut to the last {digits} digits": partial(_remainder, 10**digits) for digits in (1, 2, 3)},
     "byte-swapped": lambda x: x.astype(np.uint16).byteswap().astype(np.float32),
-    **{f"limited to {limit}": functools.partial(np.minimum, np.float32(limit)) for limit in _LIMITS[:-1]},
+    **{f"limited to {limit}": partial(np.minimum, np.float32(limit)) for limit in _LIMITS[:-1]},
     "constant: the first sample for ever": lambda x: np.full_like(x, x[0]),
     "always 0": np.zeros_like,
-    **{f"averaged over {number} samples": _averaged(number) for number in (2, 3, 4, 8)},
+    **{f"averaged over {number} samples": partial(_averaged, number) for number in (2, 3, 4, 8)},
     **{
-        f"torn: {part} byte of the {which}, {rest} byte of this one": _torn_with(neighbour, mask)
+        f"torn: {part} byte of the {which}, {rest} byte of this one": partial(
+            lambda neighbour, mask, x: torn(x, neighbour(x), mask), neighbour, mask
+        )
         for mask, part, rest in ((HIGH, "high", "low"), (LOW, "low", "high"))
         for which, neighbour in _NEIGHBOURS.items()
     },
 }
 
 
-def _any(names: Sequence[str], test: Callable[[Codes], Mask]) -> Where:
-    return lambda feed: np.asarray(np.any([test(getattr(feed, name)) for name in names], axis=0))
+def _has_low_byte(values: Sequence[int], x: Codes) -> Mask:
+    return np.isin(x.astype(np.int64) & LOW, values)
 
 
-def _has_low_byte(values: Sequence[int]) -> Callable[[Codes], Mask]:
-    return lambda x: np.isin(x.astype(np.int64) & LOW, values)
-
-
-def _has_byte(values: Sequence[int]) -> Callable[[Codes], Mask]:
-    return lambda x: _has_low_byte(values)(x) | np.isin(x.astype(np.int64) >> 8, values)
+def _has_byte(values: Sequence[int], x: Codes) -> Mask:
+    return _has_low_byte(values, x) | np.isin(x.astype(np.int64) >> 8, values)
 
 
 _SPECIAL = {"of 0": (0,), "of a line end": (10, 13), "of 0 or a line end": (0, 10, 13)}
 """Bytes that a framing may give a meaning."""
 
 _TESTS: Mapping[str, Callable[[Codes], Mask]] = {
-    **{f"is {limit} or more": functools.partial(np.less_equal, np.float32(limit)) for limit in _LIMITS},
+    **{f"is {limit} or more": partial(np.less_equal, np.float32(limit)) for limit in _LIMITS},
     "is 0": lambda x: x == 0,
-    **{f"has a low byte {which}": _has_low_byte(values) for which, values in _SPECIAL.items()},
-    **{f"has a byte {which}": _has_byte(values) for which, values in _SPECIAL.items()},
+    **{f"has a low byte {which}": partial(_has_low_byte, values) for which, values in _SPECIAL.items()},
+    **{f"has a byte {which}": partial(_has_byte, values) for which, values in _SPECIAL.items()},
 }
 
 _MISALIGNED = {
@@ -444,21 +414,14 @@ _MISALIGNED = {
 """Readings one byte off, with the step through the high byte of u and the low byte of y from the low byte on."""
 
 
-def _misread(name: str, step: int) -> Alter:
-    def alter(feed: Feed) -> Feed:
-        low, high = (feed.u.astype(np.int64) >> 8 & LOW, feed.y.astype(np.int64) & LOW)[::step]
-        return feed.altered(**{name: low | high << 8})
-
-    return alter
+def _misread(name: str, step: int, feed: Feed) -> Feed:
+    low, high = (feed.u.astype(np.int64) >> 8 & LOW, feed.y.astype(np.int64) & LOW)[::step]
+    return feed.altered(**{name: low | high << 8})
 
 
-def _without_repetitions(names: Sequence[str]) -> Alter:
-    return lambda feed: feed.without(
-        np.all([np.concatenate([[False], np.diff(getattr(feed, name)) == 0]) for name in names], axis=0)
-    )
+def _are_repeated(names: Sequence[str], feed: Feed) -> Mask:
+    return np.all([np.append([False], np.diff(getattr(feed, name)) == 0) for name in names], axis=0)
 
 
-def _in_units(scales: Mapping[str, tuple[np.float32, np.float32]]) -> Alter:
-    return lambda feed: feed.altered(
-        **{name: getattr(feed, name) * factor + offset for name, (factor, offset) in scales.items()}
-    )
+def _rescaled(scales: Mapping[str, tuple[np.float32, np.float32]], feed: Feed) -> Feed:
+    return feed.altered(**{name: getattr(feed, name) * factor + zero for name, (factor, zero) in scales.items()})

@@ -6,21 +6,25 @@ input, and writes one line of JSON for each step to the descriptor that its argu
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import pickle
 import select
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from analogrig.errors import AnalogrigError
+from analogrig.testing.conformance.stimulus import Stimulus, play
 
 START_S = 60.0
 """Longest time to start Python and to connect to the device."""
@@ -44,104 +48,98 @@ class Alone:
     """Reason why there are no results; empty if there are."""
 
 
-def play_alone(device: Mapping[str, Any], stimulus: Mapping[str, Any], limit_s: float) -> Alone:
+def play_alone(device: Mapping[str, Any], stimulus: Stimulus, limit_s: float) -> Alone:
     """Play a record on a device in a process of its own.
 
     :param device: description of the device in plain values.
-    :param stimulus: table of a ``Stimulus``.
     :param limit_s: longest time of one play.
     """
     readable, writable = os.pipe()
-    order = {"device": device, "stimulus": stimulus, "limit_s": limit_s, "path": sys.path}
-    with subprocess.Popen(
-        [sys.executable, "-m", __name__, str(writable)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        pass_fds=(writable,),
-        env={**os.environ, _MARK: uuid.uuid4().hex, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    ) as process:
-        os.close(writable)
-        stderr: list[bytes] = []
-        drain = threading.Thread(target=lambda: stderr.append(process.stderr.read() if process.stderr else b""))
-        drain.start()
-        try:
-            if process.stdin is not None:
-                process.stdin.write(json.dumps(order).encode())
-                process.stdin.close()
-            return _follow(readable, process, limit_s, stderr)
-        finally:
-            os.close(readable)
-            process.kill()
-            drain.join(START_S)
+    with tempfile.TemporaryFile() as order, tempfile.TemporaryFile() as stderr:
+        pickle.dump((json.dumps(device), stimulus, limit_s), order)
+        order.seek(0)
+        with subprocess.Popen(
+            [sys.executable, "-P", "-m", __name__, str(writable)],
+            stdin=order,
+            stdout=subprocess.DEVNULL,
+            stderr=stderr,
+            pass_fds=(writable,),
+            env={**os.environ, _MARK: uuid.uuid4().hex, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        ) as process:
+            os.close(writable)
+            try:
+                found, step = _follow(readable, limit_s)
+                if found is not None:
+                    return found
+                status = process.wait()
+            finally:
+                os.close(readable)
+                process.kill()
+        stderr.seek(0)
+        last = stderr.read().decode(errors="replace").strip().splitlines()[-1:]
+    how = signal.Signals(-status).name if status < 0 else f"status {status}"
+    return Alone(failure=f"ends its process with {how} while {step}{''.join(f': {each}' for each in last)}")
 
 
-def _follow(readable: int, process: subprocess.Popen[bytes], limit_s: float, stderr: list[bytes]) -> Alone:
-    """Results from the lines of the process."""
+def _follow(readable: int, limit_s: float) -> tuple[Alone | None, str]:
+    """Results from the lines of the process, None if it has ended before; and its last step."""
     digests: list[Mapping[str, str]] = []
     step, wait_s, buffer = "starting", START_S, b""
-    while True:
-        if not select.select([readable], [], [], wait_s)[0]:
-            return Alone(failure=f"hangs: {step} took longer than {wait_s:g} s")
-        received = os.read(readable, 1 << 16)
-        if not received:
-            status = process.wait()
-            how = signal.Signals(-status).name if status < 0 else f"status {status}"
-            last = b"".join(stderr).decode(errors="replace").strip().splitlines()[-1:]
-            return Alone(failure=f"ends its process with {how} while {step}{''.join(f': {each}' for each in last)}")
+    while select.select([readable], [], [], wait_s)[0]:
+        if not (received := os.read(readable, 1 << 16)):
+            return None, step
         *lines, buffer = (buffer + received).split(b"\n")
         for line in lines:
             match json.loads(line):
                 case {"failure": failure}:
-                    return Alone(failure=f"fails while {step}: {failure}")
+                    return Alone(failure=f"fails while {step}: {failure}"), step
                 case {"left": left}:
-                    return Alone(tuple(digests), tuple(left))
+                    return Alone(tuple(digests), tuple(left)), step
                 case {"digests": played}:
                     digests.append(played)
                 case {"step": step}:
                     wait_s = START_S if step == "connecting" else 2.0 * limit_s
+    return Alone(failure=f"hangs: {step} took longer than {wait_s:g} s"), step
 
 
 # ------------------------------------------------------------------------------------------------- the process itself
 
 
 def _main(fd: int) -> None:
-    order = json.load(sys.stdin)
-    sys.path[:] = order["path"]
+    device, stimulus, limit_s = pickle.load(sys.stdin.buffer)  # noqa: S301 - written by play_alone
     os.set_inheritable(fd, False)  # noqa: FBT003 - Python's name is a positional parameter
 
     def tell(**line: Any) -> None:
         os.write(fd, json.dumps(line).encode() + b"\n")
 
     try:
-        tell(left=_left_after_rounds(order, tell))
+        left = _left_after_rounds(lambda: _play(json.loads(device), stimulus, limit_s, tell))
+        tell(step="ending the device's processes")
+        tell(left=[*left, *_processes_left(limit_s)])
     except AnalogrigError as error:
         tell(failure=str(error))
 
 
-def _left_after_rounds(order: Mapping[str, Any], tell: Any) -> list[str]:
+def _left_after_rounds(play_round: Callable[[], None]) -> list[str]:
     """Open, play and close until a round leaves nothing; the first round, which may fill caches, does not count."""
     left: dict[str, set[str]] = {}
     for number in range(_MOST_ROUNDS):
         before = _resources()
-        _play(order, tell)
+        play_round()
         left = {kind: held - before[kind] for kind, held in _resources().items() if number < 2 or left.get(kind)}
         if number and not any(left.values()):
             break
-    tell(step="ending the device's processes")
-    names = [f"{kind} {name}" for kind, held in left.items() for name in sorted(held)]
-    return [*names, *_processes_left(order["limit_s"])]
+    return [f"{kind} {name}" for kind, held in left.items() for name in sorted(held)]
 
 
-def _play(order: Mapping[str, Any], tell: Any) -> None:
+def _play(description: Mapping[str, Any], stimulus: Stimulus, limit_s: float, tell: Callable[..., None]) -> None:
     from analogrig.devices.registry import recorded
-    from analogrig.testing.conformance.stimulus import Stimulus, play
 
     tell(step="connecting")
-    with recorded(order["device"]).connect() as device:
+    with recorded(description).connect() as device:
         tell(step="playing")
-        device.limit(order["limit_s"])
-        tell(digests=play(device, Stimulus.from_table(order["stimulus"])).digests())
+        device.limit(limit_s)
+        tell(digests=play(device, stimulus).digests)
         tell(step="closing")
 
 
@@ -155,35 +153,20 @@ def _resources() -> dict[str, set[str]]:
 
 
 def _processes_left(limit_s: float) -> list[str]:
-    """Marked processes that do not end in time, beside this one."""
-    until_s = time.monotonic() + limit_s
-    left = {pid: name for pid, name in _marked().items() if not _ends(pid, until_s)}
-    return [f"process {pid} ({name})" for pid, name in left.items()]
-
-
-def _marked() -> dict[int, str]:
-    """Names of the marked processes beside this one, by number."""
+    """Marked processes beside this one that do not end in time."""
     mark = f"{_MARK}={os.environ[_MARK]}".encode()
-    found = {}
+    until_s = time.monotonic() + limit_s
+    left = []
     for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if int(process.name) != os.getpid() and mark in (process / "environ").read_bytes():
-                found[int(process.name)] = (process / "comm").read_text().strip()
-        except OSError:  # it has just ended, or belongs to somebody else
-            continue
-    return found
-
-
-def _ends(pid: int, until_s: float) -> bool:
-    """True if a process ends in time, or has ended."""
-    try:
-        fd = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        return bool(select.select([fd], [], [], max(0.0, until_s - time.monotonic()))[0])
-    finally:
-        os.close(fd)
+        pid = int(process.name)
+        with contextlib.suppress(OSError):  # it has just ended, or belongs to somebody else
+            if pid != os.getpid() and mark in (process / "environ").read_bytes():
+                name = (process / "comm").read_text().strip()
+                fd = os.pidfd_open(pid)
+                if not select.select([fd], [], [], max(0.0, until_s - time.monotonic()))[0]:
+                    left.append(f"process {pid} ({name})")
+                os.close(fd)
+    return left
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
+from analogrig.answers import Answers, Samples
 from analogrig.datasheet import Datasheet
 from analogrig.devices.device import Device
 from analogrig.rigs.description import open_rig
@@ -21,8 +22,6 @@ from analogrig.scenario import PotChange, Scenario
 
 SAMPLES_N, CHANGE_AT, BLOCK_N = 800, 640, 97
 """Samples of a record, sample of its change, and usual length of a block: a prime, so that none fits a buffer."""
-
-_ARRAYS = ("flags", "theta", "innovation", "statistic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +37,8 @@ class Stimulus:
     @classmethod
     def of_plant(cls, seed: int) -> Self:
         """Samples of the emulated computer, whose plant changes after the warm-up of most devices."""
-        scenario = Scenario.load("healthy")
         changes = (PotChange(CHANGE_AT, {"M": 60.0, "K": 18_000.0}),)
-        scenario = dataclasses.replace(scenario, samples=SAMPLES_N, changes=changes)
+        scenario = dataclasses.replace(Scenario.load("healthy"), samples=SAMPLES_N, changes=changes)
         with open_rig("emulator") as rig:
             performance = rig.perform(scenario, seed)
             parts = [block.samples() for block in performance.blocks]
@@ -66,18 +64,6 @@ class Stimulus:
             yield Samples(first, self.u[here], self.y[here], self.valid[here])
             first += length
 
-    def as_table(self) -> dict[str, Any]:
-        """Plain values, from which ``from_table`` makes the same."""
-        channels = {name: dataclasses.asdict(channel) for name, channel in self.channels.items()}
-        arrays = {name: getattr(self, name).tolist() for name in ("u", "y", "valid")}
-        return {"channels": channels, "period_s": self.period_s, **arrays}
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any]) -> Self:
-        channels = {name: Channel(**channel) for name, channel in table["channels"].items()}
-        u, y = (np.array(table[name], np.uint16) for name in ("u", "y"))
-        return cls(channels, table["period_s"], u, y, np.array(table["valid"], np.bool_))
-
 
 @dataclass(frozen=True, eq=False)
 class Answered:
@@ -88,38 +74,18 @@ class Answered:
     """Answers as they came."""
     counters: Mapping[str, int]
 
-    def array(self, name: str) -> NDArray[Any] | None:
-        """An array of the answers over the record; None if it is not reported."""
-        found = [getattr(part, name) for part in self.parts]
-        return None if not found or any(each is None for each in found) else np.concatenate(found)
+    @functools.cached_property
+    def whole(self) -> Answers:
+        return Answers.joined(self.parts)
 
-    @property
-    def alarms(self) -> tuple[RaisedAlarm, ...]:
-        return tuple(RaisedAlarm(*each) for part in self.parts for each in part.alarms.tolist())
-
-    @property
-    def diagnoses(self) -> tuple[ReportedDiagnosis, ...]:
-        return tuple(ReportedDiagnosis(*each) for part in self.parts for each in part.diagnoses.tolist())
-
-    @property
-    def misfits(self) -> tuple[ReportedMisfit, ...]:
-        return tuple(ReportedMisfit(*each) for part in self.parts for each in part.misfits.tolist())
-
-    @property
-    def alarm_indices(self) -> list[int]:
-        return [alarm.index for alarm in self.alarms]
-
+    @functools.cached_property
     def digests(self) -> dict[str, str]:
         """SHA-256 of each quantity over the record; empty if it is not reported."""
-        arrays = {name: self.array(name) for name in _ARRAYS}
-        found = {name: "" if each is None else _digest(each.tobytes()) for name, each in arrays.items()}
-        events = {"alarms": self.alarms, "diagnoses": self.diagnoses, "misfits": self.misfits}
-        rows = {name: [tuple(map(float, vars(each).values())) for each in every] for name, every in events.items()}
-        return found | {name: _digest(repr(each).encode()) for name, each in rows.items()}
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
+        quantities = {each.name: getattr(self.whole, each.name) for each in dataclasses.fields(Answers)}
+        return {
+            name: "" if each is None else hashlib.sha256(each.tobytes()).hexdigest()
+            for name, each in quantities.items()
+        }
 
 
 def begin(device: Device, stimulus: Stimulus) -> None:
@@ -138,9 +104,3 @@ def finish(device: Device, answers: Iterable[Answers]) -> Answered:
     """Collect the answers of a record, and end it."""
     parts = tuple(answers)
     return Answered(device.datasheet, parts, device.stop())
-
-
-def settle(device: Device) -> None:
-    """Bring a device that was left in the middle of a record to the state of the first one."""
-    device.recover()
-    device.configure()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,9 @@ from analogrig.devices.device import Device, DeviceDescription
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.judging.bursts import BURST, lower_count
-from analogrig.judging.exposure import Exposure, exposure, until_latched
+from analogrig.judging.exposure import exposure, until_latched
 from analogrig.judging.statistics import Decision, SequentialTest, lower_rate
 from analogrig.judging.verdict import judge, unreported
-from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run
@@ -71,22 +70,12 @@ def is_playable(rig: Rig, scenario: Scenario) -> bool:
     return True
 
 
-def _play_all(play: Play, scenario: Scenario, seed: int, plays: int) -> list[Played]:
-    return [play(scenario, seed + number, allow_inconclusive=True) for number in range(plays)]
-
-
-def _play_valid(play: Play, scenario: Scenario, seed: int) -> Played:
+def play_valid(play: Play, scenario: Scenario, seed: int) -> Played:
     """:raises Inconclusive: the play is not valid."""
     played = play(scenario, seed, allow_inconclusive=True)
-    _check_valid(played)
+    if not played.verdict.valid:
+        raise Inconclusive(played.verdict.reasons[0], played.run)
     return played
-
-
-def _check_valid(*plays: Played) -> None:
-    """:raises Inconclusive: a play is not valid."""
-    for played in plays:
-        if not played.verdict.valid:
-            raise Inconclusive(played.verdict.reasons[0], played.run)
 
 
 # --------------------------------------------------------------------------------------------------------- false alarms
@@ -105,7 +94,7 @@ def rate_of_plays_below(
     or_misfit: bool = False,
 ) -> Finding:
     """Finding of ``analogrig.testing.one_play.rate_below`` for a given number of plays."""
-    played = _play_all(play, scenario, seed, plays)
+    played = [play(scenario, seed + number, allow_inconclusive=True) for number in range(plays)]
     return rate_below(rate, played, confidence=confidence, burst=burst, or_misfit=or_misfit)
 
 
@@ -117,23 +106,14 @@ def false_alarms_at_most(
 
     Each trial takes ``samples_each`` samples.
     """
-    bench = _direct_bench(play, f"takes {samples} samples: analogrig certify")
-    scenario = dataclasses.replace(scenario, samples=samples_each)
-    alarms: list[NDArray[np.int64]] = []
-    armed = 0
-    while armed < samples:
-        found, shown = _count_alarms(bench, scenario, seed + len(alarms))
-        alarms.append(found)
-        armed += shown.armed
-        if shown.lack_of_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
-            why = shown.lack_of_evidence or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
-            raise Inconclusive(why)
-    count = sum(map(len, alarms))
-    why = f"{count} false alarms in {armed} samples, allowed {allowed}"
-    if count <= allowed:
-        return Finding(holds=True, why=why)
-    most = _with_most(alarms)
-    return _witness(play, scenario, seed + most, alarms[most], why)
+    most = _MOST_UNARMED * samples // samples_each
+    trials = ((dataclasses.replace(scenario, samples=samples_each), seed + number) for number in range(most))
+    found = _count_alarms(play, f"takes {samples} samples: analogrig certify", trials, enough=samples)
+    if found.armed < samples:
+        raise Inconclusive(found.why_not)
+    count = found.alarms_n
+    why = f"{count} false alarms in {found.armed} samples, allowed {allowed}"
+    return Finding(holds=True, why=why) if count <= allowed else found.witness(play, why)
 
 
 @experiment
@@ -146,50 +126,66 @@ def false_alarms_of_plants_rarer(
     """
     from analogrig.testing.strategies import random_suspensions
 
-    bench = _direct_bench(play, f"takes {plants * samples_each} samples: analogrig campaign")
     scenario = dataclasses.replace(scenario, samples=samples_each)
-    drawn = [scenario.with_plant(plant) for plant in random_suspensions(plants, seed)]
-    alarms, shown = zip(*(_count_alarms(bench, each, seed) for each in drawn), strict=True)
-    if nothing := next((each.lack_of_evidence for each in shown if each.lack_of_evidence), ""):
-        raise Inconclusive(nothing)
-    count, samples = sum(map(len, alarms)), sum(each.armed for each in shown)
-    low = lower_count(count, confidence, BURST) / samples
-    why = f"{count} false alarms in {samples} samples: the rate is at least {low:.2g} per sample, allowed {rate:g}"
-    if _MOST_UNARMED * samples < plants * samples_each:
-        raise Inconclusive(f"the trigger was armed in {samples} of {plants * samples_each} samples")
-    if low <= rate:
-        return Finding(holds=True, why=why)
-    most = _with_most(alarms)
-    return _witness(play, drawn[most], seed, alarms[most], why)
+    trials = ((scenario.with_plant(plant), seed) for plant in random_suspensions(plants, seed))
+    found = _count_alarms(play, f"takes {plants * samples_each} samples: analogrig campaign", trials)
+    if _MOST_UNARMED * found.armed < plants * samples_each:
+        raise Inconclusive(found.why_not)
+    count = found.alarms_n
+    low = lower_count(count, confidence, BURST) / found.armed
+    why = f"{count} false alarms in {found.armed} samples: the rate is at least {low:.2g} per sample, allowed {rate:g}"
+    return Finding(holds=True, why=why) if low <= rate else found.witness(play, why)
 
 
-def _direct_bench(play: Play, otherwise: str) -> Bench:
-    return direct_bench(*_in_this_process(play, otherwise), alarms_only=True)
+@dataclasses.dataclass
+class _Alarms:
+    """Alarms in many trials, and their exposure."""
+
+    trials: list[tuple[Scenario, int, NDArray[np.int64]]]
+    """Scenario, seed, and samples with an alarm."""
+    armed: int = 0
+
+    @property
+    def alarms_n(self) -> int:
+        return sum(len(alarms) for _, _, alarms in self.trials)
+
+    @property
+    def why_not(self) -> str:
+        """Reason why zero alarms prove nothing."""
+        samples = sum(scenario.samples for scenario, _, _ in self.trials)
+        return f"the trigger was armed in {self.armed} of {samples} samples"
+
+    def witness(self, play: Play, why: str) -> Finding:
+        """Failed finding with the play of most alarms, which leaves a recording."""
+        scenario, seed, alarms = max(self.trials, key=lambda each: len(each[2]))
+        samples = max(_WITNESS_N, int(alarms[0]) + _AFTER_N if len(alarms) else 0)
+        short = dataclasses.replace(scenario, samples=min(samples, scenario.samples))
+        return Finding(holds=False, why=why, run=play(short, seed, allow_inconclusive=True).run)
 
 
-def _count_alarms(bench: Bench, scenario: Scenario, seed: int) -> tuple[NDArray[np.int64], Exposure]:
-    """Samples with an alarm, and the exposure of the play."""
-    run = raise_if_interrupted(bench.play(scenario, seed))
-    return until_latched(run).alarm_index, exposure(run)
+def _count_alarms(
+    play: Play, otherwise: str, trials: Iterable[tuple[Scenario, int]], enough: float = math.inf
+) -> _Alarms:
+    """Alarms of trials without a line, until the trigger was armed in ``enough`` samples.
 
+    The test is skipped unless such trials equal those on the bench.
 
-def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
-    """Rig and device, if trials without a line equal those on the bench; else the test is skipped."""
+    :raises Inconclusive: a trial could raise no alarm.
+    """
     rig, device = play.bench.rig, device_description(play.bench.dut)
     if not can_be_direct(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --hil-dut inproc, not {play.bench.dut.name}")
-    return rig, device
-
-
-def _with_most(alarms: Sequence[NDArray[np.int64]]) -> int:
-    return int(np.argmax([len(each) for each in alarms]))
-
-
-def _witness(play: Play, scenario: Scenario, seed: int, alarms: NDArray[np.int64], why: str) -> Finding:
-    """Failed finding with a play that leaves a recording."""
-    samples = max(_WITNESS_N, int(alarms[0]) + _AFTER_N if len(alarms) else 0)
-    witness = dataclasses.replace(scenario, samples=min(samples, scenario.samples))
-    return Finding(holds=False, why=why, run=play(witness, seed, allow_inconclusive=True).run)
+    bench, found = direct_bench(rig, device, alarms_only=True), _Alarms([])
+    for scenario, seed in trials:
+        run = raise_if_interrupted(bench.play(scenario, seed))
+        shown = exposure(run)
+        if shown.lack_of_evidence:
+            raise Inconclusive(shown.lack_of_evidence)
+        found.trials.append((scenario, seed, until_latched(run).alarm_index))
+        found.armed += shown.armed
+        if found.armed >= enough:
+            break
+    return found
 
 
 # ------------------------------------------------------------------------------------------------ latency and diagnoses
@@ -213,10 +209,9 @@ def changes_are_noticed_soon_and_rightly_named(
 
     A ratio up to ``doubtful_latency`` after ``plays`` plays is decided by ``most_plays`` plays.
     """
-    every = _play_all(play, scenario, seed, plays)
+    every = [play_valid(play, scenario, seed + number) for number in range(plays)]
     if latency < _latency_over_bound(every) <= doubtful_latency:
-        every += _play_all(play, scenario, seed + plays, most_plays - plays)
-    _check_valid(*every)
+        every += [play_valid(play, scenario, seed + number) for number in range(plays, most_plays)]
     missed = [finding for played in every if not (finding := played.detects(_EVER))]
     if missed:
         why = f"in {len(missed)} of {len(every)} plays changes were missed: {missed[0].why}"
@@ -226,11 +221,10 @@ def changes_are_noticed_soon_and_rightly_named(
         slowest = max(every, key=lambda played: sum(change.latency_n or 0 for change in played.verdict.changes))
         why = f"mean latency is {ratio:.2f} times the mean bound in {len(every)} plays, allowed {latency:g}"
         return Finding(holds=False, why=why, run=slowest.run)
-    diagnoses = [change.diagnosis for each in every for change in each.verdict.changes if change.diagnosis is not None]
-    wrong_n = sum(not diagnosis.right for diagnosis in diagnoses)
-    if diagnoses and lower_rate(wrong_n, len(diagnoses), confidence) > 1.0 - right:
+    said = _diagnoses_are_right(every)
+    if said and lower_rate(said.count(False), len(said), confidence) > 1.0 - right:
         first = _first_wrong_diagnosis(every)
-        why = f"{wrong_n} of {len(diagnoses)} changes were called wrongly, allowed {1.0 - right:.0%}: {first.why}"
+        why = f"{said.count(False)} of {len(said)} changes were called wrongly, allowed {1.0 - right:.0%}: {first.why}"
         return Finding(holds=False, why=why, run=first.run)
     return Finding(holds=True, why=f"mean latency is {ratio:.3f} times the mean bound")
 
@@ -239,6 +233,11 @@ def _latency_over_bound(plays: Sequence[Played]) -> float:
     changes = [change for played in plays for change in played.verdict.changes if change.bound_n is not None]
     bounds_n = sum(change.bound_n or 0 for change in changes)
     return sum(change.latency_n or 0 for change in changes) / bounds_n if bounds_n else math.inf
+
+
+def _diagnoses_are_right(plays: Sequence[Played]) -> list[bool]:
+    changes = [change for played in plays for change in played.verdict.changes]
+    return [change.diagnosis.right for change in changes if change.diagnosis is not None]
 
 
 def _first_wrong_diagnosis(plays: Sequence[Played]) -> Finding:
@@ -265,9 +264,8 @@ def single_changes_are_rightly_named(
     test = SequentialTest(expected, refuted, miss=miss, false_alarm=false_failure)
     every: list[Played] = []
     for number in range(most_plays):
-        played = _play_valid(play, scenario, seed + number)
-        right = [change.diagnosis.right for change in played.verdict.changes if change.diagnosis is not None]
-        every.append(played)
+        every.append(play_valid(play, scenario, seed + number))
+        right = _diagnoses_are_right(every[-1:])
         test.add(len(right), right.count(False))
         if test.decision is not Decision.OPEN or (number + 1 >= silent and not test.trials):
             break
@@ -305,7 +303,7 @@ def pause_does_no_harm(play: Play, scenario: Scenario, seed: int, until: int) ->
     """Finding: while the force has no edge, up to sample ``until``, the device raises no alarm and its estimate stays
     finite."""
     _configure(play, stuck_n=0)  # a displacement that does not move is a measurement then
-    played = _play_valid(play, scenario, seed)
+    played = play_valid(play, scenario, seed)
     run, wrong = played.run, []
     early = run.alarm_index[run.alarm_index < until].tolist()
     wrong += [f"alarms in the pause, at {', '.join(map(str, early[:5]))}"] if early else []
@@ -319,7 +317,7 @@ def alarms_keep_hold_off_and_warm_up(
 ) -> Finding:
     """Finding: a device set to raise alarms as often as possible keeps the hold-off and the warm-up."""
     _configure(play, hold_off_n=hold_off_n, warm_up_n=warm_up_n, **RESTLESS)
-    played = _play_valid(play, scenario, seed)
+    played = play_valid(play, scenario, seed)
     run, index = played.run, played.run.alarm_index
     if len(index) < at_least:
         return Finding(holds=False, why=f"{len(index)} alarms, where at least {at_least} were due", run=run)
@@ -360,7 +358,7 @@ def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, fau
     with contextlib.ExitStack() as stack:
         if device.wire_faults:  # those with which it failed, when this is judged again
             play = play.on(bench.rig, stack.enter_context(dataclasses.replace(device, wire_faults="").connect()))
-        clean = _play_valid(play, scenario, seed).run
+        clean = play_valid(play, scenario, seed).run
         again = RecordingRig.of(clean, Path("clean"))  # a real rig does not take the same samples twice
         try:
             spoiled = stack.enter_context(dataclasses.replace(device, wire_faults=faults).connect())
@@ -386,7 +384,7 @@ def faults_among_the_samples_cost_no_more_than_samples(
     kinds = sorted(PASSING.intersection(device.fault_kinds()))
     valid: set[str] = set()
     with device.connect() as alone:
-        without = _play_valid(play.on(play.bench.rig, alone), scenario, seed).run
+        without = play_valid(play.on(play.bench.rig, alone), scenario, seed).run
         for kind, faults in _cases(kinds, device, without, each):
             # a real rig would not take the same samples twice
             again = RecordingRig.of(without, Path("without"))
