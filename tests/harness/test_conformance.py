@@ -15,7 +15,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from analogrig.testing.conformance.test_device import *  # noqa: F403 - the tests, run here on each device
+from analogrig.testing.conformance.test_contract import *  # noqa: F403 - the tests, run here on each device
 from tests.harness.faulty_devices import FAULTS, SHARED_MEMORY
 from tests.harness.library_builds import OWN, build
 from tests.harness.scripted_ecu import ScriptedEcu, write
@@ -52,7 +52,7 @@ NOT_FOR = {
 
 FAULTY_TESTS = """\
 import pytest
-from analogrig.testing.conformance.test_device import *
+from analogrig.testing.conformance.test_contract import *
 
 def pytest_generate_tests(metafunc):
     metafunc.parametrize("hil_dut", {names}, indirect=True, ids=lambda name: name)
@@ -64,7 +64,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    if metafunc.function.__module__ == "analogrig.testing.conformance.test_device":
+    if metafunc.function.__module__ == "analogrig.testing.conformance.test_contract":
         left_out = NOT_FOR.get(metafunc.function.__name__, frozenset())
         devices = {kind: name for kind, name in DEVICES.items() if kind not in left_out}
         metafunc.parametrize("hil_dut", list(devices.values()), ids=list(devices), indirect=True)

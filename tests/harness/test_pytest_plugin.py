@@ -457,23 +457,18 @@ def test_without(n):
 
 
 def test_device_of_which_there_is_one_belongs_to_one_worker(user: pytest.Pytester) -> None:
+    """Tests and scenario files alike."""
     user.makepyfile(SHARED)
-    with board() as port:
-        result = user.runpytest_subprocess("-n", "2", "--hil-dut", f"serial:{port}", "-rP")
-    result.assert_outcomes(passed=8)
-    assert len({line for line in result.outlines if re.fullmatch(r"<gw\d>", line)}) == 1
-
-
-def test_scenario_files_for_a_device_of_which_there_is_one_go_to_one_worker(user: pytest.Pytester) -> None:
     folder = user.mkdir("suite")
     for name in "abcd":
         (folder / f"{name}.toml").write_text(SHORT.format(head="", expect=""))
     with board() as port:
-        result = user.runpytest_subprocess(
-            "-n", "2", "--hil-scenario-dir", "suite", "--hil-dut", f"serial:{port}", "-v"
-        )
-    result.assert_outcomes(passed=4)
-    assert len(set(re.findall(r"\[(gw[01])\].* PASSED", result.stdout.str()))) == 1
+        options = ("-n", "2", "--hil-scenario-dir", "suite", "--hil-dut", f"serial:{port}", "-v", "-rP")
+        result = user.runpytest_subprocess(*options)
+    result.assert_outcomes(passed=12)
+    played = re.findall(r"\[(gw[01])\].* PASSED suite", result.stdout.str())
+    assert len(played) == 4
+    assert len({*played, *(line[1:-1] for line in result.outlines if re.fullmatch(r"<gw\d>", line))}) == 1
 
 
 def test_device_of_which_there_is_one_refuses_other_ways_to_share_the_tests_out(user: pytest.Pytester) -> None:
@@ -597,8 +592,10 @@ def test_shipped_property_in_a_file_sets_the_device_itself_and_judges_by_the_lim
     for name, at_least in (("good", 3), ("strict", 300)):
         told = SHORT.format(head="", expect="") + KEEPS_HOLD_OFF.format(at_least=at_least)
         (folder / f"{name}.toml").write_text(told)
+    ends = '[statement]\nname = "record_may_end_anywhere"\nlimits = { ends = 2 }\n'
+    (folder / "ends.toml").write_text(SHORT.format(head="", expect="").replace("900", "60").replace("700", "50") + ends)
     result = run(user, "--hil-dut", "inproc", "--hil-scenario-dir", "suite")
-    result.assert_outcomes(passed=1, failed=1)
+    result.assert_outcomes(passed=2, failed=1)
     result.stdout.fnmatch_lines(["*strict.toml: * alarms, where at least 300 were due"])
 
 

@@ -93,10 +93,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(site: Path, cwd: Path, module: str, *words: str) -> subprocess.CompletedProcess[str]:
+def run(site: Path | str, cwd: Path, command: str) -> subprocess.CompletedProcess[str]:
+    """End of a command of Python, such as ``pytest -q``, in whose environment the folder is installed."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("ANALOGRIG", "PYTEST"))}
     return subprocess.run(
-        [sys.executable, "-m", module, *words],
+        [sys.executable, "-m", *command.split()],
         cwd=cwd,
         env=kept | {"PYTHONPATH": str(site)},
         capture_output=True,
@@ -105,30 +106,34 @@ def run(site: Path, cwd: Path, module: str, *words: str) -> subprocess.Completed
     )
 
 
+def analogrig(site: Path | str, cwd: Path, command: str) -> subprocess.CompletedProcess[str]:
+    return run(site, cwd, f"analogrig.cli {command}")
+
+
+PLAY = "run --dut jump:80 --rig flat --scenario scenario.toml --out out"
+
+
 def test_page_shows_a_kind_in_forty_lines(site: Path) -> None:
     lines = [line for line in (site / "my_kinds.py").read_text().splitlines() if line.strip()]
     assert len(lines) <= 40
 
 
 def test_kinds_of_another_package_play(site: Path, folder: Path) -> None:
-    words = ("run", "--dut", "jump:80", "--rig", "flat", "--scenario", "scenario.toml", "--out", "out")
-    done = run(site, folder, "analogrig.cli", *words)
+    done = analogrig(site, folder, PLAY)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     played = Run.load(folder / "out" / "run.npz")
     assert played.alarm_index.tolist() == [251]
     assert played.datasheet.statistic and played.alarm_statistic[0] > 80.0
     assert played.conditions.rig == {"name": "flat", "kind": "flat", "jump_at": 250}
     assert played.conditions.dut["codes"] == 80
-    again = run(site, folder, "analogrig.cli", "replay", "out/run.npz", "--out", "again")
+    again = analogrig(site, folder, "replay out/run.npz --out again")
     assert (again.returncode, again.stderr) == (0, ""), "the device is opened from the record"
 
 
 def test_kinds_of_another_package_play_in_pytest_and_in_campaigns(site: Path, folder: Path) -> None:
-    done = run(site, folder, "pytest", "-q", "-p", "no:cacheprovider", "--hil-rig", "flat", "--hil-dut", "jump")
+    done = run(site, folder, "pytest -q -p no:cacheprovider --hil-rig flat --hil-dut jump")
     assert "1 passed" in done.stdout, done.stdout
-    done = run(
-        site, folder, "analogrig.cli", "campaign", "campaign.toml", "--workers", "2", "--out", "out.sqlite", "--json"
-    )
+    done = analogrig(site, folder, "campaign campaign.toml --workers 2 --out out.sqlite --json")
     assert done.stderr == ""
     assert [cell["missed"] for cell in json.loads(done.stdout)["cells"]] == [0, 2]
 
@@ -140,8 +145,8 @@ def test_broken_packages_are_listed_and_break_nothing_else(site: Path, folder: P
         "import analogrig.devices\nclass It(analogrig.devices.DeviceDescription):\n    kind = 'dumb'\n"
     )
     install(folder, "broken", **{group: {k: v[0] for k, v in kinds.items()} for group, kinds in BROKEN.items()})
-    both = Path(f"{site}{os.pathsep}{folder}")
-    done = run(both, folder, "analogrig.cli", "list", "--json")
+    both = f"{site}{os.pathsep}{folder}"
+    done = analogrig(both, folder, "list --json")
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     listed = json.loads(done.stdout)
     for group, kinds in BROKEN.items():
@@ -149,9 +154,9 @@ def test_broken_packages_are_listed_and_break_nothing_else(site: Path, folder: P
         for kind, (_, text) in kinds.items():
             assert any(name == kind and text in shown for name, shown in rows), (kind, rows)
     assert "host[?baud=...]" in {row["name"] for row in listed["devices"]}
-    played = run(both, folder, "analogrig.cli", "run", "--dut", "inproc", "--out", "out")
+    played = analogrig(both, folder, "run --dut inproc --out out")
     assert (played.returncode, played.stderr) == (0, "")
-    failed = run(both, folder, "analogrig.cli", "run", "--dut", "failing")
+    failed = analogrig(both, folder, "run --dut failing")
     assert failed.returncode == 2
     assert failed.stderr.startswith("analogrig: kind 'failing': the package broken (analogrig.devices: ")
     assert failed.stderr.count("\n") == 1
@@ -167,7 +172,7 @@ def test_package_that_fails_is_named(site: Path, folder: Path, fault: str) -> No
         f"class It(JumpDescription):\n    kind = 'it'\n    {member}):\n        {body}\n"
     )
     install(folder, "failing", devices={"it": "failing_kinds:It"})
-    done = run(Path(f"{site}{os.pathsep}{folder}"), folder, "analogrig.cli", "run", "--dut", "it")
+    done = analogrig(f"{site}{os.pathsep}{folder}", folder, "run --dut it")
     package = "the package failing (analogrig.devices: failing_kinds:It)"
     assert (done.returncode, done.stderr) == (
         3,
@@ -194,34 +199,21 @@ def test_package_that_states_its_entry_points_wrongly_harms_no_other(
 
 
 def test_command_of_another_package_is_listed_and_runs(site: Path, folder: Path) -> None:
-    assert "\n    span        print the span" in run(site, folder, "analogrig.cli", "--help").stdout
-    run(
-        site,
-        folder,
-        "analogrig.cli",
-        "run",
-        "--dut",
-        "jump:80",
-        "--rig",
-        "flat",
-        "--scenario",
-        "scenario.toml",
-        "--out",
-        "out",
-    )
-    done = run(site, folder, "analogrig.cli", "span", "out/run.npz", "--json")
+    assert "\n    span        print the span" in analogrig(site, folder, "--help").stdout
+    analogrig(site, folder, PLAY)
+    done = analogrig(site, folder, "span out/run.npz --json")
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["force"] == 0
-    wrong = run(site, folder, "analogrig.cli", "span", "none.npz")
+    wrong = analogrig(site, folder, "span none.npz")
     assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
 
 
 def test_instrument_of_another_package_records(site: Path, folder: Path) -> None:
     (folder / "rigs.toml").write_text(files_of("add-an-instrument")["rigs.toml"])
-    refused = run(site, folder, "analogrig.cli", "doctor", "--rig", "loop")
+    refused = analogrig(site, folder, "doctor --rig loop")
     assert refused.returncode == 2
     assert "--allow loop://bench" in refused.stderr
-    done = run(site, folder, "analogrig.cli", "doctor", "--rig", "loop", "--allow", "loop://bench", "--json")
+    done = analogrig(site, folder, "doctor --rig loop --allow loop://bench --json")
     assert (done.returncode, done.stderr) == (1, ""), done.stdout
     assert any(check["state"] == "wrong" for check in json.loads(done.stdout)["checks"])
 
@@ -237,11 +229,11 @@ def test_instrument_of_another_package_records(site: Path, folder: Path) -> None
 def test_broken_command_harms_no_other(site: Path, folder: Path, target: str, text: str) -> None:
     (folder / "nothing.py").write_text("def add(commands): pass\n")
     install(folder, "broken", commands={"broke": target, "run": "my_command:add"})
-    both = Path(f"{site}{os.pathsep}{folder}")
-    helped = run(both, folder, "analogrig.cli", "--help")
+    both = f"{site}{os.pathsep}{folder}"
+    helped = analogrig(both, folder, "--help")
     assert helped.returncode == 0
     assert "command 'run' of the package broken (analogrig.commands: my_command:add) is ignored" in helped.stderr
-    broken = run(both, folder, "analogrig.cli", "broke", "--any", "thing")
+    broken = analogrig(both, folder, "broke --any thing")
     assert broken.returncode == 2
     assert text in broken.stderr.splitlines()[-1]
-    assert run(both, folder, "analogrig.cli", "span", "none.npz").returncode == 2
+    assert analogrig(both, folder, "span none.npz").returncode == 2

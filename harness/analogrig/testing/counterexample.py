@@ -68,8 +68,12 @@ class Counterexample:
 
     def _options(self, allow: str, *, with_device: bool) -> list[str]:
         """Options that allow the things which the files of the counterexample name."""
-        device = recorded(self.run.conditions.dut).things if with_device else ()
-        return [word for thing in (*device, *_rig_things(self.run)) for word in (allow, thing.display_name())]
+        things: list[Thing] = list(recorded(self.run.conditions.dut).things) if with_device else []
+        table = self.run.conditions.rig
+        if table.get("kind") in rigs.KINDS and not str(table["name"]).startswith(RECORDING):
+            plain = tomllib.loads(config.to_toml(table))  # as a file has it: lists for tuples, and nothing that is None
+            things += rigs.from_table(plain, "the recorded rig").things
+        return [word for thing in things for word in (allow, thing.display_name())]
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Write the counterexample into ``folder``, all or nothing: the old content stays until the new one is
@@ -86,7 +90,14 @@ class Counterexample:
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir(parents=True)
         try:
-            self._write(new, page=page)
+            for name, table in self._tables().items():
+                (new / name).write_text(config.to_toml(table), encoding="utf-8")
+            self.run.save(new / RUN_FILE)
+            if page:
+                from analogrig.judging.verdict import judge
+                from analogrig.reporting import write_report
+
+                write_report(self.run, judge(self.run), new / REPORT_FILE)
             if folder.exists():  # a process that is killed here leaves it under the name ``old``
                 shutil.rmtree(old, ignore_errors=True)
                 folder.rename(old)
@@ -95,25 +106,18 @@ class Counterexample:
         finally:
             shutil.rmtree(new, ignore_errors=True)
 
-    def _write(self, folder: Path, *, page: bool) -> None:
-        for name, table in self._tables().items():
-            (folder / name).write_text(config.to_toml(table), encoding="utf-8")
-        self.run.save(folder / RUN_FILE)
-        if page:
-            from analogrig.judging.verdict import judge
-            from analogrig.reporting import write_report
-
-            write_report(self.run, judge(self.run), folder / REPORT_FILE)
-
     def _tables(self) -> dict[str, dict[str, Any]]:
         """Tables to write, by file name."""
         conditions, device = self.run.conditions, self._device()
         scenario = {key: value for key, value in conditions.scenario.items() if key not in ("name", "rig", "statement")}
         scenario["seed"] = conditions.seed if self.seed is None else self.seed
-        is_name = bool(device) and not _names_relative_path(device)
-        scenario["dut"] = device if is_name else DEVICE_FILE
+        place = device.partition(":")[2].partition("?")[0]
+        needs_file = not device or (
+            any(thing.is_path for thing in describe(device).things) and not Path(place).is_absolute()
+        )
+        scenario["dut"] = DEVICE_FILE if needs_file else device
         tables = {SCENARIO_FILE: scenario}
-        if not is_name:
+        if needs_file:
             tables[DEVICE_FILE] = {key: value for key, value in _settings(conditions.dut).items() if key != "name"}
         name = str(conditions.rig["name"])
         if name.startswith(RECORDING):
@@ -131,21 +135,6 @@ class Counterexample:
         """Name that describes the device; empty if the device needs a file."""
         names = (str(self.dut), str(self.run.conditions.dut["name"]))  # as the command line would read them
         return next((each for each in names if each and not each.endswith(".toml") and _is_device(each, self.run)), "")
-
-
-def _names_relative_path(device: str) -> bool:
-    """True if the name of a device holds a path that is relative to the working directory."""
-    path = device.partition(":")[2].partition("?")[0]
-    return any(thing.is_path for thing in describe(device).things) and not Path(path).is_absolute()
-
-
-def _rig_things(run: Run) -> tuple[Thing, ...]:
-    """Things that the rig of a run stated."""
-    table = run.conditions.rig
-    if table.get("kind") not in rigs.KINDS or str(table["name"]).startswith(RECORDING):
-        return ()
-    plain = tomllib.loads(config.to_toml(table))  # as a file has it: lists for tuples, and nothing that is None
-    return rigs.from_table(plain, "the recorded rig").things
 
 
 def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> str:

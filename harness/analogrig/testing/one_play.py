@@ -258,7 +258,10 @@ def rate_below(
     check_share(confidence, "rate_below: confidence")
     if burst is not None and burst < 1.0:
         raise LimitError(f"rate_below: burst: must be 1 or more, not {burst:g}")
-    plays = list({_samples_of(each.run): each for each in played}.values())
+    distinct = {
+        (each.run.conditions.dut["name"], hashlib.sha256(each.run.codes.tobytes()).digest()): each for each in played
+    }
+    plays = list(distinct.values())
     explained = [each for each in plays if or_misfit and each.verdict.fit]
     finding = _rate_below(rate, [each for each in plays if each not in explained], confidence, burst)
     if explained:
@@ -318,11 +321,6 @@ def _bets(plays: Sequence[Played], alarms: Sequence[int], armed: Sequence[int], 
     for events, exposure_n in zip(alarms, armed, strict=True):
         bets.add(events, exposure_n)
     return bets
-
-
-def _samples_of(run: Run) -> tuple[str, bytes]:
-    """Key of a distinct play: the device and the samples that it received."""
-    return str(run.conditions.dut["name"]), hashlib.sha256(run.codes.tobytes()).digest()
 
 
 def _of_all(

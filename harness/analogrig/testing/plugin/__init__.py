@@ -10,8 +10,7 @@ environment (ANALOGRIG_RIG, ...), the ini file (hil_rig, ...), its default.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,18 +38,13 @@ def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
     hil_options.check_allow(early_config, early_config.known_args_namespace.hil_allow)
 
 
-_PROFILE = pytest.StashKey[Callable[[], str]]()
-
-
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", f"hil_needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
     )
     hil_options.check_command_line(config)
     junit.begin(config)
-    profile: Callable[[], str] = functools.partial(_collection_profile, config)
-    config.stash[_PROFILE] = profile
-    hil_options.begin_profile(profile)
+    hil_options.sessions.append(config)
     config.stash[devices.DEVICES] = devices.Devices()
     devices.assign_owner(config)
     scenarios.add_folder(config)
@@ -59,16 +53,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     if (open_devices := config.stash.get(devices.DEVICES, None)) is not None:
         open_devices.close()
-    if (profile := config.stash.get(_PROFILE, None)) is not None:
-        hil_options.end_profile(profile)
-
-
-def _collection_profile(config: pytest.Config) -> str:
-    """:raises pytest.Collector.CollectError: the value is wrong; the test file that asks is not collected."""
-    setting = HIL_PROFILE.of_session(config)
-    if complaint := HIL_PROFILE.complaint(setting.value):
-        raise pytest.Collector.CollectError(f"{setting.by}: {complaint}")
-    return setting.value
+    if config in hil_options.sessions:
+        hil_options.sessions.remove(config)
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
@@ -76,13 +62,6 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
-    _check_needs(items)
-    scenarios.add_complaint(session, items)
-    devices.list_owned_tests(config, items)
-
-
-def _check_needs(items: list[pytest.Item]) -> None:
-    """:raises pytest.UsageError: a test needs what no rig can."""
     for item in items:
         for mark in item.iter_markers("hil_needs"):
             unknown = [*(need for need in mark.args if need not in CAPABILITIES), *mark.kwargs]
@@ -90,6 +69,8 @@ def _check_needs(items: list[pytest.Item]) -> None:
                 raise pytest.UsageError(
                     f"{item.nodeid}: hil_needs: no rig is known to {unknown[0]!r}: there are {', '.join(CAPABILITIES)}"
                 )
+    scenarios.add_complaint(session, items)
+    devices.list_owned_tests(config, items)
 
 
 # ------------------------------------------------------------------------------------------------------------- fixtures
@@ -124,16 +105,13 @@ def hil_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     with player.in_one_line(setting.by):
         rig = open_rig(setting.value, allow=hil_options.trust_of(request.config))
     with rig:
-        _skip_unless_able(request.node, rig, setting.value)
+        for mark in request.node.iter_markers("hil_needs"):
+            if lacking := sorted(set(mark.args) - rig.capabilities):
+                able = ", ".join(sorted(rig.capabilities)) or "nothing but play"
+                pytest.skip(
+                    f"rig {setting.value} cannot {' and '.join(lacking)} (it can {able}): choose another with --hil-rig"
+                )
         yield rig
-
-
-def _skip_unless_able(item: pytest.Item, rig: Rig, name: str) -> None:
-    for mark in item.iter_markers("hil_needs"):
-        lacking = sorted(set(mark.args) - rig.capabilities)
-        if lacking:
-            able = ", ".join(sorted(rig.capabilities)) or "nothing but play"
-            pytest.skip(f"rig {name} cannot {' and '.join(lacking)} (it can {able}): choose another with --hil-rig")
 
 
 @pytest.fixture

@@ -26,9 +26,6 @@ ALLOW = "--hil-allow"
 EXAMPLES = {"ci": 15, "nightly": 300, "soak": 5000}
 """Examples per property, by profile."""
 
-DEFAULT_PROFILE = "ci"
-PROFILE_VARIABLE = "ANALOGRIG_HIL_PROFILE"
-
 Source = Literal["parameter", "command line", "environment", "ini file", "default"]
 
 
@@ -67,7 +64,11 @@ class Option:
         """The value for the session, unchecked."""
         value = config.getoption(self.flag)
         if value is not None:
-            return Setting(_from_command_line(config, self.flag, str(value)), self.flag, "command line")
+            if not _is_on_command_line(config, self.flag, str(value)):  # addopts of the ini file gave it
+                from analogrig.trust import FiledName
+
+                value = FiledName(str(value), str(config.inipath))
+            return Setting(value, self.flag, "command line")
         if self.variable and (value := os.environ.get(self.variable)):
             return Setting(value, self.variable, "environment")
         value = str(config.getini(self.name))
@@ -81,18 +82,15 @@ class Option:
 
     def of(self, item: pytest.Item) -> Setting:
         """The value for an item, unchecked: its indirect parameter, else that of the session."""
-        callspec = getattr(item, "callspec", None)
-        parameter = None if callspec is None else callspec.params.get(self.name)
+        parameter = self._parameter(item)
         if parameter is None:
             return self.of_session(item.config)
-        return Setting(_name_of(parameter), f"parameter {self.name} of {item.nodeid}", "parameter")
+        name = parameter if isinstance(parameter, str) else str(parameter)  # a FiledName stays one
+        return Setting(name, f"parameter {self.name} of {item.nodeid}", "parameter")
 
     def of_fixture(self, request: pytest.FixtureRequest) -> Setting:
         """The value for a fixture: its parameter, else that of the session. A wrong value fails the test."""
-        parameter = getattr(request, "param", None)
-        setting = self.of_session(request.config)
-        if parameter is not None:
-            setting = Setting(_name_of(parameter), f"parameter {self.name} of {request.node.nodeid}", "parameter")
+        setting, parameter = self.of(request.node), self._parameter(request.node)
         complaint = self.complaint(setting.value)
         if parameter is not None and not isinstance(parameter, str | os.PathLike):
             complaint = f"must be a text or a path, not {parameter!r}"
@@ -100,24 +98,16 @@ class Option:
             pytest.fail(f"{setting.by}: {complaint}", pytrace=False)
         return setting
 
-
-def _name_of(parameter: object) -> str:
-    """Name that a parameter is; one that a file holds stays one, for ``analogrig.trust``."""
-    return parameter if isinstance(parameter, str) else str(parameter)
-
-
-def _folder_complaint(value: str) -> str:
-    return "" if not value or Path(value).is_dir() else f"{value} is no folder"
+    def _parameter(self, item: pytest.Item) -> object:
+        callspec = getattr(item, "callspec", None)
+        return None if callspec is None else callspec.params.get(self.name)
 
 
-def _new_folder_complaint(value: str) -> str:
+def _place_complaint(value: str) -> str:
+    """Reason why a folder cannot be made; empty if it can."""
     path = Path(value)
     there = next((each for each in (path, *path.parents) if each.exists()), path)
     return "" if there.is_dir() else f"{there} is no folder"
-
-
-def _profile_complaint(value: str) -> str:
-    return "" if value in EXAMPLES else f"must be one of {', '.join(EXAMPLES)}, not {value!r}"
 
 
 def _seconds(value: str) -> float | None:
@@ -129,10 +119,6 @@ def _seconds(value: str) -> float | None:
     return seconds if 1e-3 <= seconds <= 1e9 else None
 
 
-def _seconds_complaint(value: str) -> str:
-    return f"must be seconds from 0.001 to 1e9, not {value!r}" if value and _seconds(value) is None else ""
-
-
 RIG = Option("hil_rig", "ANALOGRIG_RIG", "emulator", "rig: a shipped name, a .toml file, recording:FILE")
 DUT = Option(
     "hil_dut",
@@ -140,23 +126,29 @@ DUT = Option(
     "host",
     "device under test: host, inproc[:LIBRARY], qemu-m4[:ELF], serial:URL, can:..., a .toml file",
 )
-SCENARIO_DIR = Option("hil_scenario_dir", "", "", "folder of scenario files; each of them is a test", _folder_complaint)
+SCENARIO_DIR = Option(
+    "hil_scenario_dir",
+    "",
+    "",
+    "folder of scenario files; each of them is a test",
+    lambda value: "" if not value or Path(value).is_dir() else f"{value} is no folder",
+)
 RUNS_DIR = Option(
-    "hil_runs_dir", "ANALOGRIG_RUNS_DIR", "build/runs", "folder for recordings of failed tests", _new_folder_complaint
+    "hil_runs_dir", "ANALOGRIG_RUNS_DIR", "build/runs", "folder for recordings of failed tests", _place_complaint
 )
 HIL_PROFILE = Option(
     "hil_profile",
-    PROFILE_VARIABLE,
-    DEFAULT_PROFILE,
+    "ANALOGRIG_HIL_PROFILE",
+    "ci",
     f"number of examples per property: {', '.join(f'{name} ({n})' for name, n in EXAMPLES.items())}",
-    _profile_complaint,
+    lambda value: "" if value in EXAMPLES else f"must be one of {', '.join(EXAMPLES)}, not {value!r}",
 )
 TIME_LIMIT = Option(
     "hil_time_limit",
     "ANALOGRIG_TIME_LIMIT",
     "",
     "longest time of one play in seconds; a play that takes longer is INCONCLUSIVE",
-    _seconds_complaint,
+    lambda value: f"must be seconds from 0.001 to 1e9, not {value!r}" if value and _seconds(value) is None else "",
 )
 
 OPTIONS = (RIG, DUT, SCENARIO_DIR, RUNS_DIR, HIL_PROFILE, TIME_LIMIT)
@@ -212,15 +204,6 @@ def trust_of(config: pytest.Config) -> Trust:
     return trust.also(named_things(dut.value)) if dut.is_explicit and not file_of(dut.value) else trust
 
 
-def _from_command_line(config: pytest.Config, flag: str, value: str) -> str:
-    """The value of an option; one that nobody typed is the ini file's, whatever way addopts gave it."""
-    if _is_on_command_line(config, flag, value):
-        return value
-    from analogrig.trust import FiledName
-
-    return FiledName(value, str(config.inipath))
-
-
 def _is_on_command_line(config: pytest.Config, flag: str, value: str) -> bool:
     """True if the command line or PYTEST_ADDOPTS holds the flag with this value, also in a file named by @FILE."""
     in_worker = getattr(config, "workerinput", {}).get("mainargv")  # of pytest-xdist: the words of its main process
@@ -237,24 +220,19 @@ def _lines_of(file: str) -> list[str]:
         return []
 
 
-_sessions: list[Callable[[], str]] = []
-"""Sources of the profile, one per running pytest session: a session may run another one in its process. hypothesis
-fixes the settings of a test where the test is defined, before any fixture exists."""
-
-
-def begin_profile(profile: Callable[[], str]) -> None:
-    """Make ``profile()`` the source of the profile until ``end_profile(profile)``."""
-    _sessions.append(profile)
-
-
-def end_profile(profile: Callable[[], str]) -> None:
-    """Undo ``begin_profile``; no effect if the session never began."""
-    if profile in _sessions:
-        _sessions.remove(profile)
+sessions: list[pytest.Config] = []
+"""Running pytest sessions: one may run another in its process. hypothesis fixes the settings of a test where the test
+is defined, before any fixture exists."""
 
 
 def current_profile() -> str:
-    """Name of the profile in force: that of the pytest session, else of the environment, else the default."""
-    if _sessions:
-        return _sessions[-1]()
-    return os.environ.get(PROFILE_VARIABLE) or DEFAULT_PROFILE
+    """Name of the profile in force: that of the pytest session, else of the environment, else the default.
+
+    :raises pytest.Collector.CollectError: the value is wrong; the test file that asks is not collected.
+    """
+    if not sessions:
+        return os.environ.get(HIL_PROFILE.variable) or HIL_PROFILE.default
+    setting = HIL_PROFILE.of_session(sessions[-1])
+    if complaint := HIL_PROFILE.complaint(setting.value):
+        raise pytest.Collector.CollectError(f"{setting.by}: {complaint}")
+    return setting.value

@@ -197,6 +197,8 @@ def _keep_if_it_fails(test: Callable[..., None], item: pytest.Item) -> Callable[
 
     from hypothesis.errors import UnsatisfiedAssumption
 
+    from analogrig.errors import AnalogrigError
+
     record = record_of(item)
 
     @functools.wraps(test)
@@ -211,7 +213,7 @@ def _keep_if_it_fails(test: Callable[..., None], item: pytest.Item) -> Callable[
             is_ours = not isinstance(error, pytest.fail.Exception) or not error.pytrace  # a time-out has a traceback
             if is_ours and (counterexample := record.counterexample(item)) is not None:
                 record.example = counterexample
-                with contextlib.suppress(*_write_errors()):  # the report of the test states them
+                with contextlib.suppress(AnalogrigError, OSError):  # the report of the test states them
                     counterexample.write(_folder(item), page=False)
             raise
 
@@ -229,14 +231,23 @@ def write_counterexample(item: pytest.Item) -> str:
     counterexample = record.example or record.counterexample(item)
     if counterexample is None:
         return f"found: {record.found[0].why}" if record.found and not record.found[0] else ""
+    from analogrig.errors import AnalogrigError
     from analogrig.testing.counterexample import SCENARIO_FILE
 
     lines = [f"found: {counterexample.why}"] if counterexample.why else []
-    if _is_in_suite(item, folder):
+    suite, path = SCENARIO_DIR.of(item).value, item.path.resolve()
+    if (
+        suite
+        and path.is_relative_to(Path(suite).resolve())
+        and (
+            path.is_relative_to(Path(RUNS_DIR.of(item).value).resolve())  # it repeats this very counterexample
+            or folder.resolve().is_relative_to(Path(suite).resolve())  # it would be one more scenario
+        )
+    ):
         return "\n".join([*lines, f"play it again with: {counterexample.command(item.path)}"])
     try:
         counterexample.write(folder)
-    except _write_errors() as error:
+    except (AnalogrigError, OSError) as error:
         return "\n".join([*lines, f"its recording could not be written to {folder}: {error}"])
     lines.append(f"recording and scenario: {folder}")
     if counterexample.statement is not None and not counterexample.is_private:
@@ -244,20 +255,5 @@ def write_counterexample(item: pytest.Item) -> str:
     return "\n".join([*lines, f"play it again with: {counterexample.command(folder / SCENARIO_FILE)}"])
 
 
-def _is_in_suite(item: pytest.Item, folder: Path) -> bool:
-    """True if --hil-scenario-dir holds the counterexample of this item, or would gain it as one more scenario."""
-    suite, path = SCENARIO_DIR.of(item).value, item.path.resolve()
-    if not suite or not path.is_relative_to(Path(suite).resolve()):
-        return False
-    is_counterexample = path.is_relative_to(Path(RUNS_DIR.of(item).value).resolve())
-    return is_counterexample or folder.resolve().is_relative_to(Path(suite).resolve())
-
-
 def _folder(item: pytest.Item) -> Path:
     return Path(RUNS_DIR.of(item).value) / re.sub(r"[^\w.-]+", "_", item.nodeid).strip("_")
-
-
-def _write_errors() -> tuple[type[Exception], ...]:
-    from analogrig.errors import AnalogrigError
-
-    return AnalogrigError, OSError

@@ -49,35 +49,27 @@ def add_folder(config: pytest.Config) -> None:
 
 def _recursion_complaint(folder: str, config: pytest.Config) -> str:
     """Reason why pytest does not enter a folder that is not named; empty if pytest enters it."""
-    patterns = config.getini("norecursedirs")
-    parts = _below(Path(folder).resolve(), config)
-    if not any(fnmatch.fnmatch(part, pattern) for part in parts for pattern in patterns):
+    path, root = Path(folder).resolve(), config.rootpath.resolve()
+    parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
+    if not any(fnmatch.fnmatch(part, pattern) for part in parts for pattern in config.getini("norecursedirs")):
         return ""
     return f"pytest does not look into {folder} of itself: use pytest {folder} {SCENARIO_DIR.flag} {folder}"
 
 
-def _below(path: Path, config: pytest.Config) -> tuple[str, ...]:
-    root = config.rootpath.resolve()
-    return path.relative_to(root).parts if path.is_relative_to(root) else ()
-
-
 def collect_file(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """Scenario of a file in the folder; None for any other file, such as the file of a rig or a device beside it."""
     folder = parent.config.stash.get(_FOLDER, None)
     if folder is None or path.suffix != ".toml" or not path.is_relative_to(folder):
         return None
-    return ScenarioFile.from_parent(parent, path=path) if _is_scenario(path) else None
-
-
-def _is_scenario(path: Path) -> bool:
-    """True if the file is a scenario; rig and device files beside it are none."""
     from analogrig import config
     from analogrig.devices.registry import KINDS
     from analogrig.errors import AnalogrigError
     from analogrig.rigs.description import KINDS as RIG_KINDS
 
     with contextlib.suppress(AnalogrigError):
-        return config.read_toml(path).get("kind", "scenario") not in {*KINDS, *RIG_KINDS}
-    return True
+        if config.read_toml(path).get("kind", "scenario") in {*KINDS, *RIG_KINDS}:
+            return None
+    return ScenarioFile.from_parent(parent, path=path)
 
 
 def add_complaint(session: pytest.Session, items: list[pytest.Item]) -> None:
@@ -130,7 +122,8 @@ class ScenarioItem(pytest.Item):
         import analogrig.testing.one_play
         import analogrig.testing.properties.claimed
         import analogrig.testing.properties.conversed
-        import analogrig.testing.properties.experiments  # noqa: F401 - each registers what a file can state
+        import analogrig.testing.properties.experiments
+        import analogrig.testing.properties.switches  # noqa: F401 - each registers what a file can state
         from analogrig.bench import Bench
         from analogrig.rigs.description import open_rig
         from analogrig.scenario import DEFAULT_SEED, Scenario

@@ -109,7 +109,9 @@ def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[s
                 device.disturb(batch)
                 library.disturb(batch)
                 continue
-            shared = [each for each in batch if not isinstance(each, Configure) or _have_in_common(builds, each)]
+            # what the largest orders of the builds decide is not compared
+            shared = [each for each in batch if not isinstance(each, Configure)
+                      or len({build.accepts(each.key, each.value) for build in builds}) == 1]  # fmt: skip
             device.send(shared)
             library.send(shared)
             while (answer := library.receive(timeout_s=0.0)) is not None:
@@ -122,12 +124,6 @@ def _wrong_answers(description: CatalogueDescription, script: str) -> Iterator[s
                     return
         if (more := device.receive(timeout_s=0.0)) is not None:
             yield f"expected nothing, received {more}"
-
-
-def _have_in_common(builds: Sequence[DeviceBuild], setting: Configure) -> bool:
-    """True unless the largest orders of the builds decide whether they accept a setting."""
-    limits = [build.range_of(setting.key) for build in builds]
-    return len({each is not None and each[0] <= setting.value <= each[1] for each in limits}) == 1
 
 
 class Talk:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -109,6 +110,10 @@ class DeviceBuild:
             return -largest, largest
         return RANGES.get(Key(key)) if key in set(Key) else None
 
+    def accepts(self, key: int, value: float) -> bool:
+        limits = self.range_of(key)
+        return limits is not None and limits[0] <= value <= limits[1]
+
 
 Script = Iterator[Message | Garbage | Foreign]
 
@@ -173,12 +178,10 @@ def settings(numbers: Numbered, build: DeviceBuild) -> Script:
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.5},
         {Key.CODE_LOW: 0.0, Key.CODE_HIGH: 64.0, Key.NOISE_VARIANCE: 4.0},
     ):
-        yield from (numbers.configure(key, value) for key, value in DEFAULTS.items())
-        yield from (numbers.configure(key, value) for key, value in unfit.items())
-        yield numbers.control(Command.START, RUN)
-        yield numbers.control(Command.STOP)
+        yield from itertools.starmap(numbers.configure, (*DEFAULTS.items(), *unfit.items()))
+        yield from (numbers.control(Command.START, RUN), numbers.control(Command.STOP))
     yield numbers.control(Command.RESET)
-    yield from (numbers.configure(key, value) for key, value in DEFAULTS.items())
+    yield from itertools.starmap(numbers.configure, DEFAULTS.items())
 
 
 def _near(low: float, high: float, *, is_whole: bool) -> Iterator[float]:
@@ -194,63 +197,37 @@ def _near(low: float, high: float, *, is_whole: bool) -> Iterator[float]:
 
 def _sure(numbers: Numbered) -> Script:
     """Prior knowledge that keeps the first equations well-conditioned: rounding stays small."""
-    for key, value in ((Key.P0, 1e-7), (Key.P0_OFFSET, 1e-3), (Key.REFRESH_N, 0)):
-        yield numbers.configure(key, value)
+    return itertools.starmap(numbers.configure, ((Key.P0, 1e-7), (Key.P0_OFFSET, 1e-3), (Key.REFRESH_N, 0)))
 
 
 def control(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001 - scripts have one form
     """Commands in every state, with arguments at their limits; samples that no run takes."""
     yield from _sure(numbers)
-    yield numbers.control(Command.STATUS)
-    yield numbers.sample(0)
-    yield numbers.block(0)
-    for command, argument in (
-        *(
-            (0, 1),
-            (6, 7),
-            (255, 0xA5C3_963C),
-            (7, 0x5A3C_69C3),
-            (Command.STOP, 9),
-            (Command.START, 8),
-            (Command.START, 0x10003),
+    yield from (numbers.control(Command.STATUS), numbers.sample(0), numbers.block(0))
+    yield from itertools.starmap(
+        numbers.control,
+        (
+            *((0, 1), (6, 7), (255, 0xA5C3_963C), (7, 0x5A3C_69C3)),
+            *((Command.STOP, 9), (Command.START, 8), (Command.START, 0x10003)),
+            *((Command.REPORT_INTERVAL, each) for each in (0, 65_535, 65_536, 1)),
+            *((Command.START, RUN), (Command.START, 6), (Command.REPORT_INTERVAL, 3)),
         ),
-        *((Command.REPORT_INTERVAL, each) for each in (0, 65_535, 65_536, 1)),
-        *((Command.START, RUN), (Command.START, 6), (Command.REPORT_INTERVAL, 3)),
-    ):
-        yield numbers.control(command, argument)
+    )
     yield numbers.configure(Key.P0, 5.0)
-    for index in range(7):
-        yield numbers.sample(index)
-    yield numbers.sample(7, run=4)
-    yield numbers.block(7, run=2)
-    for samples in (0, 15, 1, 4, 14):
-        yield numbers.block(7, samples, 0b1010)
+    yield from map(numbers.sample, range(7))
+    yield from (numbers.sample(7, run=4), numbers.block(7, run=2))
+    yield from (numbers.block(7, samples, 0b1010) for samples in (0, 15, 1, 4, 14))
     yield Alarm(numbers.seq, 3, 4, 5.0)
-    yield numbers.control(Command.STATUS)
-    yield numbers.control(Command.STOP)
-    yield numbers.control(Command.STATUS)
-    yield numbers.sample(26)
-    yield numbers.control(Command.STOP)
-    yield numbers.configure(Key.P0, 5.0)
-    yield numbers.control(Command.START, 0)
-    yield numbers.control(Command.STATUS)
-    yield numbers.sample(0, run=0)
-    yield numbers.control(Command.RESET)
-    yield numbers.control(Command.STATUS)
-    yield numbers.sample(1, run=0)
+    yield from map(numbers.control, (Command.STATUS, Command.STOP, Command.STATUS))
+    yield from (numbers.sample(26), numbers.control(Command.STOP), numbers.configure(Key.P0, 5.0))
+    yield from (numbers.control(Command.START, 0), numbers.control(Command.STATUS), numbers.sample(0, run=0))
+    yield from (numbers.control(Command.RESET), numbers.control(Command.STATUS), numbers.sample(1, run=0))
     yield from _sure(numbers)
-    yield numbers.control(Command.START, 7)
-    yield numbers.block(0, run=7)
-    yield numbers.control(Command.STOP)
-    yield numbers.control(Command.REPORT_INTERVAL, 4)
-    yield numbers.control(Command.START, 7)
-    yield numbers.block(0, run=7)
-    yield Identify(numbers.next())
-    yield numbers.control(Command.STOP)
-    yield numbers.control(Command.STATUS)
+    yield from (numbers.control(Command.START, 7), numbers.block(0, run=7), numbers.control(Command.STOP))
+    yield from (numbers.control(Command.REPORT_INTERVAL, 4), numbers.control(Command.START, 7), numbers.block(0, run=7))
+    yield from (Identify(numbers.next()), numbers.control(Command.STOP), numbers.control(Command.STATUS))
     yield numbers.control(Command.START, 6)  # between two reports of the run before
-    yield numbers.block(0, run=6)
-    yield numbers.control(Command.STOP)
+    yield from (numbers.block(0, run=6), numbers.control(Command.STOP))
 
 
 def order(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
@@ -258,11 +235,7 @@ def order(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     yield from _sure(numbers)
     yield numbers.control(Command.START, RUN)
     first = numbers.block(0)
-    yield from (first, first)
-    yield numbers.sample(14)
-    yield numbers.sample(14)
-    yield numbers.sample(3)
-    yield numbers.block(13, 3)
+    yield from (first, first, *map(numbers.sample, (14, 14, 3)), numbers.block(13, 3))
     at = 16
     for interval, ahead in ((1, 1), (4, 3), (5, 11), (3, 1200)):
         yield numbers.control(Command.REPORT_INTERVAL, interval)
@@ -284,12 +257,8 @@ def order(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
         yield numbers.sample(at)
         if ahead >= INDICES // 2:
             at = (at - ahead) % INDICES
-    edge = numbers.block(INDICES - 20)
-    yield edge
-    yield numbers.block(INDICES - 6)
-    yield numbers.block(8)
-    yield numbers.control(Command.STATUS)
-    yield numbers.control(Command.STOP)
+    yield from map(numbers.block, (INDICES - 20, INDICES - 6, 8))
+    yield from map(numbers.control, (Command.STATUS, Command.STOP))
 
 
 def alarms(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
@@ -303,8 +272,7 @@ def alarms(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
             yield numbers.block(number * BLOCK_SAMPLES, missing=(1 << 13 | 1, 0, 0x1555, 0, 0, 0x2)[number])
         for index in range(6 * BLOCK_SAMPLES, 6 * BLOCK_SAMPLES + 12):
             yield numbers.sample(index, missing=index % 7 == 5)
-        yield numbers.control(Command.STOP)
-        yield numbers.control(Command.STATUS)
+        yield from map(numbers.control, (Command.STOP, Command.STATUS))
     yield numbers.control(Command.RESET)
 
 
@@ -312,11 +280,8 @@ def crowd(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     """More messages at once than their answers fit into the output of a port."""
     yield from _sure(numbers)
     yield numbers.control(Command.START, RUN)
-    for number in range(60):
-        yield numbers.block(number * BLOCK_SAMPLES)
-    for _ in range(20):
-        yield numbers.control(Command.STATUS)
-    yield numbers.control(Command.STOP)
+    yield from (numbers.block(number * BLOCK_SAMPLES) for number in range(60))
+    yield from map(numbers.control, (*[Command.STATUS] * 20, Command.STOP))
 
 
 def damage(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
@@ -377,16 +342,12 @@ def losses(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
         yield numbers.sample(number * (INDICES // 2) - 1)
         if number % 200 == 3:
             yield numbers.sample(number * (INDICES // 2) - 9)
-    yield numbers.control(Command.STATUS)
-    yield numbers.control(Command.STOP)
-
-
-_ON_SERIAL, _ON_CAN = (damage,), (foreign,)
+    yield from map(numbers.control, (Command.STATUS, Command.STOP))
 
 
 def is_for(script: str, *, can: bool) -> bool:
     """True unless the script is for lines of the other kind."""
-    return SCRIPTS[script] not in (_ON_SERIAL if can else _ON_CAN)
+    return script != ("damage" if can else "foreign")
 
 
 SCRIPTS: Mapping[str, Callable[[Numbered, DeviceBuild], Script]] = {

@@ -167,7 +167,12 @@ def record_may_end_anywhere(play: Play, scenario: Scenario, seed: int, ends: int
         if whole is None:
             whole = _played(play.on(play.bench.rig, device), scenario, seed)
         for end in range(whole.samples - ends + 1, whole.samples + 1):
-            rig = RecordingRig.of(_first(whole, end), Path("first samples"))
+            scenario_so_far = {**whole.conditions.scenario, "samples": end}
+            conditions = dataclasses.replace(whole.conditions, samples_asked=end, scenario=scenario_so_far)
+            first = dataclasses.replace(
+                whole, codes=whole.codes[:end], clipped=whole.clipped[:end], conditions=conditions
+            )
+            rig = RecordingRig.of(first, Path("first samples"))
             run = _played(play.on(rig, device), rig.scenario(), seed)
             if wrong := difference(run, whole):
                 return Finding(holds=False, why=f"a record of {end} samples: {wrong} than in a longer one", run=run)
@@ -191,10 +196,3 @@ def _played(play: Play, scenario: Scenario, seed: int) -> Run:
     if run.conditions.faults:
         raise Inconclusive(run.conditions.faults[0], run)
     return run
-
-
-def _first(run: Run, samples: int) -> Run:
-    """The first samples of a run whose scenario has no changes, as a run that was to have no more."""
-    scenario = {**run.conditions.scenario, "samples": samples}
-    conditions = dataclasses.replace(run.conditions, samples_asked=samples, scenario=scenario)
-    return dataclasses.replace(run, codes=run.codes[:samples], clipped=run.clipped[:samples], conditions=conditions)
