@@ -126,6 +126,10 @@ def _unpadded(digits: int, rounding: Form) -> Form:
     return form
 
 
+def _rounded(digits: int, x: Values) -> Values:
+    return np.round(x, digits)
+
+
 def _of_bits(change: Callable[[NDArray[np.uint32]], NDArray[Any]]) -> Form:
     """Change of the bits of the float."""
 
@@ -147,7 +151,7 @@ _FORMS: Sequence[tuple[str, Form]] = (
         (f"zeros after the point lost: {digits} digits printed as a whole number", _unpadded(digits, rounding))
         for digits, rounding in itertools.product((6, 5, 4, 3, 2), (np.rint, np.trunc))
     ),
-    *((f"rounded to {n} digits after the point", partial(lambda n, x: np.round(x, n), n)) for n in range(6)),
+    *((f"rounded to {n} digits after the point", partial(_rounded, n)) for n in range(6)),
     *(
         (f"cut to {n} digits after the point", partial(lambda n, x: np.trunc(x * 10.0**n) / 10.0**n, n))
         for n in range(6)

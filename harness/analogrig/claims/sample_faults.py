@@ -420,7 +420,8 @@ def _misread(name: str, step: int, feed: Feed) -> Feed:
 
 
 def _are_repeated(names: Sequence[str], feed: Feed) -> Mask:
-    return np.all([np.append([False], np.diff(getattr(feed, name)) == 0) for name in names], axis=0)
+    same = [np.append([False], np.diff(getattr(feed, name)) == 0) for name in names]
+    return np.asarray(np.all(same, axis=0))
 
 
 def _rescaled(scales: Mapping[str, tuple[np.float32, np.float32]], feed: Feed) -> Feed:
