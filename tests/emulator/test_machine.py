@@ -121,7 +121,7 @@ def test_operate_integrates_from_the_initial_voltage() -> None:
     np.testing.assert_allclose(volts, 4.0 - 2.0 * coefficient * np.arange(10) * SAMPLE_S / 1e-3, rtol=0, atol=1e-9)
 
 
-HELD_S: Volts = np.arange(1000) * SAMPLE_S
+HELD_S: Volts = np.arange(1000, dtype=np.float64) * SAMPLE_S
 BIAS = (VoltageSource("U1_minus_bias", "u1b", dc_v=-16.0), Resistor("U1_minus_ohm", "s", "u1b", 2e8))
 HELD: Mapping[str, tuple[Circuit, Volts]] = {
     "whatever the inputs do": (integrator(), np.full(1000, 4.0)),
