@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator import PotTurn
+from analogrig_emulator import TICKS_PER_SAMPLE, Edges, PotTurn
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 """The fixture of conftest.py: (deck, nodes, samples) -> voltages of the nodes at every sample, (samples, nodes)."""
@@ -22,3 +22,9 @@ THESIS_CHANGES = (
     PotTurn(500, {"B": 2123.0, "K": 20000.0}),
     PotTurn(600, {"M": 30.0}),
 )
+
+
+def steps(*changes: tuple[float, float]) -> dict[str, Edges]:
+    """Edges of V1 at (instant in samples, level)."""
+    instants, levels_v = np.array(changes).T
+    return {"V1": Edges(np.rint(instants * TICKS_PER_SAMPLE).astype(np.int64), levels_v)}

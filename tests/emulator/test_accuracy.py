@@ -60,12 +60,6 @@ def flow_file(name: str) -> str:
 # ---- ideal parts
 
 
-@pytest.mark.heavy
-@pytest.mark.parametrize("seed", GRAZING)
-def test_contacts_of_ideal_parts_play_the_equations(seed: int) -> None:
-    assert off_equations_lsb(compiled_random(seed), rtol=TIGHT) < MOST_LSB
-
-
 def test_an_open_limiter_of_ideal_parts_leaks_nothing() -> None:
     """Two masses within their gap: the equations have no force, and neither has the patch."""
     program = compiled_random(1)
@@ -76,9 +70,9 @@ def test_an_open_limiter_of_ideal_parts_leaks_nothing() -> None:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("seed", sorted({*range(0, 200, 5)}.difference(REFUSED)))
+@pytest.mark.parametrize("seed", sorted({*range(0, 200, 5), *GRAZING}.difference(REFUSED)))
 def test_ideal_parts_play_the_equations_of_random_programs(seed: int) -> None:
-    """A sample of 40 programs; `make programs ARGS=200` plays every one."""
+    """A sample of 40 programs, and those whose contacts graze; `make programs ARGS=200` plays every one."""
     assert off_equations_lsb(compiled_random(seed), rtol=TIGHT) < MOST_LSB
 
 

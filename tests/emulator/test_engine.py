@@ -35,7 +35,7 @@ from analogrig_emulator import (
     piecewise_linear,
 )
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
-from tests.emulator.plays import LSB_V, Volts
+from tests.emulator.plays import LSB_V, Volts, steps
 
 Slope = Callable[[float, Volts, float], tuple[float, ...]]
 
@@ -44,12 +44,6 @@ RATE = 2 * math.pi * 1e6
 """2 pi GBW of the op-amps in this file."""
 SLEW = 0.5e6
 OPAMP = OpAmpModel(gbw_hz=1e6, slew_v_per_s=SLEW, swing_v=(-13.5, 13.5))
-
-
-def steps(*changes: tuple[float, float]) -> dict[str, Edges]:
-    """Edges of V1 at (instant in samples, level)."""
-    instants, levels_v = np.array(changes).T
-    return {"V1": Edges(np.rint(instants * TICKS_PER_SAMPLE).astype(np.int64), levels_v)}
 
 
 def rc_ladder(sections: int) -> Circuit:
@@ -350,14 +344,9 @@ def follower_engine_watch() -> Engine:
     return Engine(piecewise_linear(Circuit([SOURCE, OpAmp("U1", "in", "out", "out", model)])), ["out"])
 
 
-def edges(*changes: tuple[float, float]) -> dict[str, Edges]:
-    instants, levels_v = np.array(changes).T
-    return {"V1": Edges(np.rint(instants * TICKS_PER_SAMPLE).astype(np.int64), levels_v)}
-
-
 def test_a_circuit_changed_between_two_samples_follows_both_exponentials() -> None:
     engine = Engine(low_pass(100e3), ["out"])
-    engine.run(1, edges((0.0, 10.0)))
+    engine.run(1, steps((0.0, 10.0)))
     engine.advance(TICKS_PER_SAMPLE // 4)
     engine.set_system(low_pass(20e3))
     volts = engine.run(2)[:, 0]
@@ -367,10 +356,10 @@ def test_a_circuit_changed_between_two_samples_follows_both_exponentials() -> No
 
 def test_edges_on_the_way_are_taken_and_the_window_begins_after_them() -> None:
     engine = Engine(low_pass(1.0), ["in"])
-    engine.run(1, edges((0.0, 1.0)))
-    engine.advance(TICKS_PER_SAMPLE // 2, edges((0.25, 2.0)))
+    engine.run(1, steps((0.0, 1.0)))
+    engine.advance(TICKS_PER_SAMPLE // 2, steps((0.25, 2.0)))
     assert engine.window(2) == (TICKS_PER_SAMPLE // 2 + 1, 2 * TICKS_PER_SAMPLE + 1)
-    assert engine.run(2, edges((1.5, 3.0)))[:, 0].tolist() == [2.0, 3.0]
+    assert engine.run(2, steps((1.5, 3.0)))[:, 0].tolist() == [2.0, 3.0]
 
 
 @pytest.mark.parametrize("tick", [-1, 2 * TICKS_PER_SAMPLE - 1, 3 * TICKS_PER_SAMPLE])
@@ -384,21 +373,21 @@ def test_an_instant_past_or_not_before_the_next_sample_is_refused(tick: int) -> 
 def test_the_watch_tells_when_patience_ended() -> None:
     engine = follower_engine_watch()
     engine.watch(TICKS_PER_SAMPLE // 4)
-    engine.run(3, edges((1.5, 10.0)))
+    engine.run(3, steps((1.5, 10.0)))
     assert engine.overdue_ticks.tolist() == [pytest.approx(1.75 * TICKS_PER_SAMPLE, abs=1)]
 
 
 def test_patience_counts_unbroken_stretches_only() -> None:
     engine = follower_engine_watch()
     engine.watch(TICKS_PER_SAMPLE // 2)
-    engine.run(6, edges((0.0, 10.0), (1.0, 0.0), (2.0, 10.0)))
+    engine.run(6, steps((0.0, 10.0), (1.0, 0.0), (2.0, 10.0)))
     assert engine.overdue_ticks.tolist() == [-1]
 
 
 def test_a_kink_that_is_outside_still_is_told_of_too() -> None:
     engine = follower_engine_watch()
     engine.watch(TICKS_PER_SAMPLE // 4)
-    engine.run(1, edges((0.0, 10.0)))
+    engine.run(1, steps((0.0, 10.0)))
     engine.advance(TICKS_PER_SAMPLE * 3 // 10)
     assert engine.overdue_ticks.tolist() == [TICKS_PER_SAMPLE // 4]
     engine.watch(TICKS_PER_SAMPLE // 20)

@@ -30,15 +30,9 @@ from analogrig_emulator import (
     to_spice,
 )
 from analogrig_emulator.circuit.nodal import Nodal
-from tests.emulator.plays import LSB_V, NgSpice
+from tests.emulator.plays import LSB_V, NgSpice, steps
 
 SOURCE = VoltageSource("V1", "in")
-
-
-def steps(*changes: tuple[float, float]) -> dict[str, Edges]:
-    """Edges of V1 at (instant in samples, level)."""
-    instants, levels_v = np.array(changes).T
-    return {"V1": Edges(np.rint(instants * TICKS_PER_SAMPLE).astype(np.int64), levels_v)}
 
 
 def back_to_back(name: str, a: str, b: str, threshold_v: float, on_ohm: float = 50.0) -> list[DiodeLimiter]:
