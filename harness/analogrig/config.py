@@ -9,8 +9,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
-import json
-import math
 import pkgutil
 import re
 import tomllib
@@ -169,46 +167,9 @@ def plain(value: Any) -> Any:
 
 def to_toml(table: Mapping[str, Any]) -> str:
     """Plain values as TOML that ``read_toml`` gives back: the scalars first, then the tables. None is left out."""
-    return "\n".join(_toml_lines(table, ())) + "\n"
+    import tomli_w
 
-
-def _toml_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
-    given = {key: value for key, value in table.items() if value is not None}
-    tables = {key: value for key, value in given.items() if isinstance(value, Mapping)}
-    lists = {key: value for key, value in given.items() if _is_tables(value)}
-    for key, value in given.items():
-        if key not in tables and key not in lists:
-            yield f"{_toml_key(key)} = {_toml_value(value)}"
-    for key, value in tables.items():
-        yield f"\n[{'.'.join(map(_toml_key, (*path, key)))}]"
-        yield from _toml_lines(value, (*path, key))
-    for key, values in lists.items():
-        for value in values:
-            yield f"\n[[{'.'.join(map(_toml_key, (*path, key)))}]]"
-            yield from _toml_lines(value, (*path, key))
-
-
-def _is_tables(value: Any) -> bool:
-    return isinstance(value, list | tuple) and bool(value) and all(isinstance(item, Mapping) for item in value)
-
-
-def _toml_key(key: str) -> str:
-    return key if key and all(c.isascii() and (c.isalnum() or c in "_-") for c in key) else json.dumps(key)
-
-
-_NOT_IN_LINES = {*map(chr, range(32)), "\x7f", '"', "\\"} - {"\n", "\t"}
-"""Characters that keep a text from being written as lines between triple quotes."""
-
-
-def _toml_value(value: Any) -> str:
-    """TOML of strings, numbers, booleans and arrays of them, for which JSON text is valid TOML."""
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_toml_value, value))}]"
-    if isinstance(value, float) and not math.isfinite(value):
-        return "nan" if math.isnan(value) else "inf" if value > 0.0 else "-inf"
-    if isinstance(value, str) and "\n" in value and value.isascii() and not _NOT_IN_LINES & {*value}:
-        return f'"""\n{value}"""'
-    return json.dumps(value)
+    return tomli_w.dumps(plain(table), multiline_strings=True)
 
 
 def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
