@@ -60,7 +60,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "lazy",
         "pages",
     ),
-    ("run", "scenario", "header", "trust", "identity", "signals", "output"),
+    ("run", "scenario", "trust", "identity", "signals", "output"),
     ("links",),
     ("protocol",),
     ("devices", "rigs", "judging"),

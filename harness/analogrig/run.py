@@ -16,7 +16,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,13 @@ from analogrig.answers import MOST_FREQUENCY
 from analogrig.catalogue import Cause, Change
 from analogrig.datasheet import Datasheet
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.header import check_tables
+from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.identity import Identity
 from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment
 from analogrig.program import Program
-from analogrig.scenario import DEFAULT_PROGRAM, program_of
+from analogrig.scenario import DEFAULT_PROGRAM, Expectations, Statement, program_of
 from analogrig.storage import replace_file
+from analogrig_emulator import Excitation
 
 __all__ = ["IMPORTED", "INPUT", "LOST", "MAX_CODES", "OUTPUT", "Channel", "missing_samples"]
 """Names for packages beside the core."""
@@ -44,6 +45,12 @@ CHUNK_SAMPLES = 1 << 16
 """Samples per chunk. Long runs are processed in chunks to bound the memory of intermediate results."""
 
 MAX_CODES = 1 << 16
+
+_MOST_COUNT = 2**31
+"""Largest number of samples, bits per second or the like in a description."""
+
+_NEEDED_SETTINGS = ("na", "nb", "offset", "trigger")
+"""Settings without a default, because each of them changes the verdict; so does the ceiling of a trigger."""
 
 _LEAST_MAGNITUDE, _MOST_MAGNITUDE = 1e-12, 1e9
 """Limits of every plausible unit, time or noise, exclusive."""
@@ -135,6 +142,79 @@ def missing_samples(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
+class ScenarioFacts:
+    """Keys of a recorded scenario that a verdict or a page reads."""
+
+    name: str
+    description: str = ""
+    expect: Expectations = field(default_factory=Expectations)
+    excitation: Excitation | None = None
+    statement: Statement | None = None
+
+
+@dataclass(frozen=True)
+class RigFacts:
+    """Keys of a rig's description that a verdict or a page reads."""
+
+    name: str
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class DeviceFacts:
+    """Keys of a device's description that a verdict or a page reads."""
+
+    name: str
+    kind: str = ""
+    estimator: Mapping[str, Any] | None = None
+    """Settings of an estimator of our catalogue; ``Conditions.estimator`` has them typed."""
+    datasheet: Datasheet | None = None
+    alarm_is: str = "event"
+    report_interval_n: int = 1
+    most_lost_n: int = 0
+    assumed_n: int = 0
+    """Settings that a CAN log lacks."""
+    identity: Mapping[str, int | str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, least in (("report_interval_n", 1), ("most_lost_n", 0), ("assumed_n", 0)):
+            if not least <= getattr(self, name) <= _MOST_COUNT:
+                raise ValueError(f"{name} must be {least} to {_MOST_COUNT}, not {getattr(self, name)}")
+        if self.estimator is None and self.datasheet is None:
+            raise ValueError("the key 'estimator' or 'datasheet' is lacking")
+
+    def settings(self, where: str) -> EstimatorConfig | None:
+        """``estimator`` typed; ``where`` leads every error.
+
+        :raises ConfigurationError: a setting is wrong, or one is absent that changes the verdict.
+        """
+        if self.estimator is None:
+            return None
+        needed = (*_NEEDED_SETTINGS, *(() if self.estimator.get("trigger") == "none" else ("ceiling",)))
+        if lacking := [key for key in needed if key not in self.estimator]:
+            raise ConfigurationError(f"{where}: estimator: the key {lacking[0]!r} is lacking")
+        settings = config.build(EstimatorConfig, self.estimator, f"{where}: estimator")
+        try:
+            settings.check_ranges()
+        except ValueError as error:
+            raise ConfigurationError(f"{where}: {error}") from error
+        if settings.parameters > MAX_PARAMETERS:
+            raise ConfigurationError(
+                f"{where}: estimator: {settings.parameters} parameters, of at most {MAX_PARAMETERS}"
+            )
+        return settings
+
+
+Facts = TypeVar("Facts", ScenarioFacts, RigFacts, DeviceFacts)
+
+
+def _facts(kind: type[Facts], table: Mapping[str, Any], where: str) -> Facts:
+    """Build ``kind`` from the keys that it has; ignore the others, which replays read."""
+    names = {each.name for each in dataclasses.fields(kind)}
+    return config.build(kind, {key: value for key, value in table.items() if key in names}, where)
+
+
+@dataclass(frozen=True)
 class Conditions:
     """Conditions of a run: seed, sample times, the true plant, and the descriptions of scenario, rig, device and link.
 
@@ -151,11 +231,12 @@ class Conditions:
     segments: tuple[Segment, ...]
     """True plant, which the device never receives; empty if the rig does not know it."""
     scenario: Mapping[str, Any]
-    """Scenario as a TOML table, with its name."""
+    """Scenario as a TOML table, with its name; ``played`` has what a verdict reads of it."""
     rig: Mapping[str, Any]
-    """Description of the rig, with its name."""
+    """Description of the rig, with its name; ``source`` has what a verdict reads of it."""
     dut: Mapping[str, Any]
-    """Device: name, kind, settings, data sheet, identity (firmware, catalogue hash, boot nonce)."""
+    """Device: name, kind, settings, data sheet, identity (firmware, catalogue hash, boot nonce); ``device``,
+    ``estimator`` and ``datasheet`` have what a verdict reads of it."""
     link: str
     counters: Mapping[str, int] = field(default_factory=dict)
     """Counters of the device at the end."""
@@ -181,6 +262,46 @@ class Conditions:
     """Provenance; None if not recorded."""
     program: Program = field(default_factory=lambda: Program.load(DEFAULT_PROGRAM))
     """Program of the scenario; its channels are the columns of the samples."""
+
+    @functools.cached_property
+    def played(self) -> ScenarioFacts:
+        """:raises ConfigurationError: the scenario lacks a key that a verdict reads, or has a wrong one."""
+        return _facts(ScenarioFacts, self.scenario, "the recorded scenario")
+
+    @functools.cached_property
+    def source(self) -> RigFacts:
+        """:raises ConfigurationError: as ``played``, of the rig."""
+        return _facts(RigFacts, self.rig, "the recorded rig")
+
+    @functools.cached_property
+    def device(self) -> DeviceFacts:
+        """:raises ConfigurationError: as ``played``, of the device."""
+        return _facts(DeviceFacts, self.dut, "the recorded device")
+
+    @functools.cached_property
+    def estimator(self) -> EstimatorConfig | None:
+        """Settings of the device; None if it is none of our catalogue.
+
+        :raises ConfigurationError: as ``played``, of the device.
+        """
+        return self.device.settings("the recorded device")
+
+    @functools.cached_property
+    def datasheet(self) -> Datasheet:
+        """Data sheet of the device: its own, or that of its estimator's settings."""
+        return self.device.datasheet or Datasheet.of_estimator(self.dut["estimator"])
+
+    def check(self, where: str) -> None:
+        """Check each key of the descriptions that a verdict reads; ``where`` leads every error.
+
+        :raises ConfigurationError: a key is absent or wrong.
+        """
+        _facts(ScenarioFacts, self.scenario, f"{where}: scenario")
+        _facts(RigFacts, self.rig, f"{where}: rig")
+        _facts(DeviceFacts, self.dut, f"{where}: dut").settings(f"{where}: dut")
+        for name, value in self.line.items():
+            if not 1 <= value <= _MOST_COUNT:
+                raise ConfigurationError(f"{where}: line: {name} must be 1 to {_MOST_COUNT}, not {value}")
 
     @property
     def sample_period_problem_s(self) -> float:
@@ -244,10 +365,10 @@ class Run:
         """Number of samples that were played."""
         return len(self.codes)
 
-    @functools.cached_property
+    @property
     def datasheet(self) -> Datasheet:
         """Data sheet of the device."""
-        return _datasheet_of(self.conditions.dut)
+        return self.conditions.datasheet
 
     @functools.cached_property
     def missing(self) -> NDArray[np.bool_]:
@@ -353,28 +474,15 @@ class Run:
         run._check_consistency(path)
         return run
 
-    def _recorded_datasheet(self, path: Path) -> Datasheet:
-        """Data sheet of the recorded device.
-
-        :raises RecordingError: a table of the header lacks a key that a verdict reads, or has a wrong one.
-        """
-        conditions = self.conditions
-        try:
-            return check_tables(
-                f"{path}: the header of the recording",
-                scenario=conditions.scenario,
-                rig=conditions.rig,
-                dut=conditions.dut,
-                line=conditions.line,
-            )
-        except ConfigurationError as error:
-            raise RecordingError(str(error)) from error
-
     def _check_consistency(self, path: Path) -> None:
         """Check the arrays against each other and against the header.
 
-        :raises RecordingError: names every check that failed.
+        :raises RecordingError: names every check that failed, or the key of a description that is wrong.
         """
+        try:
+            self.conditions.check(f"{path}: the header of the recording")
+        except ConfigurationError as error:
+            raise RecordingError(str(error)) from error
         n, alarms, diagnoses = self.samples, len(self.alarm_index), len(self.diagnosis_index)
         misfits = len(self.misfit_index)
         conditions = self.conditions
@@ -421,9 +529,8 @@ class Run:
             "misfits": _are_sample_indices(self.misfit_index, n)
             and set(self.misfit_cause.tolist()) <= set(Cause)
             and bool(((self.misfit_frequency >= 0.0) & (self.misfit_frequency <= MOST_FREQUENCY)).all()),
-            "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
-            "theta": self.theta.shape[1] == self._recorded_datasheet(path).theta_n,
+            "theta": self.theta.shape[1] == conditions.datasheet.theta_n,
         }
         wrong = [what for what, holds in checks.items() if not holds]
         if wrong:
@@ -484,7 +591,8 @@ def _check_array(name: str, array: NDArray[Any]) -> NDArray[Any]:
 
 def _to_json(conditions: Conditions) -> dict[str, Any]:
     """Header of the file in plain JSON types."""
-    out = {name: value for name, value in vars(conditions).items() if name != "program"}  # the scenario holds it
+    names = (each.name for each in dataclasses.fields(conditions) if each.name != "program")  # the scenario holds it
+    out = {name: getattr(conditions, name) for name in names}
     if (identity := out.pop("identity")) is not None:
         out["identity"] = identity.as_table()
     out["channels"] = {name: vars(channel) for name, channel in conditions.channels.items()}
@@ -529,14 +637,3 @@ def _with_plant(segment: Any, program: Program, where: str) -> Any:
         return {**segment, "plant": Plant.of(program, values)}
     except ValueError as error:
         raise ConfigurationError(f"{where}: plant: {error}") from error
-
-
-_datasheet: tuple[Mapping[str, Any], Datasheet] | None = None
-"""Last data sheet, and the description that it is from: consecutive runs of a device share their description."""
-
-
-def _datasheet_of(dut: Mapping[str, Any]) -> Datasheet:
-    global _datasheet  # noqa: PLW0603 - a cache of one entry
-    if _datasheet is None or _datasheet[0] is not dut:
-        _datasheet = dut, Datasheet.recorded(dut)
-    return _datasheet[1]

@@ -259,5 +259,5 @@ def _lines(run: Run, arguments: argparse.Namespace) -> list[str]:
         assumed = ", as no unit is stated" if name in unstated else ""
         span = f"{channel.codes} codes from {low:.5g} to {high:.5g} {channel.unit}{assumed}"
         lines.append(f"{name.replace('_', ' ')}: {span}{converted}")
-    known = f"that of scenario {conditions.scenario['name']}" if conditions.segments else "unknown: UNJUDGED"
+    known = f"that of scenario {conditions.played.name}" if conditions.segments else "unknown: UNJUDGED"
     return [*lines, *_caveats(run), f"truth: {known}", f"next: analogrig replay {arguments.out} --dut inproc"]

@@ -159,8 +159,8 @@ def compare_rigs(
     rows_a, rows_b = zip(*rows, strict=True)
     keyed_a, keyed_b = ([((scenario.name, each["seed"]), each) for each in rows] for rows in (rows_a, rows_b))
     return RigComparison(
-        a=str(runs[0][0].conditions.rig["name"]),
-        b=str(runs[0][1].conditions.rig["name"]),
+        a=runs[0][0].conditions.source.name,
+        b=runs[0][1].conditions.source.name,
         scenario=scenario.name,
         confidence=confidence,
         plays=len(runs),
@@ -173,7 +173,7 @@ def compare_rigs(
 
 
 def _why_invalid(run: Run, row: Row) -> str:
-    return f"{run.conditions.rig['name']}, seed {row['seed']}: {row.get('why', 'inconclusive')}"
+    return f"{run.conditions.source.name}, seed {row['seed']}: {row.get('why', 'inconclusive')}"
 
 
 # --------------------------------------------------------------------------------------------------------- the signals

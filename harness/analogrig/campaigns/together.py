@@ -22,8 +22,8 @@ from analogrig.devices.device import DeviceDescription
 from analogrig.judging import information
 from analogrig.judging.courses import Model, Trajectory, Values
 from analogrig.judging.exposure import exposures
-from analogrig.judging.machine_model import PREFIX, Machine, is_played, machine_of, recorded_rig
-from analogrig.judging.verdict import Verdict, expectations_of, is_exact, judge_with, segment_estimates
+from analogrig.judging.machine_model import PREFIX, Machine, RecordedRig, is_played
+from analogrig.judging.verdict import Verdict, is_exact, judge_with, segment_estimates
 from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import Conditions, Run
@@ -153,7 +153,7 @@ def _common(run: Run) -> tuple[object, ...]:
 
 def _judge_alike(runs: Sequence[Run]) -> Iterator[Verdict]:
     models = models_of(runs) if is_exact(runs[0]) else [None] * len(runs)
-    expect = itertools.repeat(expectations_of(runs[0]))
+    expect = itertools.repeat(runs[0].conditions.played.expect)
     return map(judge_with, runs, expect, models, exposures(runs), segment_estimates(runs))
 
 
@@ -165,24 +165,25 @@ def models_of(runs: Sequence[Run]) -> Sequence[Model | None]:
     first = runs[0]
     has_ramps = any(segment.ramp_n for segment in first.conditions.segments)
     if len(runs) > 1 and is_played(first) and len(first.segments) > 1 and not has_ramps:
-        recorded = recorded_rig(first.conditions.rig, first.conditions.scenario)
+        recorded, repeated = _recorded(first.conditions)
         with emulator_errors(PREFIX):
             seeds = [run.conditions.seed for run in runs]
-            courses = _repeated(recorded.rig).courses_together(recorded.scenario, seeds, first.samples)
+            courses = repeated.courses_together(recorded.scenario, seeds, first.samples)
         if courses is not None:
             together = _Together(courses, first)
-            return [_OneOfMany(run, together, place) for place, run in enumerate(runs)]
+            return [_OneOfMany(run, recorded, together, place) for place, run in enumerate(runs)]
     return [information.model_of(run) for run in runs]
 
 
-_last: tuple[EmulatorRig, RepeatedRig] | None = None
-"""Rig of the last runs, with the one that plays them together: consecutive runs share their rig."""
+_last: tuple[Conditions, tuple[RecordedRig, RepeatedRig]] | None = None
+"""Rig of the last runs, with the one that plays them together: consecutive runs share their descriptions."""
 
 
-def _repeated(rig: EmulatorRig) -> RepeatedRig:
+def _recorded(conditions: Conditions) -> tuple[RecordedRig, RepeatedRig]:
     global _last  # noqa: PLW0603 - a cache of one entry
-    if _last is None or _last[0] is not rig:
-        _last = rig, RepeatedRig(rig)
+    if _last is None or _last[0].rig is not conditions.rig or _last[0].scenario is not conditions.scenario:
+        recorded = RecordedRig.of(conditions)
+        _last = conditions, (recorded, RepeatedRig(recorded.rig))
     return _last[1]
 
 
@@ -225,12 +226,12 @@ class _PartOfMany:
 class _OneOfMany:
     """Machine of a run, as a model of its plant: courses up to the next change are played for all runs together."""
 
-    def __init__(self, run: Run, together: _Together, place: int) -> None:
-        self._run, self._together, self._place = run, together, place
+    def __init__(self, run: Run, recorded: RecordedRig, together: _Together, place: int) -> None:
+        self._run, self._recorded, self._together, self._place = run, recorded, together, place
 
     @functools.cached_property
-    def _alone(self) -> Machine | None:
-        return machine_of(self._run)
+    def _alone(self) -> Machine:
+        return self._recorded.machine(self._run)
 
     def at_rest(self, start: int, values: Values) -> Moment:  # noqa: ARG002 - as of a machine
         return self._together.at_rest
@@ -241,4 +242,4 @@ class _OneOfMany:
         return _PartOfMany(courses_lsb[self._place], end)
 
     def rival(self, moment: Moment, values: Values) -> Trajectory | None:
-        return None if self._alone is None else self._alone.rival(moment, values)
+        return self._alone.rival(moment, values)

@@ -187,7 +187,7 @@ def compare_with_library(run: Run, before: Run | None = None, *, explain: bool =
     claimed = library.replay(feed)
     compared = tuple(np.array(answered.columns)[answered.compared.any(axis=0)].tolist())
     if not compared:
-        raise ConfigurationError(f"device {conditions.dut.get('name')}: reports nothing that can be compared")
+        raise ConfigurationError(f"device {conditions.device.name}: reports nothing that can be compared")
     first, note = answered.first_difference(claimed), answered.coarse
     equations_n = np.count_nonzero(claimed[:first, answered.columns.index(INNOVATION)])
     is_rounded = first < run.samples and bool(equations_n < _EXACT_N)

@@ -145,12 +145,13 @@ def _replay(arguments: argparse.Namespace) -> int:
         from analogrig.devices.registry import open_dut, reopen_dut
         from analogrig.errors import ConfigurationError
         from analogrig.rigs.recording import RecordingRig
+        from analogrig.run import IMPORTED
 
         if arguments.dut is None and is_capture(arguments.file):
             raise ConfigurationError(f"{arguments.file}: a CAN log does not name its device: name one with --dut")
         with RecordingRig.of(load_capture(arguments), arguments.file) as rig:
             conditions = rig.run.conditions
-            if arguments.dut is None and conditions.dut.get("kind") == "import":
+            if arguments.dut is None and conditions.device.kind == IMPORTED:
                 raise ConfigurationError(f"{arguments.file}: measured data has no device: name one with --dut")
             device: Callable[..., Device] = functools.partial(reopen_dut, conditions.dut, str(arguments.file))
             if arguments.dut:
@@ -191,7 +192,7 @@ def _judge(arguments: argparse.Namespace) -> int:
         from analogrig.run import IMPORTED
 
         run = load_capture(arguments)
-        if run.conditions.dut.get("kind") == IMPORTED:
+        if run.conditions.device.kind == IMPORTED:
             raise ConfigurationError(
                 f"{arguments.file}: no device has answered these samples: judge the run of analogrig replay"
                 f" {arguments.file} --dut NAME"
@@ -295,8 +296,8 @@ def _as_json(run: Run, verdict: Verdict, identity: Identity, output: OutputFolde
 
     conditions = run.conditions
     return {
-        "scenario": conditions.scenario["name"],
-        "rig": conditions.rig["name"],
+        "scenario": conditions.played.name,
+        "rig": conditions.source.name,
         "dut": dict(conditions.dut),
         "link": conditions.link,
         "line_s": conditions.line_s,

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig import config
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.judging.misread import misreadings
@@ -86,13 +85,13 @@ def _cure_and_cause(period: MisfitPeriod) -> tuple[str, str]:
 
 def _orders(run: Run, verdict: Verdict) -> Iterator[str]:
     """Sentence on the orders of a model that the program chose, or that are below those of the program."""
-    program, model, estimator = run.conditions.program, run.datasheet.model, run.conditions.dut.get("estimator", {})
-    if not run.conditions.segments or model is None or estimator.get("trigger") == "none":
+    program, model, estimator = run.conditions.program, run.datasheet.model, run.conditions.estimator
+    if not run.conditions.segments or model is None or (estimator is not None and estimator.trigger == "none"):
         return
-    if estimator.get("orders") == "program" and model.na != EstimatorConfig.na:
+    if estimator is not None and estimator.orders == "program" and model.na != EstimatorConfig.na:
         yield (
             f"the program {program.name}, of order {program.order}, chose the device's settings: na = {model.na},"
-            f" nb = {model.nb}, forgetting = {estimator['forgetting']:g}, C fixed"
+            f" nb = {model.nb}, forgetting = {estimator.forgetting:g}, C fixed"
         )
     elif model.na < program.order:
         cure = ' set orders = "program" under [estimator]' if estimator else " choose a model of that order"
@@ -127,17 +126,15 @@ def _theta_without_a_model(run: Run) -> Iterator[str]:
 
 
 def _statement(run: Run) -> Iterator[str]:
-    statement = run.conditions.scenario.get("statement")
-    if statement:
+    if statement := run.conditions.played.statement:
         yield (
-            f"the scenario's [statement] {statement['name']} is not judged here, only [expect]:"
+            f"the scenario's [statement] {statement.name} is not judged here, only [expect]:"
             " pytest --hil-scenario-dir FOLDER judges the statement"
         )
 
 
 def _assumed_settings(run: Run) -> Iterator[str]:
-    assumed_n = run.conditions.dut.get("assumed_n", 0)
-    if assumed_n:
+    if assumed_n := run.conditions.device.assumed_n:
         settings = number_of(
             assumed_n,
             "setting of the device is not in the log and was",
@@ -150,10 +147,9 @@ def _assumed_settings(run: Run) -> Iterator[str]:
 
 
 def _excitation_beyond_the_scales(run: Run, verdict: Verdict) -> Iterator[str]:
-    table, program = run.conditions.scenario.get("excitation"), run.conditions.program
-    if not run.conditions.segments or table is None or not (verdict.overloads or run.clipped.any()):
+    played, program = run.conditions.played.excitation, run.conditions.program
+    if not run.conditions.segments or played is None or not (verdict.overloads or run.clipped.any()):
         return
-    played = config.build(Excitation, table, "the recorded excitation")
     driven, volts = program.channels[0], program.circuit.scales.volts(program.channels[0])
     low_v, high_v = (level * volts for level in program.equations.inputs[driven].trial)
     levels_v = played.samples_v or (played.low_v, played.high_v)
@@ -206,7 +202,7 @@ def _name(fault: ChannelFault) -> str:
 
 
 def _noise_setting(run: Run) -> Iterator[str]:
-    if run.conditions.dut.get("estimator", {}).get("noise_estimated"):
+    if run.conditions.estimator is not None and run.conditions.estimator.noise_estimated:
         return  # the device follows the noise, starting with noise_variance
     measured = run.conditions.output.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2
     expected = run.datasheet.noise_variance
@@ -221,7 +217,7 @@ def _edge_spacing(run: Run) -> Iterator[str]:
     excitation = _excitation(run)
     if excitation is None or excitation.clock == "card":
         return
-    if run.conditions.dut.get("estimator", {"edge_instants": "anywhere"}).get("edge_instants") == "anywhere":
+    if run.conditions.estimator is None or run.conditions.estimator.edge_instants == "anywhere":
         return
     intervals = np.diff(_edge_instants(run, excitation))
     if len(intervals) and np.abs(intervals - np.round(intervals)).max() > MOST_EDGE_SHIFT:
@@ -256,8 +252,7 @@ def _changes_in_warm_up(run: Run, verdict: Verdict) -> Iterator[str]:
 
 def _excitation(run: Run) -> Excitation | None:
     """Recorded excitation with edges; None if the scenario has none, or nothing is known of it."""
-    table = run.conditions.scenario.get("excitation") if run.conditions.segments else None
-    found = None if table is None else config.build(Excitation, table, "the recorded excitation")
+    found = run.conditions.played.excitation if run.conditions.segments else None
     return None if found is None or found.is_smooth else found
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from analogrig.judging.courses import Values
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors, is_emulated
 from analogrig.rigs.rig import Rig
-from analogrig.run import OUTPUT, Channel, Run
+from analogrig.run import OUTPUT, Channel, Conditions, Run
 from analogrig.scenario import DEFAULT_SEED, Scenario
 from analogrig_emulator import Course, Courses, LinearMode, Moment
 
@@ -67,15 +66,24 @@ class Machine:
 
 
 class RecordedRig(NamedTuple):
-    """Rig and scenario of a run, with the tables that describe them."""
+    """Rig and scenario of a run."""
 
-    tables: tuple[Mapping[str, Any], Mapping[str, Any]]
     rig: EmulatorRig
     scenario: Scenario
 
+    @classmethod
+    def of(cls, conditions: Conditions) -> RecordedRig:
+        """:raises ConfigurationError: the recorded rig or scenario does not describe a machine."""
+        description = config.build(EmulatorDescription, config.plain(conditions.rig), "the recorded rig")
+        with emulator_errors("the recorded rig: "):
+            rig = EmulatorRig(description)
+        return cls(rig, Scenario.from_table(config.plain(conditions.scenario), "the recorded scenario"))
 
-_last: RecordedRig | None = None
-"""Those of the last run: consecutive runs of a bench share their tables."""
+    def machine(self, run: Run) -> Machine:
+        """Machine that played one of their runs."""
+        with emulator_errors(PREFIX):
+            courses = self.rig.courses(self.scenario, run.conditions.seed, run.samples)
+        return Machine(courses, run.conditions.output.lsb_v)
 
 
 def machine_of(run: Run) -> Machine | None:
@@ -83,18 +91,12 @@ def machine_of(run: Run) -> Machine | None:
 
     :raises ConfigurationError: the recorded rig or scenario does not describe a machine.
     """
-    if not is_played(run):
-        return None
-    conditions = run.conditions
-    recorded = recorded_rig(conditions.rig, conditions.scenario)
-    with emulator_errors(PREFIX):
-        courses = recorded.rig.courses(recorded.scenario, conditions.seed, run.samples)
-    return Machine(courses, conditions.output.lsb_v)
+    return RecordedRig.of(run.conditions).machine(run) if is_played(run) else None
 
 
 def is_played(run: Run) -> bool:
     """True if an emulator played a run without a gap, so that it has a machine."""
-    return run.conditions.rig.get("kind") == "emulator" and len(run.conditions.records) <= 1
+    return run.conditions.source.kind == "emulator" and len(run.conditions.records) <= 1
 
 
 def predicted(scenario: Scenario, rig: str | Rig) -> tuple[Machine, Channel]:
@@ -110,16 +112,3 @@ def predicted(scenario: Scenario, rig: str | Rig) -> tuple[Machine, Channel]:
     output = opened.perform(in_phase, seed).channels[scenario.program.channels[OUTPUT]]
     with emulator_errors(f"scenario {scenario.name}: "):
         return Machine(opened.courses(in_phase, seed, scenario.samples), output.lsb_v), output
-
-
-def recorded_rig(rig: Mapping[str, Any], scenario: Mapping[str, Any]) -> RecordedRig:
-    """Rig and scenario of these tables of a run; those of the last call if the tables are the same objects."""
-    global _last  # noqa: PLW0603 - a cache of one entry
-    if _last is None or _last.tables[0] is not rig or _last.tables[1] is not scenario:
-        description = config.build(EmulatorDescription, config.plain(rig), "the recorded rig")
-        with emulator_errors("the recorded rig: "):
-            opened = EmulatorRig(description)
-        _last = RecordedRig(
-            (rig, scenario), opened, Scenario.from_table(config.plain(scenario), "the recorded scenario")
-        )
-    return _last

@@ -44,7 +44,7 @@ def _refused(run: Run) -> Iterator[str]:
 
 def _alarms_in_a_row(run: Run) -> Iterator[str]:
     samples = np.unique(run.alarm_index)
-    is_level = run.datasheet.latches or run.conditions.dut.get("alarm_is", "event") != "event"
+    is_level = run.datasheet.latches or run.conditions.device.alarm_is != "event"
     if is_level or not len(samples):
         return
     ends = np.flatnonzero(np.diff(samples) > 1)

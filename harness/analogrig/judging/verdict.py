@@ -21,7 +21,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig import config
 from analogrig.catalogue import Cause, Change, SteppedFlag
 from analogrig.datasheet import Datasheet
 from analogrig.judging import information
@@ -333,7 +332,7 @@ class Verdict:
 
 def is_captured(run: Run) -> bool:
     """True if the run was read from a CAN log. Gaps in a log do not prove that the device lost samples."""
-    return bool(run.conditions.dut.get("kind") == "log")
+    return run.conditions.device.kind == "log"
 
 
 def missing_text(run: Run) -> str:
@@ -347,15 +346,7 @@ def judge(run: Run) -> Verdict:
     :raises ConfigurationError: the recorded scenario has an invalid expectation.
     """
     model = information.model_of(run) if is_exact(run) else None
-    return judge_with(run, expectations_of(run), model, exposure(run), segment_estimates([run])[0])
-
-
-def expectations_of(run: Run) -> Expectations:
-    """Expectations of the recorded scenario.
-
-    :raises ConfigurationError: one is invalid.
-    """
-    return config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
+    return judge_with(run, run.conditions.played.expect, model, exposure(run), segment_estimates([run])[0])
 
 
 def judge_with(
@@ -369,7 +360,7 @@ def judge_with(
     level = sheet.log_arl0(expect.arl0)
     results = _evaluate_hypotheses(run, model, expect, level)
     invalid = invalid_reasons(run, shown, expect)
-    if run.conditions.rig.get("kind") == IMPORTED and _shows_no_change(results):
+    if run.conditions.source.kind == IMPORTED and _shows_no_change(results):
         invalid.append(UNDETECTABLE)
     outcome, reasons = _decide_outcome(results, expect)
     findings = [shown.contradiction] if shown.contradiction else []
@@ -732,11 +723,11 @@ def invalid_reasons(run: Run, shown: Exposure, expect: Expectations) -> list[str
 
 def refusal_cause(run: Run) -> str:
     """End of a sentence on samples that the device refused: the causes it counted, and the first of them."""
-    counters, settings = run.conditions.counters, run.conditions.dut.get("estimator", {})
-    limits = " to ".join(f"{settings[key]:g}" for key in ("code_low", "code_high") if key in settings)
+    counters, settings = run.conditions.counters, run.conditions.estimator
+    limits = "" if settings is None else f"{settings.code_low:g} to {settings.code_high:g}"
     known = {
         f"with u or y saturated, at or beyond codes {limits}": counters.get("saturated", 0),
-        f"with a stuck y (stuck_n = {settings.get('stuck_n', 'unknown')})": counters.get("stuck", 0),
+        f"with a stuck y (stuck_n = {settings.stuck_n if settings else 'unknown'})": counters.get("stuck", 0),
     }
     causes = [f"{n} {text}" for text, n in known.items() if n]
     at = np.flatnonzero((run.flags & (SteppedFlag.REFUSED | LOST)) == SteppedFlag.REFUSED)
@@ -748,7 +739,7 @@ def refusal_cause(run: Run) -> str:
 
 def _loss_reasons(run: Run) -> list[str]:
     """Reasons for invalidity from lost samples: too many, or counts of device and harness that disagree."""
-    is_lost, most = run.lost, int(run.conditions.dut.get("most_lost_n", 0))
+    is_lost, most = run.lost, run.conditions.device.most_lost_n
     lost = int(np.count_nonzero(is_lost))
     causes = run.conditions.losses[:_MOST_CAUSES]
     where = "lost" if causes else "lost on the way to the device"

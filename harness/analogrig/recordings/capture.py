@@ -156,7 +156,7 @@ def replace_scenario(run: Run, scenario: Scenario) -> Run:
         )
     if scenario.program.channels != run.conditions.program.channels:
         there, here = (", ".join(each.channels) for each in (run.conditions.program, scenario.program))
-        cure = ": import it again with --scenario" if run.conditions.rig.get("kind") == IMPORTED else ""
+        cure = ": import it again with --scenario" if run.conditions.source.kind == IMPORTED else ""
         raise ConfigurationError(f"the recording has the channels {there}, scenario {scenario.name} {here}{cure}")
     conditions = dataclasses.replace(
         run.conditions,

@@ -31,7 +31,7 @@ def scaled_to_program(conditions: Conditions) -> Conditions:
         or the machine is too fast.
     """
     rig = conditions.rig
-    if rig.get("kind") != IMPORTED or "rig" in rig:  # a play, or data with the units and the rate of a rig
+    if conditions.source.kind != IMPORTED or "rig" in rig:  # a play, or data with the units and the rate of a rig
         return conditions
     program, clock = conditions.program, rig.get("clock")
     conditions = in_units(conditions, program.equations, program.measured)

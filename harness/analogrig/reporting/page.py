@@ -36,7 +36,7 @@ def render(run: Run, verdict: Verdict) -> str:
     :raises RecordingError: uPlot is not installed by the build.
     """
     context, program = run.conditions, run.conditions.program
-    name = f"{context.scenario['name']} on {context.rig['name']}, device {context.dut['name']}"
+    name = f"{context.played.name} on {context.source.name}, device {context.device.name}"
     problem_ms, machine_us = context.sample_period_problem_s * 1e3, context.sample_period_s * 1e6
     return render_page(
         "run.html",
@@ -63,14 +63,14 @@ def render(run: Run, verdict: Verdict) -> str:
 def _conditions(run: Run, verdict: Verdict) -> list[tuple[str, object]]:
     """Scenario, rig, device, link and provenance, with their names."""
     context = run.conditions
-    description = context.scenario.get("description")
+    scenario = context.played
     asked = context.samples_asked
     played = f"{run.samples:,}" if run.samples == asked else f"{run.samples:,} of {asked:,} asked"
     return [
-        ("Scenario", f"{context.scenario['name']}{f': {description}' if description else ''}"),
-        ("Rig", context.rig["name"]),
-        ("Device", context.dut["name"]),
-        ("Firmware", _firmware(context.dut.get("identity", {})) or "unknown"),
+        ("Scenario", f"{scenario.name}{f': {scenario.description}' if scenario.description else ''}"),
+        ("Rig", context.source.name),
+        ("Device", context.device.name),
+        ("Firmware", _firmware(context.device.identity) or "unknown"),
         ("Link", context.link),
         ("Seed", context.seed),
         ("Samples", f"{played}; {verdict.missing_n:,} {missing_text(run)}"),

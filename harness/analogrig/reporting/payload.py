@@ -278,5 +278,5 @@ def _units(run: Run, name: str) -> dict[str, Any]:
     unit, factor = _DISPLAY_UNITS.get(channel.unit, (channel.unit, 1.0))
     per_volt = channel.unit_per_v * factor
     return {"scale": channel.lsb_v * per_volt, "offset": channel.low_v * per_volt, "unit": unit} | (
-        {"last": channel.codes - 1} if conditions.rig.get("kind") == IMPORTED and "rig" not in conditions.rig else {}
+        {"last": channel.codes - 1} if conditions.source.kind == IMPORTED and "rig" not in conditions.rig else {}
     )

@@ -28,7 +28,7 @@ def summary(run: Run, verdict: Verdict) -> str:
     """Summary of a run and its verdict: several lines, without a final newline."""
     conditions = run.conditions
     head = (
-        f"{conditions.scenario['name']} on {conditions.rig['name']}, device {conditions.dut['name']}"
+        f"{conditions.played.name} on {conditions.source.name}, device {conditions.device.name}"
         f" over {conditions.link}, seed {conditions.seed}: {verdict.outcome.upper()}"
     )
     lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]

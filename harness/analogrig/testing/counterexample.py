@@ -119,12 +119,12 @@ class Counterexample:
         tables = {SCENARIO_FILE: scenario}
         if needs_file:
             tables[DEVICE_FILE] = {key: value for key, value in _settings(conditions.dut).items() if key != "name"}
-        name = str(conditions.rig["name"])
+        name = conditions.source.name
         if name.startswith(RECORDING):
             scenario["rig"] = f"{RECORDING}{RUN_FILE}"
         elif name in config.names("rigs") and _is_rig(name, self.run):
             scenario["rig"] = name
-        elif conditions.rig.get("kind") in rigs.KINDS:
+        elif conditions.source.kind in rigs.KINDS:
             scenario["rig"] = RIG_FILE
             tables[RIG_FILE] = {key: value for key, value in conditions.rig.items() if key != "name"}
         if self.statement is not None:
@@ -133,7 +133,7 @@ class Counterexample:
 
     def _device(self) -> str:
         """Name that describes the device; empty if the device needs a file."""
-        names = (str(self.dut), str(self.run.conditions.dut["name"]))  # as the command line would read them
+        names = (str(self.dut), self.run.conditions.device.name)  # as the command line would read them
         return next((each for each in names if each and not each.endswith(".toml") and _is_device(each, self.run)), "")
 
 
@@ -149,7 +149,7 @@ def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> st
         ("--dut", dut, run.conditions.dut, _is_device),
     ):
         name = next((name for name in (given, str(table["name"])) if name and is_it(name, run)), None)
-        if name is None and flag == "--scenario" and str(run.conditions.rig["name"]).startswith(RECORDING):
+        if name is None and flag == "--scenario" and run.conditions.source.name.startswith(RECORDING):
             continue  # a recording plays its own
         if name is None:
             return ""

@@ -70,8 +70,8 @@ class Played:
 
     def __repr__(self) -> str:
         conditions = self.run.conditions
-        words = f"{conditions.scenario['name']}, seed {conditions.seed}"
-        return f"<{words}: {self.run.samples} samples on {conditions.rig['name']}, device {conditions.dut['name']}>"
+        words = f"{conditions.played.name}, seed {conditions.seed}"
+        return f"<{words}: {self.run.samples} samples on {conditions.source.name}, device {conditions.device.name}>"
 
     def __bool__(self) -> bool:
         raise TypeError("a play is neither true nor false: assert a finding, such as hil_play(...).passes()")

@@ -40,7 +40,7 @@ def session_identity(config: pytest.Config, devices: Sequence[DeviceFile] = ()) 
 def play_properties(played: Played) -> Iterator[tuple[str, Any]]:
     """Properties of one play."""
     conditions, verdict = played.run.conditions, played.verdict
-    device = conditions.dut.get("identity", {})
+    device = conditions.device.identity
     yield "seed", conditions.seed
     for key in ("scenario", "rig", "dut"):
         yield key, str(getattr(conditions, key)["name"])  # a plain str: pytest-xdist passes on no subclass
