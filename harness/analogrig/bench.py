@@ -24,7 +24,7 @@ from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import Conditions, Run
 from analogrig.scenario import Scenario, check_seed
 
-__all__ = ["RunBuilder", "raise_if_interrupted"]
+__all__ = ["Progress", "RunBuilder", "raise_if_interrupted"]
 """Names for packages beside the core."""
 
 Progress = Callable[[int, int], None]

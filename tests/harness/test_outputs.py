@@ -470,7 +470,7 @@ def test_older_picture_is_not_taken_for_the_new_one(tmp_path: Path, monkeypatch:
     def measure(*_: object) -> object:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("analogrig.reporting.effects_page.measure", measure)
+    monkeypatch.setattr("analogrig_circuits.effects_page.measure", measure)
     (tmp_path / "effects.svg").write_text("older")
     assert main(["effects", "--out", str(tmp_path / "effects.svg")]) == 130
     assert contents(tmp_path) == {"effects.svg.previous": b"older"}

@@ -36,6 +36,7 @@ def _imports(package: str) -> Iterator[tuple[str, str, str]]:
 
 def test_there_are_packages_beside_the_core() -> None:
     assert BESIDE == [
+        "analogrig_circuits",
         "analogrig_ecu",
         "analogrig_imports",
         "analogrig_instruments",

@@ -13,9 +13,10 @@ from playwright.sync_api import Browser
 from analogrig.config import locate
 from analogrig.judging.verdict import judge
 from analogrig.output import REPORT_FILE, OutputFolder
-from analogrig.reporting import effects_page, write_report
+from analogrig.reporting import write_report
 from analogrig.reporting.campaign_page import write_page
 from analogrig.reporting.session import find_session, write_session
+from analogrig_circuits import effects_page
 from analogrig_emulator.machine.drawing import patch_drawing
 from analogrig_emulator.machine.program_loader import load_patch
 from analogrig_emulator.nonidealities import Effect

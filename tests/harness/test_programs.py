@@ -20,12 +20,12 @@ from analogrig.judging import information
 from analogrig.judging.verdict import BOUNDS, ESTIMATES, as_json, judge
 from analogrig.plant import SampledPlant, Segment, estimated_parameters
 from analogrig.program import Program
-from analogrig.reporting.export import netlist
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
 from analogrig.scenario import DEFAULT_SEED, PotChange, Scenario
+from analogrig_circuits import netlist
 from analogrig_emulator import SuspensionComputer
 from tests.harness.runs import made_run
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         EmulatorDescription,
         EmulatorRig,
         MeasuredValues,
+        SetUp,
         Stream,
         emulator_errors,
         is_emulated,
@@ -52,7 +53,7 @@ else:
             "analogrig.errors": "RigClosed RigRefused RigTimeout",
             "analogrig.plant": "Segment",
             "analogrig.rigs.emulator": (
-                "CardDescription ComputerDescription EmulatorDescription EmulatorRig MeasuredValues Stream "
+                "CardDescription ComputerDescription EmulatorDescription EmulatorRig MeasuredValues SetUp Stream "
                 "emulator_errors is_emulated"
             ),
             "analogrig.rigs.recording": "WRONG_SAMPLES",
@@ -82,6 +83,7 @@ __all__ = [
     "RigRefused",
     "RigTimeout",
     "Segment",
+    "SetUp",
     "Stream",
     "Thing",
     "emulator_errors",

@@ -11,11 +11,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig import ConfigurationError, Rig, Scenario
 from analogrig.bench import Progress
-from analogrig.errors import ConfigurationError
-from analogrig.rigs.emulator import SetUp, is_emulated
-from analogrig.rigs.rig import Block, Rig
-from analogrig.scenario import Scenario
+from analogrig.rigs import Block, SetUp, is_emulated
 from analogrig.storage import replace_file
 from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, Excitation, PotTurn
 

@@ -6,8 +6,20 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, files_read, open_what_to_play
-from analogrig.cli.terminal import PASSED, progress_line, show, show_plain, show_result, show_work
+from analogrig.cli import (
+    FILE,
+    PASSED,
+    add_command,
+    add_json,
+    add_what_to_play,
+    files_read,
+    open_what_to_play,
+    progress_line,
+    show,
+    show_plain,
+    show_result,
+    show_work,
+)
 
 
 def add_emulate(commands: Any) -> None:
@@ -63,8 +75,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
 
     if arguments.out.suffix in (".csv", ".npz"):
         move_aside(arguments.out, files_read(arguments))
-    from analogrig.reporting.export import write_signals
-    from analogrig.reporting.summary import lamps_text
+    from analogrig.reporting import lamps_text
+    from analogrig_circuits.export import write_signals
 
     with open_what_to_play(arguments) as (rig, scenario, seed):
         written = write_signals(rig, scenario, seed, arguments.out, progress=progress_line())
@@ -81,8 +93,8 @@ def _netlist(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         move_aside(arguments.out, files_read(arguments))
-    from analogrig.reporting.export import netlist
     from analogrig.storage import replace_file
+    from analogrig_circuits.export import netlist
 
     with open_what_to_play(arguments) as (rig, scenario, seed):
         deck = netlist(rig, scenario, seed)
@@ -101,9 +113,9 @@ def _netlist(arguments: argparse.Namespace) -> int:
 
 
 def _effects(arguments: argparse.Namespace) -> int:
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
     from analogrig.output import move_aside
-    from analogrig.reporting import effects_page
+    from analogrig_circuits import effects_page
 
     if arguments.out is not None:
         if arguments.out.suffix != ".svg":

@@ -7,12 +7,11 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import FILE, add_command, add_json
-from analogrig.cli.terminal import PASSED, show, show_plain, show_result
+from analogrig.cli import FILE, PASSED, add_command, add_json, show, show_plain, show_result
 
 if TYPE_CHECKING:
-    from analogrig.program import Program
-    from analogrig.rigs.rig import Performance
+    from analogrig import Program
+    from analogrig.rigs import Performance
     from analogrig_emulator import PatchedProgram
     from analogrig_emulator.machine.that_sheet import ThatSheet
 
@@ -66,10 +65,10 @@ def add(commands: Any) -> None:
 
 
 def _patch(arguments: argparse.Namespace) -> int:
+    from analogrig import Program
     from analogrig.config import locate
     from analogrig.output import move_aside
-    from analogrig.program import Program
-    from analogrig.rigs.emulator import emulator_errors
+    from analogrig.rigs import emulator_errors
     from analogrig.storage import replace_file
     from analogrig_emulator import SuspensionComputer, compile_program
     from analogrig_emulator.machine.drawing import patch_drawing
@@ -134,10 +133,8 @@ def _performance(program: Program, rig: str) -> tuple[Performance, float]:
     """
     import dataclasses
 
-    from analogrig.errors import ConfigurationError
-    from analogrig.rigs.description import open_rig
-    from analogrig.rigs.emulator import is_emulated
-    from analogrig.scenario import Scenario
+    from analogrig import ConfigurationError, Scenario, open_rig
+    from analogrig.rigs import is_emulated
 
     with open_rig(rig) as opened:
         if not is_emulated(opened):
@@ -281,9 +278,7 @@ def _track_notes(program: Program) -> list[str]:
 
 def _overload_notes(program: Program) -> list[str]:
     """Draws of real parts that a run without a scenario overloads: errors of parts may drive products to infinity."""
-    from analogrig.errors import AnalogrigError
-    from analogrig.rigs.description import open_rig
-    from analogrig.scenario import Scenario
+    from analogrig import AnalogrigError, Scenario, open_rig
 
     if program.circuit.is_linear:
         return []
@@ -302,7 +297,7 @@ def _overload_notes(program: Program) -> list[str]:
 
 def _check_options(arguments: argparse.Namespace) -> None:
     """:raises ConfigurationError: the options exclude each other, or name a wrong file."""
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
 
     if arguments.drawing is not None and arguments.drawing.suffix != ".svg":
         raise ConfigurationError(f"{arguments.drawing}: the file's name must end with .svg")
@@ -314,7 +309,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 def _that_sheet(program: PatchedProgram) -> ThatSheet:
     """:raises ConfigurationError: the program does not fit the machine."""
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
     from analogrig_emulator import EmulatorError
     from analogrig_emulator.machine.that_sheet import ThatSheet
 
