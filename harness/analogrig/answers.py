@@ -30,9 +30,9 @@ class Samples:
     first: int
     """Index of the first sample, from 0 in each record. A device takes skipped indices as missing samples."""
     u: NDArray[np.uint16]
-    """Input of the plant (force) in codes."""
+    """Input of the plant in codes."""
     y: NDArray[np.uint16]
-    """Output of the plant (displacement) in codes."""
+    """Output of the plant in codes."""
     valid: NDArray[np.bool_]
     """False where the sample is missing; u and y mean nothing there."""
 

@@ -190,7 +190,8 @@ class Bench:
             scenario = Scenario.load(scenario)
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
-        pace, blocks = self._pace_blocks(performance)
+        pace = None if self._real_time is None else self.pace(performance.sample_period_s * self._real_time)
+        blocks = performance.blocks if pace is None else list(performance.blocks)
         self.dut.suit(scenario.poles(performance.sample_period_s * performance.time_scale))
         self.dut.prepare(performance.of_device, performance.sample_period_s)
         self.dut.start(pace)
@@ -286,13 +287,6 @@ class Bench:
             counters=builder.counters,
             link_counters=self.dut.link_counters,
         )
-
-    def _pace_blocks(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
-        """Pace of the samples (None in lock-step), and the blocks, which are computed in advance in real time."""
-        if self._real_time is None:
-            return None, performance.blocks
-        pace = self.pace(performance.sample_period_s * self._real_time)
-        return pace, list(performance.blocks)
 
     def pace(self, period_s: float) -> Pace:
         """Pace of a real-time run with ``period_s`` between samples; counts the overruns."""

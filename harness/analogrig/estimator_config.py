@@ -102,9 +102,9 @@ class EstimatorConfig:
     refresh_n: int = 40
     """Equations after which C is set from the estimate of A, and again each time A has moved; 0: never."""
     stuck_n: int = 16
-    """Samples of constant displacement after an edge of the force that count as stuck, up to 255; 0: never."""
+    """Samples of constant output after an edge of the input that count as stuck, up to 255; 0: never."""
     idle_n: int = 1000
-    """Samples without an edge of the force after which excitation counts as lost; 0: never."""
+    """Samples without an edge of the input after which excitation counts as lost; 0: never."""
     forgetting: float = 0.995
     random_walk: float = 0.0
     """Variance of each parameter's random walk per sample, in noise variances."""
@@ -116,19 +116,19 @@ class EstimatorConfig:
     c: tuple[float, ...] = (-1.6, 0.64)
     """Prefilter C = 1 + c[0] z^-1 + ...; further coefficients are zero."""
     edge_codes: float = 64.0
-    """Smallest step of the force that counts as an edge; codes."""
+    """Smallest step of the input that counts as an edge; codes."""
     code_low: float = -1.0e6
     """A reading at or below ``code_low``, or at or above ``code_high``, is saturated; codes."""
     code_high: float = 1.0e6
     isolation: bool = True
-    """Diagnose after an alarm whether M, B or K has changed, or a channel is faulty; for na = 2, nb + nk <= 3 and the
+    """Diagnose after an alarm which parameter has changed, or which channel is faulty; for na = 2, nb + nk <= 3 and the
     trigger ``cusum``."""
     misfit: bool = True
     """Watch whether the model fits, and report the cause of a misfit; for na = 2."""
     force_zero: float = 0.0
-    """Code of zero force, for isolation. The bench sets it from the range of the rig's card."""
+    """Code of zero input, for isolation. The bench sets it from the range of the rig's card."""
     edge_instants: EdgeInstants = "may-slip"
-    """Instants of the force's edges between two samples: constant (``locked``), nearly constant (``may-slip``), or
+    """Instants of the input's edges between two samples: constant (``locked``), nearly constant (``may-slip``), or
     varying (``anywhere``), as with a period that is no whole number of samples."""
     trigger: TriggerName = "cusum"
     ceiling: float | None = None
@@ -260,7 +260,8 @@ class EstimatorConfig:
         :param most_parameters: largest number of elements of theta.
         :raises ConfigurationError: the values are no valid configuration.
         """
-        reported = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
+        # decimal numbers with the fewest digits that have the same value in single precision
+        reported = {Key(key): float(str(np.float32(value))) for key, value in settings.items() if key in set(Key)}
         for key, value in reported.items():
             if not _is_in_range(key, value):
                 raise ConfigurationError(f"{where}: {key.name.lower()} = {value:g} is no setting of an estimator")
@@ -290,8 +291,3 @@ def _is_in_range(key: Key, value: float) -> bool:
     low, high = _IN_RANGE.get(name, (-config.MOST_NUMBER, config.MOST_NUMBER))
     is_real = type(high) is float
     return low <= value <= high and (is_real or value.is_integer())
-
-
-def _shortest(value: float) -> float:
-    """Decimal number with the fewest digits that has the same value in single precision."""
-    return float(str(np.float32(value)))

@@ -86,7 +86,9 @@ class OutputFolder:
         """
         self._check_reads()
         make_folder(self.path)
-        self._check_places()
+        for place in (self.path / name for name in (*self._status, *self._holds)):
+            if place.exists() and not place.is_file():
+                raise ConfigurationError(f"--out {self.path}: {place} is no file: remove it, or choose another folder")
         self._lock = _lock_folder(self.path)
         try:
             with hold_signals():
@@ -176,12 +178,6 @@ class OutputFolder:
                 raise ConfigurationError(
                     f"--out {self.path}: would overwrite the {what} that is played; choose another folder"
                 )
-
-    def _check_places(self) -> None:
-        """:raises ConfigurationError: something other than a file has the place of a result."""
-        for place in (self.path / name for name in (*self._status, *self._holds)):
-            if place.exists() and not place.is_file():
-                raise ConfigurationError(f"--out {self.path}: {place} is no file: remove it, or choose another folder")
 
     def _move_aside(self) -> None:
         """Move the earlier result to ``.previous``.

@@ -26,11 +26,8 @@ def printable(text: str) -> str:
     """The text with control characters, line ends excepted, as escape sequences of Python."""
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
-    return "".join(char if char.isprintable() or char == "\n" else _escape(char) for char in text)
-
-
-def _escape(char: str) -> str:
-    return char.encode("unicode_escape").decode("ascii")
+    escaped = ((char, char.encode("unicode_escape").decode("ascii")) for char in text)
+    return "".join(char if char.isprintable() or char == "\n" else escape for char, escape in escaped)
 
 
 def error_text(error: BaseException) -> str:

@@ -31,9 +31,9 @@ class SentSignals:
     """Signals that carry a sample to the device, each as ``Message.Signal``."""
 
     u: str
-    """Input of the plant (force)."""
+    """Input of the plant."""
     y: str
-    """Output of the plant (displacement)."""
+    """Output of the plant."""
     valid: str = ""
     """1, or 0 for a missing sample. Without this signal, missing samples are not sent."""
     counter: tuple[str, ...] = ()

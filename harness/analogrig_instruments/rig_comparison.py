@@ -26,7 +26,7 @@ _SMOOTHED_N = 5
 """Samples over which a difference is averaged before its largest value is found."""
 
 _EDGE_PART = 0.25
-"""Smallest step of the force between neighbouring samples that is an edge, in parts of its range."""
+"""Smallest step of the input between neighbouring samples that is an edge, in parts of its range."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SignalDifference:
     noise_lsb: float
     """rms noise of both rigs together, quantisation included, which is subtracted."""
     edges_apart: int
-    """Samples of all plays, next to an edge of the force, at which only one rig has the new level; left out."""
+    """Samples of all plays, next to an edge of the input, at which only one rig has the new level; left out."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ class RigComparison:
     @property
     def sentence(self) -> str:
         """Summary in one sentence."""
-        displacement = next(each for each in self.signals if each.channel == "displacement")
+        output = self.signals[-1]
         latency = "an unknown number of" if self.latency is None else f"{self.latency.within_n:.2g}"
         shown = [f"{each.quantity} is {each.word}" for each in self.verdicts.differences if each.shown]
         return (
-            f"{self.b} follows {self.a} within {displacement.rms_most_lsb:.2g} LSB (displacement, rms, without noise)"
+            f"{self.b} follows {self.a} within {output.rms_most_lsb:.2g} LSB ({output.channel}, rms, without noise)"
             f" and {latency} samples (mean latency), each with {self.confidence:.0%} confidence, in"
             f" {self.plays} plays of {self.scenario}; in the verdicts {', '.join(shown) or 'no difference is shown'}."
         )
@@ -180,7 +180,7 @@ def _why_invalid(run: Run, row: Row) -> str:
 
 
 def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence: float) -> SignalDifference:
-    """Difference of one channel in two plays or more, without clipped samples and those at edges of the force."""
+    """Difference of one channel in two plays or more, without clipped samples and those at edges of the input."""
     differences, compared, apart = zip(*(_difference(a, b, channel) for a, b in runs), strict=True)
     pairs = list(zip(differences, compared, strict=True))
     noise = math.sqrt(float(np.mean([noise_variance(each) for each in differences])))

@@ -58,6 +58,9 @@ MOST_CLOCK_PPM = 50.0
 MOST_MASS, MOST_DAMPING = 0.3, 0.15
 MOST_SHAPE, LEAST_SHAPE_LSB = 3e-4, 0.5
 
+_TERMS = {"mass": "second-order term", "damping": "first-order term", "stiffness": "the term of order zero"}
+"""Names of the terms of the output's equation where diagnoses name no parameter, by those that diagnoses have."""
+
 AMPLIFIERS_S = Uncertain(0.625e-6, 0.5e-6)
 """Delay of the output by the computer's amplifiers: 0.62 us with TL07x, 1.2 us with polyester capacitors too, 0
 with ideal ones. The 9.5 us of a 741 are reported as skew."""
@@ -466,7 +469,7 @@ class _Analysis:
 
     @cached_property
     def _nominal(self) -> tuple[float, float]:
-        """Mass and damping per unit of the spring, in samples."""
+        """Terms of second and first order over that of order zero, in samples."""
         sample_s = self.sample_period_s * self.time_scale
         response = self.plant.response()
         return 1.0 / response["s0"] / sample_s**2, response["s1"] / response["s0"] / sample_s
@@ -500,7 +503,7 @@ class _Analysis:
         if shape.state == "wrong":
             why = f"it is read from the shape of the {self.answer.name}, which is wrong"
             names = [(name, self.answer.name) for name in ("gain", "offset", "noise")]
-            names += [(name, "") for name in ("skew", "mass", "damping")]
+            names += [(name, "") for name in ("skew", self._name_of("mass"), self._name_of("damping"))]
             return (self._clock_ratio(), shape, *(_not_measured(name, channel, why) for name, channel in names))
         gain, offset = min(self._gains, key=abs), min(self._offsets, key=abs)
         gain_error = math.hypot(response.gain.error / abs(response.gain.value), self._input_gain.error)
@@ -551,8 +554,12 @@ class _Analysis:
         name = self.plant.program.diagnosed.get(diagnosis)
         return f"the pot of {name}" if name else "the pots"
 
+    def _name_of(self, diagnosis: str) -> str:
+        """Parameter that diagnoses give this name, or its place in the equation of second order."""
+        return self.plant.program.diagnosed.get(diagnosis, _TERMS[diagnosis])
+
     def _machine(self) -> Iterator[Check]:
-        """Checks of mass and damping, those of a spring that gives the same response."""
+        """Checks of the terms of second and first order, relative to that of order zero."""
         fitted = (self._response.mass_n2, self._response.damping_n)
         for name, found, nominal, most, parts in zip(
             ("mass", "damping"),
@@ -563,8 +570,11 @@ class _Analysis:
             strict=True,
         ):
             off = found.value / nominal - 1.0
-            advice = f"it is {off:+.0%} relative to the spring: set {self._pot_of(name)} again, and check {parts}"
-            yield Check(name, "", off, found.error / nominal, -most, most, "off nominal", advice)
+            advice = (
+                f"it is {off:+.0%} relative to {self._name_of('stiffness')}: set {self._pot_of(name)} again, and check"
+                f" {parts}"
+            )
+            yield Check(self._name_of(name), "", off, found.error / nominal, -most, most, "off nominal", advice)
 
 
 def _remove_quantisation(rms_lsb: float) -> float:

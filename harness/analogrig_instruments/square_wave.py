@@ -34,7 +34,7 @@ _AVERAGES_FROM = 8
 _UNSETTLED_N = 3
 """Samples on either side of an edge that are left out of the noise of a level."""
 _MOVING_PART = 0.25
-"""Part of a half period, from its edge, in which the displacement moves by more than a code per sample."""
+"""Part of a half period, from its edge, in which the output moves by more than a code per sample."""
 _PARTS = 104
 """Parts of a period that are averaged: about two samples each."""
 _NEAR_N = 0.2
@@ -43,7 +43,7 @@ _NEAR_N = 0.2
 _EDGES_FELT = 2
 """Latest edges whose response is computed; earlier ones have settled to 1e-5 for half periods of 100 samples."""
 _LATEST_N, _SCAN_N = 40.0, 2.0
-"""Largest delay of the displacement's edges that is searched, and step of the search, in samples."""
+"""Largest delay of the output's edges that is searched, and step of the search, in samples."""
 _SCANNED_N = 2000
 """Samples used in the search."""
 
@@ -81,7 +81,7 @@ class SquareWave:
         values = codes.astype(np.float64)
         upper = values > 0.5 * (values.min() + values.max())
         if not upper.any():
-            raise SelfTestError("the force does not change")
+            raise SelfTestError("the input does not change")
         low, high = float(np.median(values[~upper])), float(np.median(values[upper]))
         off = np.abs(values - np.where(upper, high, low))
         noise = max(1.4826 * float(np.median(off)), 0.5)
@@ -93,9 +93,9 @@ class SquareWave:
         lengths = np.diff(marks) / half_period_n
         lengths[[0, -1]] = np.where(lengths[[0, -1]] < 1.5, 1.0, lengths[[0, -1]])
         if (broken := np.flatnonzero(np.rint(lengths) != 1)).size:
-            raise SelfTestError(f"the square wave of the force is broken after sample {int(marks[broken[0]])}")
+            raise SelfTestError(f"the square wave of the input is broken after sample {int(marks[broken[0]])}")
         if (longest := int((after - before).max())) > _MOST_BETWEEN + 1:
-            raise SelfTestError(f"the force takes {longest} samples from level to level: it is no square wave")
+            raise SelfTestError(f"the input takes {longest} samples from level to level: it is no square wave")
         return cls(codes, low, high, state, before, after, state[after] == 1)
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from analogrig import ConfigurationError, Device
 from analogrig.devices import Answers, Cause, Change
-from analogrig.judging import DIAGNOSABLE, LinearPlant, Model, PlantChange, first_at_level, information_of, weights
+from analogrig.judging import LinearPlant, Model, PlantChange, diagnosis_text, first_at_level, information_of, weights
 from analogrig.plant import estimated_parameters
 from analogrig.rigs import Block
 from analogrig.run import INPUT, LOST, OUTPUT, missing_samples
@@ -109,8 +109,7 @@ class Notes:
         for index in answers.alarms.index.tolist():
             self._note_alarm(index)
         for diagnosis in answers.diagnoses:
-            named = DIAGNOSABLE.get(Change(diagnosis.change), "undecided")
-            self.diagnosis = self._desk.program.diagnosed.get(named, named)
+            self.diagnosis = diagnosis_text(Change(diagnosis.change), self._desk.program)
         for misfit in answers.misfits:
             self.misfit = "" if misfit.cause == Cause.NONE else Cause(misfit.cause).name.lower().replace("_", " ")
         has_searched = self._search_bounds(end)

@@ -7,7 +7,7 @@ import pytest
 
 from analogrig.catalogue import Change
 from analogrig.judging.advice import advice
-from analogrig.judging.verdict import CHANNEL_FAULTS, DIAGNOSABLE, FAULT_CURES, ChannelFault, as_json, judge
+from analogrig.judging.verdict import CHANNEL_FAULTS, FAULT_CURES, ChannelFault, as_json, diagnosis_text, judge
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
 from analogrig.run import Run
@@ -64,7 +64,7 @@ def test_page_of_a_run_without_faults_states_it() -> None:
 @pytest.mark.parametrize("fault", sorted(CHANNEL_FAULTS))
 def test_advice_names_each_fault_and_its_cure(fault: Change) -> None:
     faulty = made_run(np.zeros(100), [(0, FRONT)], diagnoses=[(30, fault, 20, 1.0)])
-    name = DIAGNOSABLE[fault]
+    name = diagnosis_text(fault, FRONT.program)
     channel, kind = name.split()
     said = [sentence for sentence in advice(faulty, judge(faulty)) if f"({name})" in sentence]
     assert len(said) == 1

@@ -199,10 +199,10 @@ FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
     ),
     "card fast": (lambda: emulate(clock_drift_ppm=100.0), ["clock ratio"]),
     "card slow": (lambda: emulate(clock_drift_ppm=-100.0), ["clock ratio"]),
-    "pot of M": (lambda: Altered(emulate(), play=pots(M=115.0 * 1.6)), ["mass"]),
+    "pot of M": (lambda: Altered(emulate(), play=pots(M=115.0 * 1.6)), ["M"]),
     "pot of B": (
         lambda: Altered(emulate(), play=pots(B=3021.0 * 0.7)),
-        ["damping"],
+        ["B"],
     ),
     "a dielectric that soaks": (lambda: Altered(emulate(), soak), ["shape of displacement"]),
     "a bit of displacement stuck": (lambda: Altered(emulate(), stuck_bit), ["shape of displacement"]),
@@ -294,8 +294,8 @@ def test_standard_errors_are_those_of_the_estimates() -> None:
             "offset of force": offsets[0] * lsb_v[0],
             "clock ratio": 1e6 * (1.0 / (1.0 + 1e-6 * ppm) - 1.0),
             # In samples, which are closer when the card is fast.
-            "mass": (1.0 + 1e-6 * ppm) ** 2 - 1.0,
-            "damping": 1e-6 * ppm,
+            "M": (1.0 + 1e-6 * ppm) ** 2 - 1.0,
+            "B": 1e-6 * ppm,
         }
         findings = self_test(rig, seed)
         for title, true in truth.items():

@@ -112,17 +112,13 @@ def _explain(error: BaseException) -> int:
         return complain("not enough memory", INCONCLUSIVE)
     if isinstance(error, OSError) and error.errno in _EXHAUSTED:
         return complain(f"{error.strerror}: {_EXHAUSTED[error.errno]}", INCONCLUSIVE)
-    culprit = _package_of(error) or "a fault of analogrig itself"
-    return complain(f"{culprit}: {one_line(error_text(error))} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
-
-
-def _package_of(error: BaseException) -> str:
-    """Package that adds something by an entry point, in whose code an error was raised; empty if there is none."""
     import traceback  # here, for --help needs none
 
     from analogrig.entry_points import package_of
 
-    return package_of(str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__))
+    modules = (str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__))
+    culprit = package_of(modules) or "a fault of analogrig itself"
+    return complain(f"{culprit}: {one_line(error_text(error))} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
 
 
 def _is_working_directory_gone() -> bool:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from analogrig.judging.linear import LinearPlant
     from analogrig.judging.machine_model import Machine
     from analogrig.judging.statistics import mean_interval, upper_rate
-    from analogrig.judging.verdict import DIAGNOSABLE, unexplained_alarms
+    from analogrig.judging.verdict import diagnosis_text, unexplained_alarms
 else:
     from analogrig.lazy import loader
 
@@ -26,18 +26,18 @@ else:
             "analogrig.judging.linear": "LinearPlant",
             "analogrig.judging.machine_model": "Machine",
             "analogrig.judging.statistics": "mean_interval upper_rate",
-            "analogrig.judging.verdict": "DIAGNOSABLE unexplained_alarms",
+            "analogrig.judging.verdict": "diagnosis_text unexplained_alarms",
         },
     )
 
 __all__ = [
-    "DIAGNOSABLE",
     "QUANTISATION_VARIANCE_LSB2",
     "LinearPlant",
     "Machine",
     "Model",
     "PlantChange",
     "bound_rate",
+    "diagnosis_text",
     "first_at_level",
     "information_of",
     "mean_interval",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,6 @@ from analogrig.judging.misread import misreadings
 from analogrig.judging.verdict import (
     DIAGNOSES,
     ESTIMATES,
-    ChannelFault,
-    MisfitPeriod,
     Verdict,
     is_beyond_model,
     unreported,
@@ -70,17 +69,11 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
 
 def misfits(verdict: Verdict) -> Iterator[str]:
     """One sentence for each cure of a misfit."""
-    for cure, periods in itertools.groupby(sorted(verdict.fit or (), key=_cure_and_cause), _cure):
+    for cure, periods in itertools.groupby(
+        sorted(verdict.fit or (), key=attrgetter("cure", "cause")), attrgetter("cure")
+    ):
         causes = ", ".join(dict.fromkeys(period.cause for period in periods))
         yield f"the model does not fit ({causes}): alarms may be false, and changes missed; {cure}"
-
-
-def _cure(period: MisfitPeriod) -> str:
-    return period.cure
-
-
-def _cure_and_cause(period: MisfitPeriod) -> tuple[str, str]:
-    return period.cure, period.cause
 
 
 def _orders(run: Run, verdict: Verdict) -> Iterator[str]:
@@ -179,7 +172,7 @@ def _overloads(verdict: Verdict) -> Iterator[str]:
 
 def _channel_faults(verdict: Verdict) -> Iterator[str]:
     """One sentence for each fault. The scenario has none: the rig has it, or the device is wrong."""
-    for name, faults in itertools.groupby(sorted(verdict.channel_faults, key=_name), _name):
+    for name, faults in itertools.groupby(sorted(verdict.channel_faults, key=attrgetter("name")), attrgetter("name")):
         first, *others = faults
         more = f" and {number_of(len(others), 'later sample')}" if others else ""
         yield (
@@ -195,10 +188,6 @@ def _wrong_diagnoses(verdict: Verdict) -> Iterator[str]:
                 f"the device named {change.diagnosis.named} where {change.what} changed at {change.sample}: this does"
                 " not fail the run, since one diagnosis in twenty may be wrong; isolates() of a test judges diagnoses"
             )
-
-
-def _name(fault: ChannelFault) -> str:
-    return fault.name
 
 
 def _noise_setting(run: Run) -> Iterator[str]:

@@ -65,20 +65,22 @@ def estimate_findings(run: Run, limit: float) -> Iterator[str]:
     if not names or model is None or not run.theta.shape[1] or model.na != len(run.conditions.program.equations.states):
         return
     for start, end, plant in _judged_segments(run):
-        rows = _last_estimates(run, start, end)
+        middle = (start + end) // 2
+        is_reported = (run.flags[middle:end] & np.uint8(UNREPORTED | LOST)) == 0
+        rows = middle + np.flatnonzero(is_reported)[-_LAST_N:]
         if not len(rows):
             continue
         truth = np.array([plant.parameters()[name] for name in names])
         found = trajectory(run, rows)
         ordered = np.argsort(np.nan_to_num(np.abs(found / truth - 1.0), nan=np.inf), axis=0, kind="stable")
-        middle = np.take_along_axis(found, ordered[len(rows) // 2][None], axis=0)[0]
-        errors = np.nan_to_num(np.abs(middle / truth - 1.0), nan=np.inf)
+        median = np.take_along_axis(found, ordered[len(rows) // 2][None], axis=0)[0]
+        errors = np.nan_to_num(np.abs(median / truth - 1.0), nan=np.inf)
         if not (errors > limit).any():
             continue
         most = _WITNESS_SHARE * np.clip(errors, limit, _MOST_LIMITS * limit)
         known = (np.abs(_witnesses(run, model, start, end) / truth - 1.0) <= most).all(axis=0)
         off = [
-            f"{name} is {f'{middle[i]:.5g}' if np.isfinite(middle[i]) else 'no number'} instead of {truth[i]:.5g}"
+            f"{name} is {f'{median[i]:.5g}' if np.isfinite(median[i]) else 'no number'} instead of {truth[i]:.5g}"
             for i, name in enumerate(names)
             if errors[i] > limit and known[i]
         ]
@@ -117,13 +119,6 @@ def _has_misfit(run: Run, sample: int) -> bool:
     record = max(start for start, _ in run.records if start <= sample)
     reported = np.flatnonzero((run.misfit_index >= record) & (run.misfit_index <= sample))
     return bool(len(reported)) and bool(run.misfit_cause[reported[-1]])
-
-
-def _last_estimates(run: Run, start: int, end: int) -> NDArray[np.int64]:
-    """Samples of the last estimates that the device reported in the second half of a segment."""
-    middle = (start + end) // 2
-    is_reported = (run.flags[middle:end] & np.uint8(UNREPORTED | LOST)) == 0
-    return np.asarray(middle + np.flatnonzero(is_reported)[-_LAST_N:])
 
 
 def _witnesses(run: Run, model: ModelOrders, start: int, end: int) -> NDArray[np.float64]:

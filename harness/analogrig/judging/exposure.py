@@ -203,7 +203,8 @@ def _count(
     driven, flags and are_finite are (r, n).
     """
     known = (flags & _NOT_PROCESSED) == 0
-    excited = _excitation_mask(driven, known, _least_edge(sheet, noise_lsb), sheet.idle_n)
+    noises = EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB)
+    excited = _excitation_mask(driven, known, max(sheet.edge_codes, noises) if sheet.edge_codes else 0.0, sheet.idle_n)
     excited &= (flags & SteppedFlag.IDLE) == 0
     if sheet.armed:
         watched = known & ((flags & UNARMED) == 0)
@@ -240,17 +241,13 @@ def _are_unarmed(alarms: NDArray[np.int64], flags: NDArray[np.uint8], sheet: Dat
     return np.asarray((alarms < sheet.warm_up_n) | ((since > 0) & (since <= sheet.hold_off_n)))
 
 
-def _least_edge(sheet: Datasheet, noise_lsb: float) -> float:
-    """Smallest step of the input that counts as an edge, in codes; 0.0 if the trigger needs none."""
-    if not sheet.edge_codes:
-        return 0.0
-    return max(sheet.edge_codes, EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB))
-
-
 def _excitation_mask(
     driven: NDArray[np.uint16], known: NDArray[np.bool_], edge_codes: float, idle_n: int
 ) -> NDArray[np.bool_]:
-    """(r, n): the input has had an edge, and the last one is at most ``idle_n`` samples ago."""
+    """(r, n): the input has had an edge, and the last one is at most ``idle_n`` samples ago.
+
+    :param edge_codes: smallest step of the input that counts as an edge; 0: the trigger needs none.
+    """
     codes = driven.astype(np.int32)
     are_edges = (np.abs(np.diff(codes)) >= edge_codes) & known[:, 1:] & known[:, :-1]
     excited = np.ones(codes.shape, np.bool_)

@@ -28,6 +28,7 @@ from analogrig.judging.courses import Model, first_at_level
 from analogrig.judging.estimates import estimate_findings, parameters_of
 from analogrig.judging.exposure import Exposure, exposure, latched_from, until_latched
 from analogrig.plant import Segment
+from analogrig.program import Program
 from analogrig.run import IMPORTED, LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
@@ -77,9 +78,6 @@ CHANNEL_FAULTS = frozenset(change for change in Change if change > Change.SEVERA
 GAINS = frozenset({Change.FORCE_GAIN, Change.DISPLACEMENT_GAIN})
 """Faults of a channel that have an extent."""
 
-DIAGNOSABLE = {change: change.name.lower().replace("_", " ") for change in Change if change}
-"""Changes that a device can diagnose, with their names: ``mass``, ``several``, ``force offset``."""
-
 CURES: Mapping[str, str] = {
     "drift": "remove the mean of the output by a high-pass filter, or make the run shorter",
     "hum": "shield the sensor and its cable, or sample synchronously with the mains",
@@ -108,12 +106,21 @@ _UNEXPLAINED_CAUSES = frozenset({"slow plant", "excitation"})
 _UNEXPLAINED_FAULTS = frozenset({"stuck"})
 
 
+def diagnosis_text(change: Change, program: Program) -> str:
+    """Diagnosis in the words of a program: a parameter, ``several``, or a channel and its fault: ``force offset``."""
+    what = change.name.lower()
+    channel, _, fault = what.partition("_")
+    if fault:
+        return f"{program.measured[channel == 'displacement']} {fault}"
+    return program.diagnosed.get(what, "another parameter" if change < Change.SEVERAL else what)
+
+
 @dataclass(frozen=True)
 class ChannelFault:
     """Fault of a channel that the device diagnosed."""
 
     name: str
-    """Name in ``DIAGNOSABLE``, such as ``force offset``."""
+    """Channel and fault, such as ``force offset``."""
     sample: int
     """Sample after which it was diagnosed."""
     onset: int
@@ -126,7 +133,7 @@ class ChannelFault:
     @property
     def cure(self) -> str:
         """Measure against the fault."""
-        channel, kind = self.name.split()
+        channel, kind = self.name.rsplit(maxsplit=1)
         if self.beyond_model and kind not in _UNEXPLAINED_FAULTS:
             return NONLINEAR_CURE
         return f"{channel}: {FAULT_CURES[kind]}"
@@ -165,7 +172,7 @@ class DiagnosisVerdict:
     """Verdict on the first diagnosis after the detection of a change."""
 
     named: str
-    """Parameter of the program, or a name in ``DIAGNOSABLE``: ``several``, ``force offset``."""
+    """As ``diagnosis_text``."""
     right: bool
     delay_n: int
     """Samples from the change to the diagnosis."""
@@ -411,7 +418,7 @@ def channel_faults(run: Run) -> tuple[ChannelFault, ...]:
     reported = zip(run.diagnosis_change, run.diagnosis_index, run.diagnosis_onset, run.diagnosis_extent, strict=True)
     return tuple(
         ChannelFault(
-            name=DIAGNOSABLE[Change(change)],
+            name=diagnosis_text(Change(change), run.conditions.program),
             sample=int(sample),
             onset=int(onset),
             extent=float(extent) if Change(change) in GAINS and math.isfinite(extent) else None,
@@ -689,10 +696,9 @@ def _judge_diagnosis(
     if not len(reported):
         return None
     first = reported[0]
-    diagnosis, parameters = DIAGNOSABLE[Change(run.diagnosis_change[first])], run.conditions.program.diagnosed
-    named = parameters.get(diagnosis, diagnosis)
+    named = diagnosis_text(Change(run.diagnosis_change[first]), run.conditions.program)
     ratio = float(run.diagnosis_extent[first])
-    extent = ratio if diagnosis in parameters and math.isfinite(ratio) else None
+    extent = ratio if named in run.conditions.program.parameters and math.isfinite(ratio) else None
     right = (named,) == tuple(changed) or (named == "several" and len({*changed, *segment.also}) > 1)
     error = extent * changed[named][0] / changed[named][1] - 1.0 if right and extent is not None else None
     return DiagnosisVerdict(

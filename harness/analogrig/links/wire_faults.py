@@ -296,18 +296,14 @@ class FaultyLine(ABC, Generic[L, T]):
         for each in sent:
             if direction == "from" and boots != self._boots:
                 break  # the device was reset meanwhile: its earlier frames are lost
-            kind = self._due_kind(direction, lane)
+            kind = self._at.pop((direction, lane.frames), None)
+            if kind is None:
+                kind = next((kind for kind, rate in self._rates.items() if lane.rng.random() < rate), None)
             lane.frames += 1
             passed = self._apply_lasting(lane, each)
             if passed is not None:
                 lane.put(*([passed] if kind is None else self._apply(kind, lane, passed)))
             lane.release()
-
-    def _due_kind(self, direction: Direction, lane: Lane[T]) -> str | None:
-        kind = self._at.pop((direction, lane.frames), None)
-        if kind is not None:
-            return kind
-        return next((kind for kind, rate in self._rates.items() if lane.rng.random() < rate), None)
 
     # ---- faults
 

@@ -133,9 +133,10 @@ def thin_out(values: Sequence[int], samples: int, most: int) -> list[int]:
 
 def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
     """Data of the plots in plain JSON types without NaN."""
-    shown = _pieces(run, verdict)
-    values = _signals(run, shown)
     detections, false = _alarms(run, verdict)
+    moments = (0, *(change.sample for change in verdict.changes), *detections, *verdict.overloads.values(), *false)
+    shown = pieces(run.samples, moments)
+    values = _signals(run, shown)
     program = run.conditions.program
     return {
         "samples": run.samples,
@@ -177,13 +178,6 @@ def _alarms(run: Run, verdict: Verdict) -> tuple[list[int], list[int]]:
     return detections, thin_out(
         [index for index in run.alarm_index.tolist() if index in false], run.samples, _MOST_FALSE_ALARMS
     )
-
-
-def _pieces(run: Run, verdict: Verdict) -> tuple[Piece, ...]:
-    """Pieces with every sample near the start, the changes, the lamps and the first alarms."""
-    detections, false = _alarms(run, verdict)
-    changes = (change.sample for change in verdict.changes)
-    return pieces(run.samples, (0, *changes, *detections, *verdict.overloads.values(), *false))
 
 
 def _true_segments(run: Run) -> Iterator[tuple[int, int, Plant]]:

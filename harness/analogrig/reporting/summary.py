@@ -69,7 +69,7 @@ def summary(run: Run, verdict: Verdict) -> str:
 
 
 def channel_faults_text(faults: Sequence[ChannelFault]) -> str:
-    """Faults of the channels: ``displacement stuck at 433 (since 419)``."""
+    """Faults of the channels: ``output stuck at 433 (since 419)``."""
     shown = [f"{fault.name} at {fault.sample} (since {fault.onset})" for fault in faults[:SHOWN_ALARMS]]
     return ", ".join([*shown, *(["..."] if len(faults) > SHOWN_ALARMS else [])])
 

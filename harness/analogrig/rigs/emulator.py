@@ -333,7 +333,10 @@ class EmulatorRig(Rig):
         :raises ConfigurationError: the scenario cannot be played on this rig.
         """
         with emulator_errors(f"scenario {scenario.name}: "):
-            computer = self._computer(scenario, seed)
+            card, program = self.card(scenario.program), scenario.program
+            rate_hz = card.true_rate_hz * probes_per_sample(card)
+            computer = drawn_machine(self.described.computer, program.circuit, seed, rate_hz, anew=True)
+            computer.set(**self.pot_settings(scenario.plant, program.parameters))
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         changes: list[PotTurn] = []
         plant = scenario.plant
@@ -415,13 +418,6 @@ class EmulatorRig(Rig):
             blocks=_sample(map(alter, volts), Sampler(card, NormalStream(seed, Stream.CARD))),
             hindsight=lambda: Hindsight((), lit_lamps(computer.machine.lamps, probes_per_sample(card))),
         )
-
-    def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
-        card = self.card(scenario.program)
-        rate_hz = card.true_rate_hz * probes_per_sample(card)
-        computer = drawn_machine(self.described.computer, scenario.program.circuit, seed, rate_hz, anew=True)
-        computer.set(**self.pot_settings(scenario.plant, scenario.program.parameters))
-        return computer
 
     def pot_settings(self, plant: Plant, changed: Iterable[str]) -> dict[str, float]:
         """Pot settings for a plant in which these parameters have changed, as coefficients or as dials.

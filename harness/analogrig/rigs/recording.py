@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
@@ -97,14 +96,11 @@ class RecordingRig(Rig):
             for first in range(start, end, BLOCK_SAMPLES):
                 samples = slice(first, min(first + BLOCK_SAMPLES, end))
                 codes = self.run.codes[samples]
-                yield Block(first, self._volts(codes), codes, self.run.clipped[samples], record)
-
-    def _volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
-        """Volts that codes stand for; both are (n, c)."""
-        channels, names = self.run.conditions.channels, self.run.conditions.program.channels
-        unmeasured = np.full(len(codes), np.nan)
-        volts = [channels[name].volts(codes[:, i]) if name in channels else unmeasured for i, name in enumerate(names)]
-        return np.stack(volts, axis=1)
+                volts = np.full(codes.shape, np.nan)
+                for i, name in enumerate(self.run.conditions.program.channels):
+                    if name in self.run.conditions.channels:
+                        volts[:, i] = self.run.conditions.channels[name].volts(codes[:, i])
+                yield Block(first, volts, codes, self.run.clipped[samples], record)
 
 
 def _samples_of(scenario: Scenario) -> Scenario:
