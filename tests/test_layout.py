@@ -12,7 +12,7 @@ FOLDERS = (
     "emulator/analogrig_emulator/engine",
     "harness/analogrig/devices",
     "harness/analogrig/include",
-    "harness/analogrig/templates",
+    "harness/analogrig_new/templates",
     "estimator_c",
 )
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from analogrig.cli import main
-from analogrig.cli.new import _FOLDERS, _TEMPLATES
+from analogrig_new.new_command import _FOLDERS, _TEMPLATES
 from tests.wheels import run
 
 KINDS = sorted(_FOLDERS)

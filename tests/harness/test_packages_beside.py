@@ -43,6 +43,7 @@ def test_there_are_packages_beside_the_core() -> None:
         "analogrig_lines",
         "analogrig_live",
         "analogrig_lucidac",
+        "analogrig_new",
         "analogrig_thesis",
     ]
 

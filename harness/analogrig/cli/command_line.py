@@ -19,7 +19,6 @@ from analogrig.cli import (
     certify,
     compare,
     listing,
-    new,
     playing,
     report,
 )
@@ -45,7 +44,6 @@ _COMMANDS = (
     certify.add,
     compare.add,
     report.add,
-    new.add,
     listing.add_list,
     listing.add_completion,
     listing.add_include,

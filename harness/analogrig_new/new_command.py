@@ -7,10 +7,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import add_command
-from analogrig.cli.terminal import PASSED, show
+from analogrig.cli import PASSED, add_command, show
 
-_TEMPLATES = Path(__file__).parents[1] / "templates"
+_TEMPLATES = Path(__file__).parent / "templates"
 """Folders of files. A name that begins with ``dot-`` is written with a dot."""
 
 _FOLDERS = {
@@ -55,7 +54,7 @@ def write_repository(folder: Path, kind: str) -> list[str]:
 
     :raises ConfigurationError: the folder holds something, or cannot be written to.
     """
-    from analogrig.errors import ConfigurationError
+    from analogrig import ConfigurationError
 
     files = {_name(path.relative_to(_TEMPLATES / part)): path for part in _FOLDERS[kind] for path in _files(part)}
     try:
