@@ -291,6 +291,12 @@ class Conditions:
         """Data sheet of the device: its own, or that of its estimator's settings."""
         return self.device.datasheet or Datasheet.of_estimator(self.dut["estimator"])
 
+    def again(self, **changes: Any) -> Conditions:
+        """Conditions of another run with the same scenario, rig and device, whose facts are read once for all."""
+        out = dataclasses.replace(self, **changes)
+        vars(out).update({name: getattr(self, name) for name in ("played", "source", "device", "datasheet")})
+        return out
+
     def check(self, where: str) -> None:
         """Check each key of the descriptions that a verdict reads; ``where`` leads every error.
 

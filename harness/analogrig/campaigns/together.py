@@ -6,7 +6,6 @@ The runs and verdicts are those of ``Bench.play`` and ``judge``, to the bit, wit
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 import functools
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -94,8 +93,7 @@ class DirectBench(Bench):
         common = self._common_conditions(first, scenario, seeds[0], played[0])
         return [
             _run_of_block(
-                dataclasses.replace(
-                    common,
+                common.again(
                     seed=seed,
                     overloads=overloads_until(performance.hindsight(), scenario.samples),
                     counters=counters,
