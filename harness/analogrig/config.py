@@ -21,7 +21,18 @@ from typing import Any, Generic, Literal, TypeVar
 from analogrig.entry_points import EntryPoint, of_group
 from analogrig.errors import ConfigurationError
 
-__all__ = ["Kinds", "build", "check_range", "fixtures", "locate", "plain", "read_toml", "suggest", "to_toml"]
+__all__ = [
+    "Kinds",
+    "build",
+    "check_range",
+    "fixtures",
+    "locate",
+    "plain",
+    "read_bounded",
+    "read_toml",
+    "suggest",
+    "to_toml",
+]
 """Names for packages beside the core."""
 
 T = TypeVar("T")

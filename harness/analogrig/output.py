@@ -22,7 +22,7 @@ from analogrig.identity import Identity
 from analogrig.pages import FOLDER, assemble_page
 from analogrig.signals import hold_signals, interruption
 
-__all__ = ["OutputFolder", "move_aside"]
+__all__ = ["FORMAT", "FORMAT_VERSION", "REPORT_FILE", "VERDICT_FILE", "OutputFolder", "move_aside"]
 """Names for packages beside the core."""
 
 VERDICT_FILE, RUN_FILE, REPORT_FILE, CAN_LOG = "verdict.json", "run.npz", "report.html", "can"

@@ -21,16 +21,21 @@ PLOTS = (FOLDER / "uPlot.iife.min.js", FOLDER / "plots.js")
 TABLES = FOLDER / "tables.js"
 """Script of every page with tables that can be sorted."""
 
+__all__ = ["SIGNS", "TABLES", "render_page"]
+"""Names for packages beside the core."""
+
 SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?", "unjudged": "–"}
 """Sign of each outcome of a run."""
 
 
-def render_page(template: str, scripts: Sequence[Path] = (), *, title: str, **values: Any) -> str:
-    """Self-contained page: ``template`` of this package with values, all of which are escaped.
+def render_page(template: str | Path, scripts: Sequence[Path] = (), *, title: str, **values: Any) -> str:
+    """Self-contained page: a template with values, all of which are escaped.
 
+    :param template: path, or the name of one of this package. It may import those of this package.
     :raises RecordingError: a file is missing, such as uPlot before the build.
     """
-    body = _templates().get_template(template).render(values)
+    path = FOLDER / template
+    body = _templates(path.parent).get_template(path.name).render(values)
     return _frame(body, scripts, html.escape(title))
 
 
@@ -53,12 +58,12 @@ def assemble_page(
 
 
 @functools.cache
-def _templates() -> Any:
-    """Environment of the templates. jinja2 is imported here: a command without such a page does not need it."""
+def _templates(folder: Path) -> Any:
+    """Environment of the templates in a folder. jinja2 is imported here, because few commands need it."""
     import jinja2
 
     templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "reporting"),
+        loader=jinja2.FileSystemLoader([folder, FOLDER]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

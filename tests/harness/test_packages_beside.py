@@ -44,6 +44,7 @@ def test_there_are_packages_beside_the_core() -> None:
         "analogrig_live",
         "analogrig_lucidac",
         "analogrig_new",
+        "analogrig_session",
         "analogrig_thesis",
     ]
 

@@ -15,11 +15,11 @@ from analogrig.judging.verdict import judge
 from analogrig.output import REPORT_FILE, OutputFolder
 from analogrig.reporting import write_report
 from analogrig.reporting.campaign_page import write_page
-from analogrig.reporting.session import find_session, write_session
 from analogrig_circuits import effects_page
 from analogrig_emulator.machine.drawing import patch_drawing
 from analogrig_emulator.machine.program_loader import load_patch
 from analogrig_emulator.nonidealities import Effect
+from analogrig_session.session_page import find_session, write_session
 from tests.browser import VIEWS, Watched
 from tests.harness.reported import empty_run, reported_run, reported_verdict
 from tests.harness.test_campaign_page import drawn_results, results

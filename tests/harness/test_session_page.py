@@ -12,8 +12,8 @@ import pytest
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError
 from analogrig.output import NOT_ENDED, OutputFolder
-from analogrig.reporting import session as session_page
-from analogrig.reporting.session import find_session, render
+from analogrig_session import session_page
+from analogrig_session.session_page import find_session, render
 from tests.harness.reported import Page
 
 CHANGE = {"latency": 3, "bound": 2, "result": "detected"}

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         FAILED,
         INCONCLUSIVE,
         PASSED,
+        USAGE,
         complain,
         output_for_command,
         progress_line,
@@ -60,7 +61,7 @@ else:
                 "add_seed add_what_to_play changes_of_dut count files_read open_what_to_play port trust_of"
             ),
             "analogrig.cli.terminal": (
-                "FAILED INCONCLUSIVE PASSED complain output_for_command progress_line show show_json "
+                "FAILED INCONCLUSIVE PASSED USAGE complain output_for_command progress_line show show_json "
                 "show_plain show_result show_work"
             ),
         },
@@ -76,6 +77,7 @@ __all__ = [
     "RIG",
     "RIG_NAMES",
     "SCENARIO",
+    "USAGE",
     "add_allow",
     "add_command",
     "add_dut",

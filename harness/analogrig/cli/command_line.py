@@ -20,7 +20,6 @@ from analogrig.cli import (
     compare,
     listing,
     playing,
-    report,
 )
 from analogrig.cli.terminal import (
     INCONCLUSIVE,
@@ -43,7 +42,6 @@ _COMMANDS = (
     campaign.add,
     certify.add,
     compare.add,
-    report.add,
     listing.add_list,
     listing.add_completion,
     listing.add_include,

@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import add_command, add_json
-from analogrig.cli.terminal import INCONCLUSIVE, PASSED, USAGE, show, show_result, show_work
+from analogrig.cli import INCONCLUSIVE, PASSED, USAGE, add_command, add_json, show, show_result, show_work
 
 
 def add(commands: Any) -> None:
@@ -27,7 +26,7 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from analogrig.reporting.session import PAGE_FILE, find_session, write_session
+    from analogrig_session.session_page import PAGE_FILE, find_session, write_session
 
     page = arguments.out or arguments.folder / PAGE_FILE
     with show_work(f"reading the runs in {arguments.folder}"):

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from analogrig import ConfigurationError, RecordingError
 from analogrig.config import read_bounded
-from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.output import FORMAT, FORMAT_VERSION, REPORT_FILE, VERDICT_FILE
 from analogrig.pages import SIGNS, TABLES, render_page
 from analogrig.storage import replace_file
@@ -180,7 +180,7 @@ def render(session: RunList) -> str:
     unread = (*session.unended, *session.unread)
     worst = next((outcome for outcome in ("failed", "inconclusive", "unjudged") if session.count(outcome)), "passed")
     return render_page(
-        "session.html",
+        Path(__file__).parent / "session.html",
         (TABLES,),
         title=f"{number_of(len(session.runs), 'run')}: {counts}",
         outcome="inconclusive" if worst == "passed" and unread else worst,
