@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from analogrig.cli import main
-from analogrig_circuits import netlist
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
+from analogrig_circuits import netlist
 from analogrig_emulator import (
     FRONT,
     SHOCK,
