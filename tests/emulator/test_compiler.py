@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,6 +144,15 @@ z' = -z - 0.5*sqrt(0.05 + x*x)/sqrt(0.3 + abs(y))""",
 }
 
 
+DEAR = ("a root of the input", "a divisor with a root", "a fast quotient")
+"""Programs of a kind that others show too, and that take seconds to compile or to solve."""
+
+
+def sampled(names: Iterable[str]) -> list[Any]:
+    """Parameters with these names; the dear ones are heavy."""
+    return [pytest.param(name, marks=pytest.mark.heavy) if name in DEAR else name for name in names]
+
+
 def compiled(equations: str) -> PatchedProgram:
     states = "".join(f"{state} = {{}}\n" for state in "xyz")
     return compile_program(
@@ -167,7 +177,7 @@ MOVED = {
 }
 
 
-@pytest.mark.parametrize("name", MOVED)
+@pytest.mark.parametrize("name", sampled(MOVED))
 def test_ideal_parts_play_the_equations_under_an_input_that_moves_all_the_time(name: str) -> None:
     equations, excitation = MOVED[name]
     program = compiled(equations)
@@ -189,13 +199,13 @@ def test_ideal_parts_play_the_equations_under_an_input_that_moves_all_the_time(n
 
 
 @pytest.mark.parametrize("sample_rate_hz", [500.0, 100e3, pytest.param(RATE_HZ, marks=pytest.mark.heavy)])
-@pytest.mark.parametrize("name", DIVIDING)
+@pytest.mark.parametrize("name", sampled(DIVIDING))
 def test_dividers_and_roots_play_the_equations_at_any_rate(name: str, sample_rate_hz: float) -> None:
     assert off_equations_lsb(compiled(DIVIDING[name]), sample_rate_hz=sample_rate_hz) < 0.05
 
 
 @pytest.mark.parametrize("sample_rate_hz", [100.0, 500.0])
-@pytest.mark.parametrize("name", [*DIVIDING, "two-tanks"])
+@pytest.mark.parametrize("name", sampled([*DIVIDING, "two-tanks"]))
 def test_offsets_of_ideal_amplifiers_leave_dividers_a_solution(name: str, sample_rate_hz: float) -> None:
     program = compiled(DIVIDING[name]) if name in DIVIDING else program_of(name)
     low_v, high_v = levels_v(program)
