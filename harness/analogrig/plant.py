@@ -250,11 +250,17 @@ def _sampled(plant: Plant, period_s: float) -> SampledPlant:
     return SampledPlant.from_plants([plant], period_s)[0]
 
 
-def discretise(program: Program, parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
-    """Discretise plants of a linear program, (p, m) parameters: (p, n, n + 1), the states from states and input."""
+def discretise(
+    program: Program, parameters: NDArray[np.float64], period_s: float | Sequence[float]
+) -> NDArray[np.float64]:
+    """Discretise plants of a linear program, (p, m) parameters: (p, n, n + 1), the states from states and input.
+
+    :param period_s: duration; of several, the result has one more axis at the front.
+    """
     generators = program.generators(parameters)
     generators[:, -1] = 0.0
-    return exponentials(generators * period_s)[:, :-1]
+    matrices = generators * np.asarray(period_s)[..., None, None, None]
+    return exponentials(matrices.reshape(-1, *generators.shape[1:])).reshape(matrices.shape)[..., :-1, :]
 
 
 def exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:

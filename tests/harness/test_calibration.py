@@ -51,8 +51,10 @@ LSB_V = 20.0 / 4096
 
 @pytest.mark.parametrize(
     ("number", "stocks"),
-    [(0, ("polypropylene", "polyester")), (4, ("polyester",))],
-    ids=["front, polyester", "shock, polyester"],
+    [
+        pytest.param(0, ("polypropylene", "polyester"), marks=pytest.mark.heavy, id="front"),
+        pytest.param(4, ("polyester",), id="shock"),
+    ],
 )
 def test_twin_of_a_random_rig_follows_it_and_its_errors_cover_the_truth(number: int, stocks: tuple[Stock, ...]) -> None:
     """The limit is 1 LSB; twenty rigs stay below half of it (calibration.md).

@@ -51,6 +51,14 @@ _DRAWS = 8
 """Uniform numbers within +-1 drawn for each element, numbered by _Draw."""
 
 
+@functools.lru_cache(maxsize=4096)  # a fit wires the same specimen thousands of times
+def _draws(seed: int, name: str) -> NDArray[np.float64]:
+    """(_DRAWS,) uniform numbers of an element; not to be written to."""
+    draws = np.random.default_rng([seed, *name.encode()]).uniform(-1.0, 1.0, _DRAWS)
+    draws.flags.writeable = False
+    return draws
+
+
 class _Draw:
     """Index of each quantity among the numbers drawn for an element."""
 
@@ -421,7 +429,7 @@ class Components:
         return self.resistors, self.capacitors, self.dielectric, self.op_amps, self.pots, self.multipliers
 
     def _parts(self, element: Element) -> Iterator[Element]:
-        draws = np.random.default_rng([self.seed, *element.name.lower().encode()]).uniform(-1.0, 1.0, _DRAWS)
+        draws = _draws(self.seed, element.name.lower())
         match element:
             case Resistor():
                 yield replace(element, ohm=element.ohm * self._factor(element.name, self.resistors, draws))

@@ -245,7 +245,7 @@ class CardDescription:
 
         :raises ConfigurationError: one is of another type.
         """
-        hints = typing.get_type_hints(Card)
+        hints = typing.get_type_hints(Card) if self.faults else {}  # evaluating them takes a millisecond
         return {name: config.convert(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
 
     def card(self, channels: Sequence[str]) -> Card:
@@ -315,11 +315,14 @@ class EmulatorRig(Rig):
         )  # refused here, and not when it is first played
         self.amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._cards: dict[tuple[str, ...], Card] = {}
-        self._table = dataclasses.asdict(description)  # to write it takes as long as to play a thousand samples
         self._block_samples = block_samples
 
     def description(self) -> Mapping[str, Any]:
         return self._table
+
+    @functools.cached_property
+    def _table(self) -> Mapping[str, Any]:
+        return dataclasses.asdict(self.described)  # to write it takes as long as to play a thousand samples
 
     def card(self, program: Program) -> Card:
         """Card with the channels of a program."""

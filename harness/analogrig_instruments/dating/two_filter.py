@@ -121,9 +121,8 @@ class PlantModel:
         period_s, noise_m = signals.period_s, signals.noise_m
         units = np.array([[1.0, 1.0 / period_s, 1.0 / noise_m], [period_s, 1.0, period_s / noise_m]])
         places = np.clip(edges.mean + edges.half_width * _PLACES, 0.0, 1.0).tolist()
-        whole, *late = (
-            units * discretise(program, parameters, part * period_s) for part in (1.0, *(1.0 - at for at in places))
-        )
+        parts = [1.0, *(1.0 - at for at in places)]
+        whole, *late = units * discretise(program, parameters, [part * period_s for part in parts])
         edge = np.array(late)[:, :, :, 2]
         off = edge - edge.mean(axis=0)
         covariance = np.einsum("pmi,pmj->mij", off, off) / len(places)
