@@ -132,8 +132,8 @@ def test_ctrl_c_ends_a_command_whose_device_hangs(tmp_path: Path) -> None:
         ("include",),
         ("completion", "bash"),
         ("netlist",),
-        ("run", "--scenario", "healthy", "--out", "out"),
-        ("run", "--scenario", "healthy", "--out", "out", "--json"),
+        ("run", "--dut", "inproc", "--out", "out"),
+        ("run", "--dut", "inproc", "--out", "out", "--json"),
     ],
     ids=" ".join,
 )

@@ -224,13 +224,19 @@ def test_played(hil_play):
 
 def test_other():
     pass
+
+def test_failed(hil_play):
+    hil_play("thesis")
+    assert False
 """
 
 
-@pytest.mark.parametrize("options", [[], ["-n", "2"]])
-def test_junit_says_it_of_each_play_and_of_the_suite(pytester: pytest.Pytester, options: list[str]) -> None:
+@pytest.mark.parametrize("options", [[], ["-n", "1"]])
+def test_junit_says_it_of_each_play_and_of_the_suite_and_a_recording_has_it(pytester: pytest.Pytester, options: list[str]) -> None:
     pytester.makepyfile(PLAYED)
-    pytester.runpytest_subprocess("--hil-dut", "inproc", "--junitxml", "out.xml", *options).assert_outcomes(passed=2)
+    pytester.runpytest_subprocess("--hil-dut", "inproc", "--junitxml", "out.xml", *options).assert_outcomes(
+        passed=2, failed=1
+    )
     suite = junit_suite(pytester)
     of_suite = {each.get("name"): each.get("value") for each in suite.findall("properties/property")}
     cases = {case.get("name"): case for case in suite.findall("testcase")}
@@ -242,17 +248,12 @@ def test_junit_says_it_of_each_play_and_of_the_suite(pytester: pytest.Pytester, 
         assert "--hil-dut inproc --junitxml out.xml" in str(told["command"])
         assert datetime.fromisoformat(str(told["started"])).utcoffset() == timedelta(0)
     assert "device_sha256" not in of_suite
+    (recording,) = (pytester.path / "build" / "runs").rglob("run.npz")  # of the one that failed
+    made_by = Run.load(recording).conditions.identity
+    assert made_by is not None and made_by.command.startswith("pytest ")
 
 
 def test_junit_of_a_session_that_plays_nothing_stays_as_it_is(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("def test_other(): pass")
-    pytester.runpytest_subprocess("--junitxml", "out.xml").assert_outcomes(passed=1)
+    pytester.runpytest_inprocess("-p", "no:xdist", "--junitxml", "out.xml").assert_outcomes(passed=1)
     assert junit_suite(pytester).find("properties") is None
-
-
-def test_run_that_fails_leaves_its_identity_with_the_recording(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile("def test_it(hil_play):\n    hil_play('thesis')\n    assert False\n")
-    pytester.runpytest_subprocess("--hil-dut", "inproc").assert_outcomes(failed=1)
-    (recording,) = (pytester.path / "build" / "runs").rglob("run.npz")
-    made_by = Run.load(recording).conditions.identity
-    assert made_by is not None and made_by.command.startswith("pytest ")

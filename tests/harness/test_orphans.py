@@ -19,7 +19,7 @@ import pytest
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import LONG_S, gone, marked
 
-KILLS = 8
+KILLS = 3
 
 
 @contextmanager

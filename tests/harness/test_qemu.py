@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import shutil
 import signal
@@ -61,31 +62,41 @@ def shortened(name: str) -> Scenario:
     )
 
 
-@pytest.fixture(scope="module", params=names("scenarios"))
-def reference(request: pytest.FixtureRequest) -> tuple[Scenario, Run]:
+@functools.cache
+def reference(name: str) -> tuple[Scenario, Run]:
     """A scenario, and its run with the device in this process."""
-    scenario = shortened(request.param)
+    scenario = shortened(name)
     return scenario, play(InprocDevice(name="bob", estimator=EstimatorConfig(**SETTINGS)), scenario)
 
 
 SETTINGS: dict[str, Any] = {"orders": "given"}
 """Boards have room for two poles; a scenario's program may want more."""
 
-DEVICES = [
-    *({"kind": kind} for kind in ("host", "qemu-m3", "qemu-m4", "qemu-m7")),
-    {"kind": "qemu-m3", "firmware": str(FOLDER / "analogrig-m0.elf")},
-]
+DEVICES: dict[str, dict[str, str]] = {
+    **{kind: {"kind": kind} for kind in ("qemu-m3", "qemu-m4", "qemu-m7", "host")},
+    "m0": {"kind": "qemu-m3", "firmware": str(FOLDER / "analogrig-m0.elf")},
+}
+EXCHANGES = ("sample", "stream")
 
 
-@pytest.mark.parametrize("device", DEVICES, ids=lambda device: "-".join(Path(word).stem for word in device.values()))
-@pytest.mark.parametrize("exchange", ["sample", "stream"])
-def test_every_scenario_gives_the_same_bits_on_every_device(
-    reference: tuple[Scenario, Run], device: dict[str, str], exchange: str
-) -> None:
+def combinations() -> Iterator[Any]:
+    """Thesis profile on every device with both exchanges; each other scenario with one, by turns, on every device.
+
+    ``make test`` plays one device of each other scenario.
+    """
+    yield from (pytest.param("thesis", device, exchange) for device in DEVICES for exchange in EXCHANGES)
+    for i, scenario in enumerate(name for name in names("scenarios") if name != "thesis"):
+        for j, device in enumerate(DEVICES):
+            marks = () if (i + j) % len(DEVICES) == 0 else pytest.mark.heavy
+            yield pytest.param(scenario, device, EXCHANGES[(i + j) % 2], marks=marks)
+
+
+@pytest.mark.parametrize(("scenario", "device", "exchange"), list(combinations()))
+def test_every_scenario_gives_the_same_bits_on_every_device(scenario: str, device: str, exchange: str) -> None:
     """The M0 image runs on an M3, since QEMU has no M0 board."""
-    scenario, expected = reference
-    table = {"name": "bob", "exchange": exchange, "timeout_s": LONG_S, "estimator": SETTINGS, **device}
-    run = play(from_table(table, "bob"), scenario)
+    played, expected = reference(scenario)
+    table = {"name": "bob", "exchange": exchange, "timeout_s": LONG_S, "estimator": SETTINGS, **DEVICES[device]}
+    run = play(from_table(table, "bob"), played)
     assert run.conditions.faults == ()
     assert run.theta_hash() == expected.theta_hash()
     assert (run.statistic == expected.statistic).all()

@@ -30,7 +30,7 @@ from tests.harness.test_trust import (
 __all__ = ["instrument", "library", "pytestmark", "user"]
 """Fixtures, and what applies to every test."""
 
-PLAYS = "def test_it(hil_play):\n    hil_play('healthy')\n"
+PLAYS = "def test_it(hil_play):\n    hil_play('short.toml')\n"
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_device_of_a_scenario_that_a_test_passes_on_is_opened_only_if_it_is_allo
 
         @pytest.mark.parametrize("hil_dut", [Scenario.load({scenario!r}).dut], indirect=True)
         def test_it(hil_play):
-            hil_play("healthy")
+            hil_play("short.toml")
     """)
     check(user, bait, [])
 
