@@ -232,7 +232,9 @@ def test_failed(hil_play):
 
 
 @pytest.mark.parametrize("options", [[], ["-n", "1"]])
-def test_junit_says_it_of_each_play_and_of_the_suite_and_a_recording_has_it(pytester: pytest.Pytester, options: list[str]) -> None:
+def test_junit_says_it_of_each_play_and_of_the_suite_and_a_recording_has_it(
+    pytester: pytest.Pytester, options: list[str]
+) -> None:
     pytester.makepyfile(PLAYED)
     pytester.runpytest_subprocess("--hil-dut", "inproc", "--junitxml", "out.xml", *options).assert_outcomes(
         passed=2, failed=1

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+import analogrig.testing.properties.claimed
+import analogrig.testing.properties.conversed
+import analogrig.testing.properties.experiments  # noqa: F401 - a session in this process forgets what it imports itself
 from tests.harness.test_pytest_plugin import run, user
 from tests.harness.test_trust import (
     _OPEN,
