@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import io
 import random
 import struct
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import can
+import cantools
 import numpy as np
 import pytest
 
@@ -95,21 +97,22 @@ def without(frames: list[can.Message], *places: int) -> list[can.Message]:
     return [frame for i, frame in enumerate(frames) if i not in places]
 
 
-def ran(*words: str, given: bytes = b"") -> str:
-    return subprocess.run(
-        [sys.executable, *words], input=given, capture_output=True, check=True, timeout=LONG_S
-    ).stdout.decode()
-
-
 # ------------------------------------------------------------------------------------------------- the users' tools
 
 
-def test_cantools_decodes_a_candump_log_with_our_dbc(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+def test_cantools_decodes_a_candump_log_with_our_dbc(
+    tmp_path: Path,
+    traffic: tuple[Run, list[can.Message]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     run, frames = traffic
     first = nth(frames, "Sample", 0)
     log = written(tmp_path / "can.log", frames[first : first + 9])
-    out = ran("-m", "cantools", "decode", "--single-line", str(DBC), given=log.read_bytes())
-    lines = out.splitlines()
+    monkeypatch.setattr(sys, "argv", ["cantools", "decode", "--single-line", str(DBC)])
+    monkeypatch.setattr(sys, "stdin", io.StringIO(log.read_text()))
+    cantools._main()
+    lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 9
     assert f"Force: {run.codes[0, 0]} code" in lines[0]
     assert f"Displacement: {run.codes[0, 1]} code" in lines[0]

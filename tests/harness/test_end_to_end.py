@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import pty
@@ -20,10 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analogrig.cli import main
 from analogrig.config import locate
 from analogrig.devices.processes import HOST_PROGRAM
 from analogrig.run import Run
+from tests.harness.commands import called
 from tests.harness.firmware import CORES, needs_firmware
 from tests.harness.processes import LONG_S, descendants
 from tests.harness.runs import made_run
@@ -39,20 +37,6 @@ def analogrig(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[
     return subprocess.run(
         command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=LONG_S, check=False
     )
-
-
-def called(*arguments: str | Path, cwd: Path) -> tuple[int, str, str]:
-    """Status, output and errors of a command in this process."""
-    with (
-        contextlib.chdir(cwd),
-        contextlib.redirect_stdout(io.StringIO()) as out,
-        contextlib.redirect_stderr(io.StringIO()) as errors,
-    ):
-        try:
-            status: Any = main(list(map(str, arguments)))
-        except SystemExit as ended:
-            status = ended.code
-    return status, out.getvalue(), errors.getvalue()
 
 
 def run_json(*arguments: str | Path, cwd: Path, status: int = 0) -> dict[str, Any]:

@@ -193,7 +193,7 @@ def short(name: str, samples: int) -> Scenario:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("kind", KINDS)
-def test_200_plays_in_any_order_answer_as_alone(kind: str, tmp_path: Path) -> None:
+def test_plays_in_any_order_answer_as_alone(kind: str, tmp_path: Path) -> None:
     description = KINDS[kind](tmp_path)
     scenarios = (short("healthy", 90), short("healthy", 240), short("thesis", 450))
     plays = [(scenario, seed) for scenario in scenarios for seed in (1, 2)]
@@ -202,7 +202,7 @@ def test_200_plays_in_any_order_answer_as_alone(kind: str, tmp_path: Path) -> No
         with bench_of(description) as bench:
             expected.append(bits(bench.play(scenario, seed)))
     assert len(set(expected)) == len(plays)
-    order = np.random.default_rng(7).integers(len(plays), size=200).tolist()
+    order = np.random.default_rng(7).integers(len(plays), size=60).tolist()
     with bench_of(description) as bench:
         for number, index in enumerate(order):
             assert bits(bench.play(*plays[index])) == expected[index], (number, index)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import re
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -26,6 +24,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import BLOCK_SAMPLES
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from tests.harness.commands import called
 
 SCENARIO = Scenario.load("thesis")
 
@@ -147,7 +146,7 @@ def test_question_beyond_the_limit_is_not_waited_for() -> None:
 
 
 class SlowServer:
-    """A device behind TCP that answers every message of samples after a second."""
+    """A device behind TCP that answers every message of samples after 0.3 s."""
 
     def __init__(self) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -171,7 +170,7 @@ class SlowServer:
                     return
                 wire.write(received)
                 if has_samples(received):
-                    time.sleep(1.0)
+                    time.sleep(0.3)
                 line.sendall(wire.read(0.0))
             except OSError:
                 return
@@ -187,16 +186,6 @@ def slow() -> Iterator[SlowServer]:
     server.close()
 
 
-def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "analogrig.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300.0,
-        check=False,
-    )
-
-
 @pytest.mark.parametrize("verb", ["run", "replay"])
 def test_command_ends_at_its_limit_and_keeps_what_was_recorded(tmp_path: Path, slow: SlowServer, verb: str) -> None:
     what: tuple[str, ...] = ("--scenario", "thesis")
@@ -210,14 +199,14 @@ def test_command_ends_at_its_limit_and_keeps_what_was_recorded(tmp_path: Path, s
             Bench(rig, dut).play(SCENARIO, 1).save(tmp_path / "before.npz")
         what = (str(tmp_path / "before.npz"),)
     device = ("--dut", f"serial:socket://127.0.0.1:{slow.port}", "--exchange", "sample")
-    done = command(verb, *what, *device, "--time-limit", "5", "--out", tmp_path / "out")
-    assert done.returncode == 3, done.stderr
-    (line,) = done.stderr.splitlines()
-    told = re.fullmatch(r"analogrig: INCONCLUSIVE: time limit of 5 s reached after (\d+) of 1800 samples", line)
+    done = called(verb, *what, *device, "--time-limit", "1.5", "--out", tmp_path / "out")
+    assert done.status == 3, done.err
+    (line,) = done.err.splitlines()
+    told = re.fullmatch(r"analogrig: INCONCLUSIVE: time limit of 1.5 s reached after (\d+) of 1800 samples", line)
     assert told is not None, line
     assert int(told[1]) <= 5
     assert Run.load(tmp_path / "out" / "run.npz").samples == int(told[1])
-    assert "time limit of 5 s" in (tmp_path / "out" / "report.html").read_text()
+    assert "time limit of 1.5 s" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_limit_ends_a_play_of_the_plugin(
@@ -225,9 +214,9 @@ def test_limit_ends_a_play_of_the_plugin(
 ) -> None:
     monkeypatch.setenv("ANALOGRIG_DUT", f"serial:socket://127.0.0.1:{slow.port}")
     pytester.makepyfile("def test_it(hil_play):\n    hil_play('thesis')\n")
-    result = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:xdist", "--hil-time-limit", "5")
+    result = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:xdist", "--hil-time-limit", "1.5")
     result.assert_outcomes(failed=1)
-    result.stdout.re_match_lines([r".*INCONCLUSIVE: time limit of 5 s reached after \d+ of 1800 samples"])
+    result.stdout.re_match_lines([r".*INCONCLUSIVE: time limit of 1.5 s reached after \d+ of 1800 samples"])
 
 
 @pytest.mark.parametrize("limit", ["0", "soon", "nan"])
@@ -239,7 +228,7 @@ def test_invalid_limit_of_the_plugin_is_refused(pytester: pytest.Pytester, limit
 
 @pytest.mark.parametrize("limit", ["0", "-1", "nan", "soon", "1e99"])
 def test_invalid_limit_is_refused_in_one_line(limit: str, tmp_path: Path) -> None:
-    done = command("run", f"--time-limit={limit}", "--out", tmp_path)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
+    done = called("run", f"--time-limit={limit}", "--out", tmp_path)
+    assert done.status == 2
+    (line,) = done.err.splitlines()
     assert "--time-limit" in line

@@ -69,11 +69,11 @@ def test_bench_with_a_device_that_hangs_says_so_and_ends_at_a_later_signal(tmp_p
     (tmp_path / "stuck.py").write_text(
         "import threading\n\nclass Stuck:\n    def step(self, u, y, valid):\n        threading.Event().wait()\n"
     )
-    command = [
-        *(sys.executable, "-m", "analogrig.cli", "bench", "--no-open", "--out", "out"),
-        "--dut",
-        "python:stuck:Stuck",
-    ]
+    impatient = (
+        "import runpy; from analogrig_live import bench_command; bench_command._PATIENCE_S = 0.2;"
+        " runpy.run_module('analogrig.cli', run_name='__main__')"
+    )
+    command = [sys.executable, "-c", impatient, "bench", "--no-open", "--out", "out", "--dut", "python:stuck:Stuck"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
         assert process.stdout is not None
         address = process.stdout.readline().split()[-1]
