@@ -235,7 +235,13 @@ def test_estimator_of_fixed_orders_is_that_of_any_orders_to_the_bit(settings: di
         assert ours.counters == others.counters
 
 
-@pytest.mark.parametrize("options", [("-O1", "-DLIBRARY_NARROW"), ("-O2", "-fno-semantic-interposition")], ids=" ".join)
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(("-O1", "-DLIBRARY_NARROW"), id="narrow"),
+        pytest.param(("-O2", "-fno-semantic-interposition"), id="as shipped", marks=pytest.mark.heavy),
+    ],
+)
 def test_estimator_inside_the_loop_over_samples_is_the_one_that_is_called_to_the_bit(
     options: tuple[str, ...], tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from analogrig import Bench, Scenario, judge, open_rig
 from analogrig.cli import main
+from analogrig.config import locate
 from analogrig.devices.python import PythonDescription
 from analogrig.run import Run
 from tests.harness.hostile_python import ACTS, AT
@@ -83,8 +84,11 @@ def test_other_acts_do_no_harm(act: str, capfd: pytest.CaptureFixture[str]) -> N
 
 
 def command(act: str, out: Path, *options: str, query: str = "") -> list[str]:
+    """Play two thousand samples of the scenario ``healthy``."""
+    scenario = out.with_name("short.toml")
+    scenario.write_text(locate("scenarios", "healthy").read_text().replace("samples = 20000", "samples = 2000"))
     dut = f"python:tests.harness.hostile_python:make?act={act}{query}"
-    return ["run", "--scenario", "healthy", "--dut", dut, "--out", str(out), *options]
+    return ["run", "--scenario", str(scenario), "--dut", dut, "--out", str(out), *options]
 
 
 def test_time_limit_ends_a_step_that_sleeps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

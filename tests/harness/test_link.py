@@ -268,7 +268,7 @@ def test_program_serves_a_serial_device_that_is_there_and_ends_when_it_is_gone(t
 
 def test_device_answers_bursts_that_fill_its_output_to_the_last() -> None:
     """Work that is left over when the output has just been emptied must not wait for the next message."""
-    burst, bursts = 11, 1500
+    burst, bursts = 11, 500
     with subprocess.Popen([HOST_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         link = at_port(process.stdout.readline().strip())

@@ -70,7 +70,7 @@ def test_bench_with_a_device_that_hangs_says_so_and_ends_at_a_later_signal(tmp_p
         "import threading\n\nclass Stuck:\n    def step(self, u, y, valid):\n        threading.Event().wait()\n"
     )
     impatient = (
-        "import runpy; from analogrig_live import bench_command; bench_command._PATIENCE_S = 0.2;"
+        "import runpy; from analogrig_live import bench_command; bench_command._PATIENCE_S = 1.2;"
         " runpy.run_module('analogrig.cli', run_name='__main__')"
     )
     command = [sys.executable, "-c", impatient, "bench", "--no-open", "--out", "out", "--dut", "python:stuck:Stuck"]
