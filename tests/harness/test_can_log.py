@@ -111,7 +111,7 @@ def test_cantools_decodes_a_candump_log_with_our_dbc(
     log = written(tmp_path / "can.log", frames[first : first + 9])
     monkeypatch.setattr(sys, "argv", ["cantools", "decode", "--single-line", str(DBC)])
     monkeypatch.setattr(sys, "stdin", io.StringIO(log.read_text()))
-    cantools._main()
+    cantools._main()  # type: ignore[no-untyped-call]
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 9
     assert f"Force: {run.codes[0, 0]} code" in lines[0]
