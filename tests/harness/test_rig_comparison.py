@@ -132,7 +132,7 @@ def test_rig_equals_itself() -> None:
 
 
 def test_noise_beyond_the_setting_of_the_device_changes_the_verdicts() -> None:
-    found = compare(rig(noise_lsb=0.3), rig(noise_lsb=8.0), plays=8, noise_estimated=False)
+    found = compare(rig(noise_lsb=0.3), rig(noise_lsb=8.0), plays=12, noise_estimated=False)
     assert found.latency is not None
     assert found.latency.least_n > 0.0
     assert found.latency.quantiles_n[1][1] > found.latency.quantiles_n[0][1]
