@@ -22,7 +22,7 @@ from analogrig.config import locate
 from analogrig.devices.processes import HOST_PROGRAM
 from analogrig.run import Run
 from tests.harness.commands import called
-from tests.harness.firmware import CORES, needs_firmware
+from tests.harness.firmware import needs_firmware
 from tests.harness.processes import LONG_S, descendants
 from tests.harness.runs import made_run
 
@@ -105,23 +105,11 @@ def test_same_seed_gives_the_same_estimates_bit_for_bit(thesis: tuple[Path, dict
     assert run_json("run", "--seed", "4", "--dut", "inproc", cwd=tmp_path)["theta_hash"] != out["theta_hash"]
 
 
-QUICK_CORE = "m4"
-"""Core that ``make test`` plays; ``make test-heavy`` plays the others."""
-
-
-@pytest.mark.parametrize(
-    "dut",
-    [
-        "inproc",
-        *(
-            pytest.param(f"qemu-{core}", marks=[needs_firmware, *([] if core == QUICK_CORE else [pytest.mark.heavy])])
-            for core in CORES
-        ),
-    ],
-)
+@pytest.mark.parametrize("dut", ["inproc", pytest.param("qemu-m4", marks=needs_firmware)])
 def test_every_device_gives_the_same_estimates_bit_for_bit(
     thesis: tuple[Path, dict[str, Any]], tmp_path: Path, dut: str
 ) -> None:
+    """test_qemu.py plays the other boards."""
     out = run_json("run", "--seed", "3", "--dut", dut, cwd=tmp_path)
     assert out["theta_hash"] == thesis[1]["theta_hash"]
     assert out["dut"]["kind"] == dut
