@@ -273,7 +273,9 @@ class _DeckWriter:
         yield from elements
         yield "* time points on the samples"
         yield clock
-        yield from self._initial_conditions()
+        for amp in (*self._circuit.of(OpAmp), *self._circuit.of(Multiplier)):
+            if amp.name in self._deck.initial_v:
+                yield f".ic v({_card('X', amp.name)}.state)={_number(self._deck.initial_v[amp.name])}"
         yield ".save " + " ".join(f"v({node})" for node in (self._circuit.nodes if nodes is None else nodes))
         yield f".options reltol={accuracy.reltol:g} vntol={accuracy.vntol_v:g} abstol={accuracy.abstol_a:g}"
         yield f".options trtol={accuracy.trtol:g} method={accuracy.method}"
@@ -325,11 +327,6 @@ class _DeckWriter:
     def _instance(self, subcircuit: str, card: str, nodes: Sequence[str], **values: float) -> str:
         self._used[subcircuit] = None
         return " ".join([card, *nodes, subcircuit, *(f"{name}={_number(value)}" for name, value in values.items())])
-
-    def _initial_conditions(self) -> Iterator[str]:
-        for amp in (*self._circuit.of(OpAmp), *self._circuit.of(Multiplier)):
-            if amp.name in self._deck.initial_v:
-                yield f".ic v({_card('X', amp.name)}.state)={_number(self._deck.initial_v[amp.name])}"
 
     def _free(self, name: str) -> str:
         """Name with as many underscores appended as make it unique in the deck."""

@@ -264,17 +264,14 @@ class LucidacCircuit:
         yield element
         if kind in ("UI", "US"):
             current_a = self.trims.offsets_a.get(int(number), 0.0)
-            if charging and kind == "UI":
-                yield from self._charging(int(number))
+            if charging and kind == "UI":  # an inverter of the initial condition, with the capacitor across it
+                initial = self.configuration.integrators[int(number)].ic * UNIT_V
+                initial_v = initial + self.trims.initial_v.get(int(number), 0.0)
+                yield VoltageSource(f"IC{number}", f"i{number}", dc_v=initial_v)
+                yield Resistor(f"RA{number}", f"i{number}", f"s{number}", SUM_OHM)
+                yield Resistor(f"RB{number}", f"s{number}", f"o{number}", SUM_OHM)
             else:
                 yield CurrentSource(f"SH{number}", GROUND, f"s{number}", dc_a=current_a)
-
-    def _charging(self, i: int) -> Iterator[Element]:
-        """Charging circuit of an integrator, which inverts its initial condition."""
-        initial_v = self.configuration.integrators[i].ic * UNIT_V + self.trims.initial_v.get(i, 0.0)
-        yield VoltageSource(f"IC{i}", f"i{i}", dc_v=initial_v)
-        yield Resistor(f"RA{i}", f"i{i}", f"s{i}", SUM_OHM)
-        yield Resistor(f"RB{i}", f"s{i}", f"o{i}", SUM_OHM)
 
 
 def calibrated(wiring: LucidacCircuit, *, gain: bool, offset: bool) -> Trims:

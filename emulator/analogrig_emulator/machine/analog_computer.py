@@ -295,7 +295,10 @@ class AnalogComputer:
                 f"relays cannot switch within a run while {', '.join(self._setting.pots.ramps)} are being turned: "
                 "switch() between two runs"
             )
-        self._check_instants(samples, [tick for tick, _ in switches])
+        instants = [tick for tick, _ in switches]
+        first, last = max(self._engine.now_tick, 0), self.window(samples)[1] - 1
+        if any(later < earlier for earlier, later in itertools.pairwise([first, *instants, last])):
+            raise ModeError(f"switches at ticks {instants}: not in order, or not within {first} to {last}")
         volts = []
         stop = self.recorded + samples
         for tick, mode in switches:
@@ -408,12 +411,6 @@ class AnalogComputer:
     def _levels_at(self, tick: int) -> dict[str, float]:
         """Levels of all inputs at the present tick, in V."""
         return self._levels_v | {name: drive.at(tick) for name, drive in self._drives.items()}
-
-    def _check_instants(self, samples: int, ticks: Sequence[int]) -> None:
-        _, stop = self.window(samples)
-        allowed = [max(self._engine.now_tick, 0), *ticks, stop - 1]
-        if ticks and any(later < earlier for earlier, later in itertools.pairwise(allowed)):
-            raise ModeError(f"switches at ticks {list(ticks)}: not in order, or not within {allowed[0]} to {stop - 1}")
 
     # ---- relays
 

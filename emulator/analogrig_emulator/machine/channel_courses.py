@@ -91,7 +91,12 @@ class Course:
         """Voltages of the next samples, (samples,). Raises EngineError."""
         probes = self._courses.probes
         first = 0 if self._engine.recorded else 1 + self._probe
-        return self._courses.sign * self._run(first + samples * probes)[first + probes - 1 :: probes, 0]
+        count = first + samples * probes
+        now = [turn for turn in self._coming if turn[0] < self._engine.recorded + count]
+        del self._coming[: len(now)]
+        edges = {} if self._edges is None else {SOURCE: self._edges.within(*self._engine.window(count))}
+        volts = self._engine.run_changing(count, now, edges) if now else self._engine.run(count, edges)
+        return self._courses.sign * volts[first + probes - 1 :: probes, 0]
 
     def moment(self) -> Moment:
         """Moment of the last sample; there must be one. Raises EngineError."""
@@ -101,13 +106,6 @@ class Course:
         course = Course(self._courses, self._start, self._turns, 0)
         course.advance(samples)
         return course.moment()
-
-    def _run(self, probes: int) -> Matrix:
-        until = self._engine.recorded + probes
-        now = [turn for turn in self._coming if turn[0] < until]
-        del self._coming[: len(now)]
-        edges = {} if self._edges is None else {SOURCE: self._edges.within(*self._engine.window(probes))}
-        return self._engine.run_changing(probes, now, edges) if now else self._engine.run(probes, edges)
 
 
 class Courses:

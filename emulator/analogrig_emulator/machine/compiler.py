@@ -535,9 +535,11 @@ class _Patcher:
                 otherwise=f"raise the full scale of {name}, or name parts of the formula as signals",
             )
         if coefficient < _LEAST_COEFFICIENT:
+            slowest = self._slow_most(stage)
+            slow = f"; the integrator is slow, at most {slowest:.2g} with 1 uF" if slowest < _SLOW else ""
             raise ProgramError(
                 f"{what} has a coefficient of {coefficient:.2g}, below one winding of a pot ({_LEAST_COEFFICIENT:g})"
-                f"{self._slowness(stage)}",
+                f"{slow}",
                 edits=[*self._faster(stage), *self._rescaled(stage, coefficient / _LEAST_COEFFICIENT)],
                 otherwise=f"delete the term, or lower the full scale of {name}",
             )
@@ -558,10 +560,6 @@ class _Patcher:
             return 1.0
         rates = [self._ratio(stage, cord) * extremes(self._stages, cord, stage.place)[1] for cord in stage.cords]
         return self._stages.equations.speed * max(rates) * INPUT_OHM * _CAPACITORS_FARAD[0]
-
-    def _slowness(self, stage: PatchStage) -> str:
-        most = self._slow_most(stage)
-        return f"; the integrator is slow, at most {most:.2g} with 1 uF" if most < _SLOW else ""
 
     def _faster(self, stage: PatchStage) -> list[Edit]:
         """Higher speeds of an integrator: its largest coefficient becomes one, or it moves more in the trial play."""

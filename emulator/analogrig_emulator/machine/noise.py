@@ -38,7 +38,6 @@ from analogrig_emulator.circuit.nodal import analyse
 from analogrig_emulator.circuit.nonlinear import Multiplier
 from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
 from analogrig_emulator.engine import binding
-from analogrig_emulator.engine.system import PiecewiseLinear
 from analogrig_emulator.exceptions import CircuitError
 from analogrig_emulator.machine.suspension import BLOCK_SAMPLES, SuspensionComputer
 
@@ -144,7 +143,8 @@ class _Sources:
 
     def _propagate(self, conditions: _Conditions, dials: Mapping[str, float]) -> Propagation:
         system = self._nodal.at(dials)
-        circuit = _linear_matrix(system)
+        n, slopes = len(system.states), np.array([kink.slopes[1] for kink in system.kinks])
+        circuit = system.abc[:, :n] + _product(system.g * slopes, system.cde[:, :n])  # without active limits
         if system.products and np.linalg.eigvals(circuit).real.max() > _MOST_GROWTH_PER_S:
             raise CircuitError(
                 "noise and hum of this program cannot be computed: products are held in them, and without its products "
@@ -345,13 +345,6 @@ class NoisySuspension:
 def _rows_of(response: Mapping[str, Matrix], names: Sequence[str]) -> Matrix:
     """Rows by name: (names, n)."""
     return np.array([response[name] for name in names]).reshape(len(names), len(response[GROUND]))
-
-
-def _linear_matrix(system: PiecewiseLinear) -> Matrix:
-    """Matrix A without active limits: (n, n)."""
-    slopes = np.array([kink.slopes[1] for kink in system.kinks])
-    n = len(system.states)
-    return system.abc[:, :n] + _product(system.g * slopes, system.cde[:, :n])
 
 
 def _propagate(a: Matrix, intensity: Matrix, period_s: float) -> tuple[Matrix, Matrix, Matrix]:

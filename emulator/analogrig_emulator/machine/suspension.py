@@ -59,7 +59,9 @@ class SuspensionComputer:
     ) -> None:
         self.program = _program(program)
         self.sample_rate_hz = sample_rate_hz
-        model, count = _model(opamp, offset_v), self.program.amplifiers
+        if not 0 <= offset_v < math.inf:
+            raise CircuitError(f"offset_v must be finite and not negative, got {offset_v!r}")
+        model, count = preset(opamp) if isinstance(opamp, str) else opamp, self.program.amplifiers
         offsets_v = None if rng is None else drawn_offsets_v(model, rng.random(count), offset_v).tolist()
         if components.is_perfect and isinstance(self.program, Hashable):
             circuit, self._pots = _nominal(self.program, model, multiplier)
@@ -347,12 +349,6 @@ def _program(program: str | ProgramCircuit) -> ProgramCircuit:
     if program not in PROGRAMS:
         raise CircuitError(f"unknown program {program!r}; there are {', '.join(PROGRAMS)}, or load_patch(file)")
     return PROGRAMS[program]
-
-
-def _model(opamp: str | OpAmpModel, offset_v: float) -> OpAmpModel:
-    if not 0 <= offset_v < math.inf:
-        raise CircuitError(f"offset_v must be finite and not negative, got {offset_v!r}")
-    return preset(opamp) if isinstance(opamp, str) else opamp
 
 
 def drawn_offsets_v(model: OpAmpModel, uniforms: NDArray[np.float64], offset_v: float) -> NDArray[np.float64]:
