@@ -2,7 +2,7 @@
 
 Signals are compared in codes of the first rig, play by play. Noise is no difference: its variance is estimated from the
 differences between neighbouring samples, and subtracted. Verdicts are compared as those of two builds of a device are
-(``analogrig.campaigns.comparison``), paired by seed.
+(``analogrig.campaigns.compare``), paired by seed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from analogrig import Bench, Run, Scenario, judge
 from analogrig.bench import raise_if_interrupted
-from analogrig.campaigns import Comparison, Row, changes, compare, row
+from analogrig.campaigns import Comparison, Trial, compare
 from analogrig.judging import bound_rate, mean_interval, upper_rate
 from analogrig.run import INPUT
 from analogrig_instruments.calibration.averages import noise_variance
@@ -87,9 +87,9 @@ class FalseAlarms:
     """Assumption and data behind the interval."""
 
     @classmethod
-    def of(cls, rows: Sequence[Row], confidence: float) -> Self:
+    def of(cls, trials: Sequence[Trial], confidence: float) -> Self:
         """Sum over plays."""
-        alarms, armed = ([each[name] for each in rows] for name in ("false_alarms", "armed"))
+        alarms, armed = ([getattr(each, name) for each in trials] for name in ("false_alarms", "armed"))
         bounds = bound_rate(alarms, armed, 0.5 * (1.0 + confidence))
         return cls(sum(alarms), sum(armed), bounds.low, bounds.high, bounds.basis)
 
@@ -141,23 +141,23 @@ def compare_rigs(
     :raises DeviceError, LinkError, RigError: before a first sample.
     """
     runs: list[tuple[Run, Run]] = []
-    rows: list[tuple[Row, Row]] = []
+    trials: list[tuple[Trial, Trial]] = []
     invalid = []
     for done, seed in enumerate(seeds, start=1):
         pair = raise_if_interrupted(a.play(scenario, seed)), raise_if_interrupted(b.play(scenario, seed))
-        judged = row(pair[0], judge(pair[0])), row(pair[1], judge(pair[1]))
-        why = [_why_invalid(*each) for each in zip(pair, judged, strict=True) if each[1]["outcome"] == "inconclusive"]
+        judged = Trial.of(pair[0], judge(pair[0])), Trial.of(pair[1], judge(pair[1]))
+        why = [_why_invalid(*each) for each in zip(pair, judged, strict=True) if not each[1].is_valid]
         if why:
             invalid.append(why[0])
         else:
             runs.append(pair)
-            rows.append(judged)
+            trials.append(judged)
         if progress is not None:
             progress(done, len(seeds))
     if len(runs) < 2:
         return tuple(invalid) or ("two plays at least are needed",)
-    rows_a, rows_b = zip(*rows, strict=True)
-    keyed_a, keyed_b = ([((scenario.name, each["seed"]), each) for each in rows] for rows in (rows_a, rows_b))
+    trials_a, trials_b = zip(*trials, strict=True)
+    keyed_a, keyed_b = ([((scenario.name, each.seed), each) for each in side] for side in (trials_a, trials_b))
     return RigComparison(
         a=runs[0][0].conditions.source.name,
         b=runs[0][1].conditions.source.name,
@@ -166,14 +166,14 @@ def compare_rigs(
         plays=len(runs),
         invalid=tuple(invalid),
         signals=tuple(signal_difference(runs, name, confidence) for name in scenario.program.measured),
-        latency=_latency(rows_a, rows_b, confidence),
-        false_alarms=(FalseAlarms.of(rows_a, confidence), FalseAlarms.of(rows_b, confidence)),
+        latency=_latency(trials_a, trials_b, confidence),
+        false_alarms=(FalseAlarms.of(trials_a, confidence), FalseAlarms.of(trials_b, confidence)),
         verdicts=compare(keyed_a, keyed_b, round(1.0 - confidence, 12), scenario.program.estimates),
     )
 
 
-def _why_invalid(run: Run, row: Row) -> str:
-    return f"{run.conditions.source.name}, seed {row['seed']}: {row.get('why', 'inconclusive')}"
+def _why_invalid(run: Run, trial: Trial) -> str:
+    return f"{run.conditions.source.name}, seed {trial.seed}: {trial.why or 'inconclusive'}"
 
 
 # --------------------------------------------------------------------------------------------------------- the signals
@@ -245,10 +245,10 @@ def _largest(difference: NDArray[np.float64], counted: NDArray[np.bool_]) -> tup
 # -------------------------------------------------------------------------------------------------------- the verdicts
 
 
-def _latency(a: Sequence[Row], b: Sequence[Row], confidence: float) -> LatencyDifference | None:
+def _latency(a: Sequence[Trial], b: Sequence[Trial], confidence: float) -> LatencyDifference | None:
     """Difference of the latencies of changes detected on both rigs."""
     both = [
-        [(before.latency_n, after.latency_n) for before, after in zip(changes(mine), changes(other), strict=True)
+        [(before.latency_n, after.latency_n) for before, after in zip(mine.changes, other.changes, strict=True)
          if before.latency_n is not None and after.latency_n is not None]
         for mine, other in zip(a, b, strict=True)
     ]  # fmt: skip

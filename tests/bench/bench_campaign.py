@@ -23,15 +23,13 @@ from pathlib import Path
 
 import numpy as np
 
-from analogrig.campaigns.conduct import conduct
+from analogrig.campaigns.conduct import Task, conduct
 from analogrig.campaigns.plan import Part, Plan
 from analogrig.campaigns.plays import PlayedTask, play_part, play_task
 from analogrig.campaigns.spec import CampaignSpec
-from analogrig.campaigns.tally import Task
-from analogrig.campaigns.trials import Trials
+from analogrig.campaigns.trials import Trials, columns_of, encode
 from analogrig.campaigns.workers import ThisProcess
-from analogrig.reporting.campaign import write_json
-from analogrig.reporting.campaign_page import write_page
+from analogrig.reporting.campaign_page import write_json, write_page
 from tests import tools
 
 from .figure import Figure
@@ -134,7 +132,7 @@ def _stored(folder: Path, trials: int) -> Iterator[Figure]:
         plan = Plan.of(CampaignSpec.load(str(_spec(folder, f"stored-{name}", trials))))
         files.append(folder / f"{name}.sqlite")
         start_s = time.process_time()
-        results = conduct(plan, _Copier(plan, number), files[-1])  # type: ignore[arg-type]  # narrower
+        results = conduct(plan, _Copier(plan, number), files[-1])
         write_json(results, files[-1].with_suffix(".json"))
         write_page(results, files[-1].with_suffix(".html"))
         if not number:
@@ -155,7 +153,7 @@ class _Copier(ThisProcess):
     def __init__(self, plan: Plan, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         text = plan.as_json()
-        self._played = [Trials.of(play_part(text, Part(cell, 0, COPIED))) for cell in range(plan.size)]
+        self._played = [columns_of(play_part(text, Part(cell, 0, COPIED))) for cell in range(plan.size)]
 
     def play(  # type: ignore[override]  # narrower than the protocol
         self,
@@ -163,18 +161,15 @@ class _Copier(ThisProcess):
         tasks: Iterator[Task],
     ) -> Iterator[tuple[Task, PlayedTask]]:
         for task in tasks:
-            parts = [(part, self._copy(part).encode()) for part in task]
+            parts = [(part, encode(self._copy(part))) for part in task]
             yield task, PlayedTask(parts, 2e-3 * sum(part.trials for part in task))
 
     def _copy(self, part: Part) -> Trials:
         places = (part.first + np.arange(part.trials)) % COPIED
-        copied = self._played[part.cell].at(places)
-        values = vars(copied) | {
-            "error": copied.error * self._rng.normal(1.0, 0.1, copied.error.shape).astype(np.float32),
-            "theta": self._rng.integers(1, 2**63, part.trials).astype(np.uint64),
-            "why": tuple(self._played[part.cell].why[i] for i in places.tolist()),
-        }
-        return Trials(**values)
+        copied = self._played[part.cell][places]
+        copied["error"] *= self._rng.normal(1.0, 0.1, copied["error"].shape).astype(np.float32)
+        copied["theta"] = self._rng.integers(1, 2**63, part.trials)
+        return copied
 
 
 def _spec(folder: Path, name: str, trials: int) -> Path:

@@ -16,8 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
-from analogrig.campaigns.repeated import DIRECT_BLOCK_SAMPLES
-from analogrig.campaigns.together import DirectBench, direct_bench
+from analogrig.campaigns.together import DIRECT_BLOCK_SAMPLES, DirectBench, direct_bench
 from analogrig.devices.registry import describe
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig

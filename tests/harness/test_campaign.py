@@ -23,16 +23,14 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.campaigns import builds
-from analogrig.campaigns.conduct import conduct
+from analogrig.campaigns.aggregates import Aggregate, Summary
+from analogrig.campaigns.conduct import TASK_S, Task, Tasks, conduct
 from analogrig.campaigns.plan import Part, Plan, device_files, device_of, one_worker_only, rig_table
 from analogrig.campaigns.plays import PlayedTask, close_devices, play_part, play_task
-from analogrig.campaigns.results import Results
-from analogrig.campaigns.rows import row
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.store import Store
-from analogrig.campaigns.summary import Aggregate, Summary
-from analogrig.campaigns.tally import TASK_S, Tally, Task, Tasks
-from analogrig.campaigns.trials import COLUMNS, Trials
+from analogrig.campaigns.tally import Results, Tally
+from analogrig.campaigns.trials import COLUMNS, Change, Trial, Trials, columns_of, decode, encode, join
 from analogrig.campaigns.workers import MOST_DEATHS, Processes, ThisProcess
 from analogrig.cli import main
 from analogrig.devices.device import Device, DeviceDescription
@@ -41,7 +39,7 @@ from analogrig.devices.registry import describe, open_dut
 from analogrig.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
 from analogrig.judging.betting import BettingSequence
 from analogrig.judging.verdict import judge
-from analogrig.reporting.campaign import as_json, text
+from analogrig.reporting.campaign_page import as_json, text
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
@@ -80,19 +78,19 @@ def exported(results: Results | Path) -> bytes:
     return json.dumps(as_json(found)).encode()
 
 
-def columns_of(out: Path) -> dict[int, Trials]:
+def stored(out: Path) -> dict[int, Trials]:
     """All trials of a store, by cell."""
     with Store.read(out) as store:
         found: dict[int, list[Trials]] = {}
-        for part, trials in store.parts(store.plan()):
+        for part, trials in store.parts():
             found.setdefault(part.cell, []).append(trials)
-    return {cell: Trials.joined(parts) for cell, parts in found.items()}
+    return {cell: join(parts) for cell, parts in found.items()}
 
 
 def stored_trials(path: Path) -> int:
     """Number of trials that an unfinished store holds; 0 while its command has it."""
     with Store.read(path) as store:
-        return sum(part.trials for part, _ in store.parts(store.plan()))
+        return sum(part.trials for part, _ in store.parts())
 
 
 # ------------------------------------------------------------------------------------------------------- what is played
@@ -110,8 +108,8 @@ def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
     with open_rig(str(rig_file)) as rig, open_dut("inproc", exchange="block") as dut:
         run = Bench(rig, dut).play(scenario, 4)
     played = play_part(plan.as_json(), Part(1, 4, 2))
-    assert [each["seed"] for each in played] == [4, 5]
-    assert played[0] == row(run, judge(run), plan.draw(4))
+    assert [each.seed for each in played] == [4, 5]
+    assert played[0] == Trial.of(run, judge(run), plan.draw(4))
 
 
 def test_plan_reads_the_same_after_a_journey_as_text(tmp_path: Path) -> None:
@@ -218,7 +216,7 @@ class Backwards(ThisProcess):
 
 
 def test_order_in_which_parts_come_changes_nothing(tmp_path: Path, reference: Path) -> None:
-    conduct(planned(tmp_path), Backwards(), tmp_path / "back.sqlite")  # type: ignore[arg-type]  # narrower
+    conduct(planned(tmp_path), Backwards(), tmp_path / "back.sqlite")
     assert exported(tmp_path / "back.sqlite") == exported(reference)
 
 
@@ -228,7 +226,7 @@ def test_division_into_parts_changes_nothing(tmp_path: Path, reference: Path, co
     with Store.write(out, plan) as store:
         for cell in range(plan.size):
             for first in range(0, 6, count):
-                store.add(plan, play_task(plan.as_json(), (Part(cell, first, min(count, 6 - first)),)).parts)
+                store.add(play_task(plan.as_json(), (Part(cell, first, min(count, 6 - first)),)).parts)
     assert exported(conduct(plan, ThisProcess(), out)) == exported(reference)
 
 
@@ -237,14 +235,14 @@ def test_trials_played_together_are_those_played_alone_in_any_order(tmp_path: Pa
     text = planned(tmp_path, SPEC.partition("[draw]")[0]).as_json()
     for cell in (1, 0):
         alone = {place: play_part(text, Part(cell, place, 1)) for place in (3, 5, 0, 4, 2, 1)}
-        assert play_part(text, Part(cell, 0, 6)) == [row for place in range(6) for row in alone[place]]
+        assert play_part(text, Part(cell, 0, 6)) == [trial for place in range(6) for trial in alone[place]]
 
 
 @pytest.mark.parametrize("parts", [[], [Part(0, 0, 6)], [Part(1, 2, 3)], [Part(0, 1, 2), Part(0, 4, 2), Part(1, 0, 5)]])
 def test_campaign_goes_on_from_any_parts(tmp_path: Path, reference: Path, parts: list[Part]) -> None:
     plan, out = planned(tmp_path), tmp_path / "out.sqlite"
     with Store.write(out, plan) as store:
-        store.add(plan, play_task(plan.as_json(), tuple(parts)).parts)
+        store.add(play_task(plan.as_json(), tuple(parts)).parts)
     assert exported(conduct(plan, ThisProcess(), out)) == exported(reference)
     assert exported(out) == exported(reference)
     assert [path.name for path in tmp_path.glob("out.sqlite*")] == ["out.sqlite"]
@@ -256,7 +254,7 @@ def test_campaign_goes_on_after_a_cut_at_any_byte_of_the_log(tmp_path: Path, ref
     left: list[tuple[bytes, bytes]] = []
     with Store.write(out, plan) as store:
         for cell in range(plan.size):
-            store.add(plan, play_task(plan.as_json(), (Part(cell, 0, 3),)).parts)
+            store.add(play_task(plan.as_json(), (Part(cell, 0, 3),)).parts)
             left.append((out.read_bytes(), out.with_name("out.sqlite-wal").read_bytes()))
     whole, log = left[-1]
     for length in (0, 7, 33, len(left[0][1]), len(left[0][1]) + 500, len(log) - 1, len(log)):
@@ -269,7 +267,7 @@ def test_tasks_take_seconds_whatever_a_trial_takes(tmp_path: Path) -> None:
     spec = SPEC.replace("trials = 6", "trials = 1000000").split("[draw]")[0]
     plan = planned(tmp_path, spec)
     for trial_s in (1e-4, 3e-3, 0.4, 3.0, 60.0):
-        tasks = Tasks(plan, Tally(plan, no_part), slots=2)
+        tasks = Tasks(plan, Tally(plan), slots=2)
         given = iter(tasks)
         next(given)
         tasks.note(10, 10 * trial_s)
@@ -279,62 +277,57 @@ def test_tasks_take_seconds_whatever_a_trial_takes(tmp_path: Path) -> None:
 
 def test_tasks_cover_every_trial_once(tmp_path: Path) -> None:
     plan = planned(tmp_path, SPEC.replace("trials = 6", "trials = 1007"))
-    tasks, seen = Tasks(plan, Tally(plan, no_part), slots=3), []
+    tasks, seen = Tasks(plan, Tally(plan), slots=3), []
     for task in tasks:
         seen += [(part.cell, part.first + i) for part in task for i in range(part.trials)]
         tasks.note(1, 3e-3)
     assert sorted(seen) == [(cell, i) for cell in range(2) for i in range(1007)]
 
 
-def no_part(part: Part) -> Trials:
-    raise AssertionError(part)
+MANY = SPEC.replace("trials = 6", "trials = 120")
+"""Campaign that takes about a second."""
 
 
-def started(spec: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
-    command: list[str | Path] = [
-        sys.executable,
-        "-m",
-        "analogrig.cli",
-        "campaign",
-        spec,
-        "--out",
-        out,
-        "--workers",
-        "2",
-        *more,
-    ]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Results of MANY, played here without interruption."""
+    folder = tmp_path_factory.mktemp("many")
+    return exported(conduct(planned(folder, MANY), ThisProcess(), folder / "many.sqlite"))
 
 
-def until_stored(process: subprocess.Popen[bytes], path: Path, log_bytes: int) -> None:
-    """Until the log of the store has so many bytes; fails if the campaign ends before."""
-    deadline_s, log = time.monotonic() + LONG_S, path.with_name(f"{path.name}-wal")
-    while not log.exists() or log.stat().st_size < log_bytes:
-        assert process.poll() is None and time.monotonic() < deadline_s
-        time.sleep(0.01)
+def command_of(spec: Path, out: Path, workers: int) -> list[str]:
+    command = [sys.executable, "-m", "analogrig.cli", "campaign", str(spec), "--out", str(out)]
+    return [*command, "--workers", str(workers)]
 
 
 @pytest.mark.parametrize(("ended_by", "status"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
 def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
-    tmp_path: Path, ended_by: signal.Signals, status: int
+    tmp_path: Path, many: bytes, ended_by: signal.Signals, status: int
 ) -> None:
-    spec = SPEC.replace("trials = 6", "trials = 160")
-    plan, out = planned(tmp_path, spec), tmp_path / "out.sqlite"
-    process = started(tmp_path / "spec.toml", out)
-    until_stored(process, out, 7_000)
+    plan, out = planned(tmp_path, MANY), tmp_path / "out.sqlite"
+    process = subprocess.Popen(
+        command_of(tmp_path / "spec.toml", out, 2), stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    deadline_s, log = time.monotonic() + LONG_S, out.with_name("out.sqlite-wal")
+    while not log.exists() or log.stat().st_size < 7_000:
+        assert process.poll() is None and time.monotonic() < deadline_s
+        time.sleep(0.01)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    assert len(children) >= 2
     process.send_signal(ended_by)
     _, complaint = process.communicate(timeout=LONG_S)
     assert process.returncode == status
+    while any(Path(f"/proc/{child}/cmdline").exists() for child in children):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
     assert not out.with_suffix(".json").exists() and not out.with_suffix(".html").exists()
-    assert 0 < stored_trials(out) < 320
+    assert 0 < stored_trials(out) < 240
     with pytest.raises(RecordingError, match="a campaign that has not ended"):
         Results.load(out)
     if ended_by == signal.SIGINT:
         assert complaint.decode().startswith("analogrig: interrupted: what is done is kept in ")
         assert complaint.count(b"\n") == 1
-    conduct(plan, Processes(2), out)
-    conduct(plan, Processes(2), tmp_path / "whole.sqlite")
-    assert exported(out) == exported(tmp_path / "whole.sqlite")
+    assert exported(conduct(plan, ThisProcess(), out)) == many == exported(out)
 
 
 def _die_once(marks: str, task: int) -> int:
@@ -424,21 +417,6 @@ def test_worker_that_is_killed_while_it_has_no_task_is_replaced() -> None:
     assert len(set(workers)) == MOST_DEATHS + 1
 
 
-def test_workers_end_with_the_campaign_that_was_killed(tmp_path: Path) -> None:
-    planned(tmp_path, SPEC.replace("trials = 6", "trials = 2000"))
-    out = tmp_path / "out.sqlite"
-    process = started(tmp_path / "spec.toml", out)
-    until_stored(process, out, 8_000)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    assert len(children) >= 2
-    process.kill()
-    process.communicate(timeout=LONG_S)
-    deadline_s = time.monotonic() + LONG_S
-    while any(Path(f"/proc/{child}/cmdline").exists() for child in children):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
-
-
 @pytest.mark.heavy
 def test_campaign_on_dask_with_a_worker_killed_gives_the_file_of_one_process(tmp_path: Path, reference: Path) -> None:
     script = Path(__file__).with_name("campaign_on_dask.py")
@@ -463,9 +441,9 @@ def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None
     assert quick.missed == 0
     assert quick.miss_rate[1] < 0.5
     assert quick.trials < 20
-    again = conduct(plan, Backwards(), tmp_path / "b.sqlite")  # type: ignore[arg-type]  # narrower
+    again = conduct(plan, Backwards(), tmp_path / "b.sqlite")
     assert exported(again) == exported(results) == exported(tmp_path / "a.sqlite") == exported(tmp_path / "b.sqlite")
-    assert len(columns_of(tmp_path / "b.sqlite")[0]) == quick.trials
+    assert len(stored(tmp_path / "b.sqlite")[0]) == quick.trials
 
 
 def test_samples_of_the_warm_up_do_not_end_a_cell(tmp_path: Path) -> None:
@@ -486,8 +464,8 @@ def test_trial_in_which_the_trigger_was_never_armed_is_inconclusive(tmp_path: Pa
     still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
     plan = planned(tmp_path, f"trials = 1\n{spec.format(still=still)}\n")
     (played,) = play_part(plan.as_json(), Part(0, 0, 1))
-    assert (played["outcome"], played["armed"]) == ("inconclusive", 0)
-    assert why in played["why"]
+    assert (played.outcome, played.armed) == ("inconclusive", 0)
+    assert why in played.why
 
 
 # ------------------------------------------------------------------------------------------------------------ results
@@ -501,7 +479,7 @@ class Nobody(ThisProcess):
 
 def test_results_that_are_there_are_not_played_again(tmp_path: Path, reference: Path) -> None:
     before = reference.read_bytes()
-    again = conduct(planned(tmp_path), Nobody(), reference)  # type: ignore[arg-type]
+    again = conduct(planned(tmp_path), Nobody(), reference)
     assert exported(again) == exported(reference)
     assert reference.read_bytes() == before
 
@@ -530,10 +508,10 @@ def test_two_campaigns_do_not_share_a_store(tmp_path: Path) -> None:
 
 def test_trials_survive_their_encoding(tmp_path: Path) -> None:
     plan = planned(tmp_path)
-    trials = Trials.of(play_part(plan.as_json(), Part(0, 0, 4)), list(plan.spec.draw))
-    again = Trials.decode(4, dict(zip(COLUMNS, trials.encode(), strict=True)), 1)
+    trials = columns_of(play_part(plan.as_json(), Part(0, 0, 4)), list(plan.spec.draw))
+    again = decode(4, encode(trials), 1)
     for name in COLUMNS:
-        assert np.array_equal(getattr(again, name), getattr(trials, name), equal_nan=name == "error")
+        assert np.array_equal(again[name], trials[name], equal_nan=name == "error")
 
 
 DAMAGES: dict[str, str] = {
@@ -585,29 +563,21 @@ def test_damaged_results_are_one_line(
 
 
 def trial(
-    outcome: str = "passed", false_alarms: int = 0, changes: tuple[object, ...] = (), seed: int = 0
-) -> dict[str, object]:
-    return {
-        "seed": seed,
-        "outcome": outcome,
-        "samples": 1000,
-        "armed": 850,
-        "false_alarms": false_alarms,
-        "changes": list(changes),
-        "errors": [0.03, -0.04, 0.0],
-        "theta": "00",
-    }
+    outcome: str = "passed", false_alarms: int = 0, changes: Sequence[tuple[int | None, int | None, bool, bool]] = ()
+) -> Trial:
+    found = tuple(Change(*each) for each in changes)
+    return Trial(0, outcome, "", 1000, 850, false_alarms, found, (0.03, -0.04, 0.0))
 
 
 def test_summary_counts_what_is_valid_and_nothing_else() -> None:
     rows = [
-        trial(changes=([4, 3, False, False],)),
-        trial("failed", 2, ([None, 5, True, False], [8, 5, False, True])),
-        trial(changes=([None, None, False, False],)),
-        trial("inconclusive", 9, ([None, 1, True, False],)),
+        trial(changes=[(4, 3, False, False)]),
+        trial("failed", 2, [(None, 5, True, False), (8, 5, False, True)]),
+        trial(changes=[(None, None, False, False)]),
+        trial("inconclusive", 9, [(None, 1, True, False)]),
     ]
     aggregate = Aggregate()
-    aggregate.add(Trials.of(rows), 0)
+    aggregate.add(columns_of(rows), 0)
     found = Summary.of(aggregate, ("M", "B", "K"))
     assert (found.trials, found.passed, found.failed, found.inconclusive) == (4, 2, 1, 1)
     assert (found.samples, found.false_alarms, found.visible, found.missed, found.late) == (3000, 2, 3, 1, 1)
@@ -657,18 +627,17 @@ def test_parquet_file_has_a_row_for_each_trial_of_the_store(
     assert 1 < file.num_row_groups < 12
     rows = file.read().to_pylist()
     with Store.read(out) as store:
-        plan = store.plan()
-        parts = list(store.parts(plan))
+        plan, parts = store.plan, list(store.parts())
     assert [(row["cell"], row["seed"]) for row in rows] == [
         (part.cell, seed) for part, _ in parts for seed in plan.seeds(part)
     ]
-    trials = Trials.joined([trials for _, trials in parts])
-    assert [row["theta"] for row in rows] == trials.theta.tolist()
+    trials = join([trials for _, trials in parts])
+    assert [row["theta"] for row in rows] == trials["theta"].tolist()
     assert [row["latency_n"] for row in rows] == [
-        [None if n < 0 else n for n in latencies] for latencies in trials.latency_n.tolist()
+        [None if n < 0 else n for n in latencies] for latencies in trials["latency_n"].tolist()
     ]
-    assert [row["error_K"] for row in rows] == trials.error[:, 2].tolist()
-    assert [row["damping_n_s_per_m"] for row in rows] == trials.drawn[:, 0].tolist()
+    assert [row["error_K"] for row in rows] == trials["error"][:, 2].tolist()
+    assert [row["damping_n_s_per_m"] for row in rows] == trials["drawn"][:, 0].tolist()
     assert {row["stiffness_factor"] for row in rows} == {0.8, 0.9}
     assert {row["outcome"] for row in rows} <= {"passed", "failed"}
 
@@ -708,9 +677,9 @@ def test_device_that_does_not_answer_leaves_the_others_their_results(
     said = capsys.readouterr()
     assert "mute cannot be had, and its trials are INCONCLUSIVE: device mute: no Hello" in said.err
     assert "3 trials inconclusive, such as seed 0: device mute: no Hello" in said.out
-    mute, others = (columns_of(out)[cell] for cell in range(2))
-    assert (mute.outcome.tolist(), mute.samples.tolist()) == ([2] * 3, [0] * 3)
-    assert (others.outcome.tolist(), others.samples.tolist()) == ([0] * 3, [700] * 3)
+    mute, others = (stored(out)[cell] for cell in range(2))
+    assert (mute["outcome"].tolist(), mute["samples"].tolist()) == ([2] * 3, [0] * 3)
+    assert (others["outcome"].tolist(), others["samples"].tolist()) == ([0] * 3, [700] * 3)
 
 
 @pytest.mark.parametrize("failing", [{1, 2}, set(range(4))])
@@ -728,9 +697,9 @@ def test_trial_whose_device_fails_is_inconclusive_and_the_next_is_played(
     planned(tmp_path, "trials = 4\nsamples = 700\ndevices = ['host?exchange=block']\n")
     out = tmp_path / "out.sqlite"
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 3
-    trials = columns_of(out)[0]
-    assert set(np.flatnonzero(trials.outcome == 2).tolist()) == failing
-    assert {trials.why[seed] for seed in failing} == {"the device is gone"}
+    trials = stored(out)[0]
+    assert set(np.flatnonzero(trials["outcome"] == 2).tolist()) == failing
+    assert {trials["why"][seed] for seed in failing} == {"the device is gone"}
 
 
 def test_device_of_several_cells_is_opened_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -774,7 +743,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
     spec = f"trials = 2\nsamples = 300\ndevices = ['inproc:{library}']\n"
     plan = planned(tmp_path, spec, [str(library)])
     with Store.write(out, plan) as store:
-        store.add(plan, play_task(plan.as_json(), (Part(0, 0, 1),)).parts)
+        store.add(play_task(plan.as_json(), (Part(0, 0, 1),)).parts)
     kept = out.read_bytes()
     library.unlink()  # as a linker does: it is still loaded
     library.write_bytes(LIBRARY.read_bytes())
@@ -847,21 +816,17 @@ def test_file_of_somebody_else_in_the_place_of_results_or_page_is_left_alone(
     assert (tmp_path / standing).read_text() == "my own"
 
 
-def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path) -> None:
+def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, many: bytes) -> None:
     """A limit on the size of files stands for a disk that is full."""
-    plan = planned(tmp_path, SPEC.replace("trials = 6", "trials = 120"))
-    out = tmp_path / "out.sqlite"
+    plan, out = planned(tmp_path, MANY), tmp_path / "out.sqlite"
     limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (7_500, 7_500))"
-    limited = [sys.executable, "-c", f"{limit}; os.execv(sys.argv[1], sys.argv[1:])"]
-    command = [*limited, sys.executable, "-m", "analogrig.cli", "campaign", str(tmp_path / "spec.toml")]
-    command += ["--out", str(out), "--workers", "1"]
+    command = [sys.executable, "-c", f"{limit}; os.execv(sys.argv[1], sys.argv[1:])"]
+    command += command_of(tmp_path / "spec.toml", out, 1)
     ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert ended.returncode == 2, ended
     assert ended.stderr.startswith(f"analogrig: {out}: ")
     assert ended.stderr.count("\n") == 1
-    conduct(plan, ThisProcess(), out)
-    conduct(plan, ThisProcess(), tmp_path / "whole.sqlite")
-    assert exported(out) == exported(tmp_path / "whole.sqlite")
+    assert exported(conduct(plan, ThisProcess(), out)) == many
 
 
 def test_campaign_that_another_process_has_ended_meanwhile_is_not_played_again(
@@ -870,7 +835,7 @@ def test_campaign_that_another_process_has_ended_meanwhile_is_not_played_again(
     out = tmp_path / "out.sqlite"
     out.write_bytes(reference.read_bytes())
     monkeypatch.setattr("analogrig.campaigns.conduct.ended_results", lambda *_: None)
-    results = conduct(planned(tmp_path), Nobody(), out)  # type: ignore[arg-type]
+    results = conduct(planned(tmp_path), Nobody(), out)
     assert exported(results) == exported(reference)
 
 

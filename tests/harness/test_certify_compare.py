@@ -16,7 +16,7 @@ from scipy import stats
 
 from analogrig.bench import Bench
 from analogrig.campaigns.certificate import Question, certify
-from analogrig.campaigns.comparison import (
+from analogrig.campaigns.differences import (
     Difference,
     Observation,
     Recorded,
@@ -29,7 +29,7 @@ from analogrig.campaigns.comparison import (
 )
 from analogrig.campaigns.plan import rig_table
 from analogrig.campaigns.plays import Count
-from analogrig.campaigns.rows import Row
+from analogrig.campaigns.trials import Change, Trial
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
 from analogrig.devices.registry import describe, open_dut
@@ -318,17 +318,16 @@ def test_permutations_agree_with_scipy() -> None:
 
 
 def observed(
-    seed: int, latency_n: int | None, *, false_alarms: int = 0, cell: str = "a", theta: str = "0"
-) -> tuple[tuple[object, ...], Row]:
-    change = [latency_n, 3, latency_n is None, False]
-    counts = {"samples": 1000, "armed": 850, "false_alarms": false_alarms}
-    row = {"seed": seed, "outcome": "passed", **counts, "changes": [change]}
-    return (cell, seed), {**row, "errors": [0.01, 0.02, 0.03], "theta": theta}
+    seed: int, latency_n: int | None, *, false_alarms: int = 0, cell: str = "a", theta: int = 0
+) -> Observation:
+    change = Change(latency_n, 3, latency_n is None, late=False)
+    errors = (0.01, 0.02, 0.03)
+    return (cell, seed), Trial(seed, "passed", "", 1000, 850, false_alarms, (change,), errors, theta)
 
 
 def test_slower_build_is_worse_and_the_other_way_round_better() -> None:
     quick = [observed(seed, 4 + seed % 3) for seed in range(12)]
-    slow = [observed(seed, 6 + seed % 3, theta="1") for seed in range(12)]
+    slow = [observed(seed, 6 + seed % 3, theta=1) for seed in range(12)]
     found = compare(quick, slow)
     assert {each.quantity: each.word for each in found.differences if each.word != "no difference shown"} == {
         "latency": "worse"
@@ -348,10 +347,10 @@ def test_latency_is_compared_where_both_noticed_and_misses_by_themselves() -> No
 
 def test_change_that_one_side_missed_counts_for_the_latency_of_neither() -> None:
     """Two changes a trial, the second of which B misses: 4 against 4 samples, and not 7 against 4."""
-    a, b = ([observed(seed, 4) for seed in range(3)] for _ in "ab")
-    for (_, mine), (_, other) in zip(a, b, strict=True):
-        mine["changes"].append([10, 3, False, False])
-        other["changes"].append([None, 3, True, False])
+    a, b = (
+        [(key, trial._replace(changes=(*trial.changes, second))) for key, trial in (observed(s, 4) for s in range(3))]
+        for second in (Change(10, 3, missed=False, late=False), Change(None, 3, missed=True, late=False))
+    )
     latency = compare(a, b).differences[0]
     assert (latency.a, latency.b, latency.p) == (4.0, 4.0, 1.0)
 
@@ -372,9 +371,8 @@ def test_cells_of_one_seed_are_one_observation() -> None:
 
 
 def test_build_that_loses_its_estimates_is_worse() -> None:
-    good, bad = ([observed(seed, 5) for seed in range(20)] for _ in "ab")
-    for _, trial in bad:
-        trial["errors"] = []
+    good = [observed(seed, 5) for seed in range(20)]
+    bad = [(key, trial._replace(errors=())) for key, trial in good]
     words = {each.quantity: each.word for each in compare(good, bad, estimates="MBK").differences}
     assert {words[f"error of {name}"] for name in "MBK"} == {"worse"}
 

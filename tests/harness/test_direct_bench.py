@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Samples
 from analogrig.bench import Bench
-from analogrig.campaigns.repeated import DIRECT_BLOCK_SAMPLES
-from analogrig.campaigns.together import can_be_direct, direct_bench, judge_all, models_of
+from analogrig.campaigns.together import DIRECT_BLOCK_SAMPLES, can_be_direct, direct_bench, judge_all, models_of
 from analogrig.devices.library import (
     FIXED_LIBRARY,
     LIBRARY,

@@ -26,7 +26,7 @@ from analogrig.catalogue import Change
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError
 from analogrig.recordings.files import CapturedFrames
-from analogrig.reporting.campaign import as_json
+from analogrig.reporting.campaign_page import as_json
 from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, counter_text, number_of, one_line
 
@@ -421,7 +421,7 @@ def test_scheduler_that_dies_is_one_line_and_the_campaign_goes_on_from_there(
     assert stderr.count(b"\n") == 1
     plan = Plan.of(CampaignSpec.load(str(spec)))
     with Store.read(out) as store:
-        kept = sum(part.trials for part, _ in store.parts(plan))
+        kept = sum(part.trials for part, _ in store.parts())
     assert 0 < kept < 8000
     resumed, whole = (conduct(plan, Processes(2), path) for path in (out, tmp_path / "whole.sqlite"))
     assert as_json(resumed) == as_json(whole)

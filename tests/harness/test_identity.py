@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from analogrig import identity as identity_module
-from analogrig.campaigns.results import Results
+from analogrig.campaigns.tally import Results
 from analogrig.cli import main
 from analogrig.config import fixtures
 from analogrig.devices.library import LIBRARY

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analogrig.campaigns.rows import row
+from analogrig.campaigns.trials import Trial
 from analogrig.catalogue import Change
 from analogrig.errors import RecordingError
 from analogrig.judging.verdict import Verdict, as_json, judge
@@ -226,7 +226,7 @@ def test_change_that_was_not_found_is_neither_missed_nor_misnamed() -> None:
     unseen = Segment(300, SOFT, 200, unseen="nothing to be seen")
     run = learned(unseen, alarms=[200, 404], diagnoses=[(420, Change.MASS, 398, 1.3)])
     verdict = judge(run)
-    assert row(run, verdict)["changes"] == [[None, None, False, False]]
+    assert Trial.of(run, verdict).changes == ((None, None, False, False),)
     played = Played(run)
     assert played.verdict.outcome == "failed", "for the alarm at 200"
     assert "no change could be seen" in played.detects().why

@@ -33,8 +33,8 @@ from websockets import Origin
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from analogrig.campaigns.results import Results
 from analogrig.campaigns.store import Store
+from analogrig.campaigns.tally import Results
 from analogrig.config import read_toml
 from analogrig.judging.verdict import judge
 from analogrig.run import Run

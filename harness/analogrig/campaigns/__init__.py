@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from analogrig.campaigns.comparison import Comparison, compare
-    from analogrig.campaigns.rows import Row, changes, row
+    from analogrig.campaigns.differences import Comparison, compare
+    from analogrig.campaigns.trials import Trial
 else:
     from analogrig.lazy import loader
 
     __getattr__ = loader(
         __name__,
-        {
-            "analogrig.campaigns.comparison": "Comparison compare",
-            "analogrig.campaigns.rows": "Row changes row",
-        },
+        {"analogrig.campaigns.differences": "Comparison compare", "analogrig.campaigns.trials": "Trial"},
     )
 
-__all__ = ["Comparison", "Row", "changes", "compare", "row"]
+__all__ = ["Comparison", "Trial", "compare"]

@@ -10,7 +10,6 @@ on average, or of more where the counts of the plays show them (analogrig.judgin
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import functools
 import itertools
@@ -216,17 +215,16 @@ def certify(
         dataclasses.replace(question.scenario, samples=question.play_n),
         question.first_seed,
     )
-    evidence: _Evidence = _Bets(question) if question.is_betting else _Counts(question)
+    evidence = _Evidence(question)
     try:
         for batch in _in_order(workers, functools.partial(count_runs, case, question.batch), question):
-            fault = next((count.fault for count in batch if count.fault), "")
             for count in batch:
                 evidence.add(count)
             if progress is not None:
                 progress(evidence.samples, question.most_n, evidence.alarms)
-            if fault or (fault := evidence.fault):
+            if fault := evidence.fault:
                 return Certificate("inconclusive", fault, evidence.alarms, evidence.samples)
-            if (answer := evidence.answer(is_last=evidence.samples >= question.most_n)) is not None:
+            if (answer := evidence.answer()) is not None:
                 return answer
     finally:
         close_devices()
@@ -249,80 +247,54 @@ def _in_order(workers: Workers, work: Any, question: Question) -> Iterator[list[
             expected += question.batch
 
 
-class _Evidence(abc.ABC):
+class _Evidence:
     """Counts of the plays so far, and the answer that they give."""
 
     def __init__(self, question: Question) -> None:
         self.question = question
         self.alarms = self.samples = 0
+        self._fault = ""
+        self._bets = question.bets if question.is_betting else None
+        self._counts: list[Count] = []
+        """Counts of a test of fixed length."""
 
     def add(self, count: Count) -> None:
         self.alarms += count.alarms
         self.samples += count.armed
+        self._fault = self._fault or count.fault
+        if self._bets is None:
+            self._counts.append(count)
+        else:
+            self._bets.add(count.alarms, count.armed)
 
     @property
     def fault(self) -> str:
         """Reason that the counts are no evidence; empty if they are."""
-        return ""
-
-    @abc.abstractmethod
-    def answer(self, *, is_last: bool) -> Certificate | None:
-        """Answer of the test; None while it is open."""
-
-    def _certificate(
-        self, answer: Answer, text: str, basis: str, rate: tuple[float, float] = (0.0, 1.0)
-    ) -> Certificate:
-        counted = f"{number_of(self.alarms, 'alarm')} in {number_of(self.samples, 'sample')}"
-        return Certificate(answer, f"{counted}{text}, for {basis}", self.alarms, self.samples, rate, basis)
-
-
-class _Bets(_Evidence):
-    """Test by betting: either side decides as soon as its wealth suffices."""
-
-    def __init__(self, question: Question) -> None:
-        super().__init__(question)
-        self._bets = question.bets
-
-    def add(self, count: Count) -> None:
-        super().add(count)
-        self._bets.add(count.alarms, count.armed)
-
-    @property
-    def fault(self) -> str:
+        broken = "" if self._bets is None else self._bets.broken
         hold_off_n = self.question.datasheet.hold_off_n
-        broken = self._bets.broken
-        return f"{broken}, says the data sheet with hold_off_n = {hold_off_n}" if broken else ""
+        return self._fault or (f"{broken}, says the data sheet with hold_off_n = {hold_off_n}" if broken else "")
 
-    def answer(self, *, is_last: bool) -> Certificate | None:
-        decision = self._bets.decision(self.question.far)
-        if decision is Decision.OPEN and not is_last:
+    def answer(self) -> Certificate | None:
+        """Answer of the test; None while it is open. Either side of the bets decides as soon as its wealth suffices."""
+        question, is_last = self.question, self.samples >= self.question.most_n
+        outcome: Answer
+        if self._bets is not None:
+            decision = self._bets.decision(question.far)
+            if decision is Decision.OPEN and not is_last:
+                return None
+            outcome, rate, basis = _ANSWERS[decision], self._bets.bounds, self._bets.basis
+            of = f" of {number_of(self._bets.plays.total(), 'play')}"
+        elif is_last:
+            alarms, armed = ([getattr(count, name) for count in self._counts] for name in ("alarms", "armed"))
+            bounds = bound_rate(alarms, armed, question.confidence, question.burst or 1.0)
+            low, high = rate = bounds.low, bounds.high
+            outcome = "certified" if high <= question.far else "refuted" if low > question.far else "inconclusive"
+            basis, of = bounds.basis, ""
+        else:
             return None
-        low, high = self._bets.bounds
-        text = f" of {number_of(self._bets.plays.total(), 'play')}: the rate is "
-        text += one_sided(low, high, self.question.confidence)
-        return self._certificate(_ANSWERS[decision], text, self._bets.basis, (low, high))
-
-
-class _Counts(_Evidence):
-    """Test of fixed length, with an assumption on bursts."""
-
-    def __init__(self, question: Question) -> None:
-        super().__init__(question)
-        self._counts: list[Count] = []
-
-    def add(self, count: Count) -> None:
-        super().add(count)
-        self._counts.append(count)
-
-    def answer(self, *, is_last: bool) -> Certificate | None:
-        if not is_last:
-            return None
-        far, confidence, burst = self.question.far, self.question.confidence, self.question.burst or 1.0
-        alarms, armed = [count.alarms for count in self._counts], [count.armed for count in self._counts]
-        bounds = bound_rate(alarms, armed, confidence, burst)
-        answer: Answer = "certified" if bounds.high <= far else "refuted" if bounds.low > far else "inconclusive"
-        text = f": the rate is {one_sided(bounds.low, bounds.high, confidence)}"
-        return self._certificate(answer, text, bounds.basis, (bounds.low, bounds.high))
+        counted = f"{number_of(self.alarms, 'alarm')} in {number_of(self.samples, 'sample')}"
+        reason = f"{counted}{of}: the rate is {one_sided(*rate, question.confidence)}, for {basis}"
+        return Certificate(outcome, reason, self.alarms, self.samples, rate, basis)
 
 
 _ANSWERS: Mapping[Decision, Answer] = {

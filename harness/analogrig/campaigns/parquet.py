@@ -36,8 +36,8 @@ def write_parquet(out: Path, path: Path) -> None:
     arrow: Any = importlib.import_module("pyarrow")  # it ships no annotations
     parquet: Any = importlib.import_module("pyarrow.parquet")
     with Store.read(out) as store, replace_file(path) as file:
-        plan, writer = store.plan(), None
-        for tables in _groups(plan, store):
+        writer = None
+        for tables in _groups(store):
             table = arrow.concat_tables(tables)
             writer = writer or parquet.ParquetWriter(file, table.schema)
             writer.write_table(table)
@@ -45,11 +45,11 @@ def write_parquet(out: Path, path: Path) -> None:
             writer.close()
 
 
-def _groups(plan: Plan, store: Store) -> Iterator[list[Any]]:
+def _groups(store: Store) -> Iterator[list[Any]]:
     """Tables of consecutive parts with GROUP_ROWS rows together."""
-    cells, tables, rows = plan.cells(), [], 0
-    for part, trials in store.parts(plan):
-        tables.append(_table(plan, cells[part.cell], part, trials))
+    cells, tables, rows = store.plan.cells(), [], 0
+    for part, trials in store.parts():
+        tables.append(_table(store.plan, cells[part.cell], part, trials))
         rows += len(trials)
         if rows >= GROUP_ROWS:
             yield tables
@@ -61,7 +61,8 @@ def _groups(plan: Plan, store: Store) -> Iterator[list[Any]]:
 def _table(plan: Plan, cell: Cell, part: Part, trials: Trials) -> Any:
     """Table of a part. ``latency_n`` and its neighbours are lists with an element for each change of the trial."""
     arrow: Any = importlib.import_module("pyarrow")
-    exists = (trials.change & EXISTS) != 0
+    change, latency_n, bound_n = (trials[name] for name in ("change", "latency_n", "bound_n"))
+    exists = (change & EXISTS) != 0
     offsets = np.concatenate(([0], np.cumsum(exists.sum(axis=1)))).astype(np.int32)
 
     def same(value: str | float) -> Any:
@@ -78,18 +79,18 @@ def _table(plan: Plan, cell: Cell, part: Part, trials: Trials) -> Any:
             "rig": same(plan.rigs[cell.rig]["name"]),
             "device": same(plan.devices[cell.device]["name"]),
             **{axis: same(float(value)) for axis, value in cell.values.items()},
-            **dict(zip(plan.spec.draw, map(arrow.array, trials.drawn.T), strict=True)),
-            "outcome": arrow.array([OUTCOMES[outcome] for outcome in trials.outcome.tolist()]),
-            **{name: arrow.array(getattr(trials, name)) for name in ("samples", "armed", "false_alarms")},
-            "missed": by_change((trials.change & MISSED) != 0),
-            "late": by_change((trials.change & LATE) != 0),
-            "latency_n": by_change(trials.latency_n, trials.latency_n < 0),
-            "bound_n": by_change(trials.bound_n, trials.bound_n < 0),
+            **dict(zip(plan.spec.draw, map(arrow.array, trials["drawn"].T), strict=True)),
+            "outcome": arrow.array([OUTCOMES[outcome] for outcome in trials["outcome"].tolist()]),
+            **{name: arrow.array(trials[name]) for name in ("samples", "armed", "false_alarms")},
+            "missed": by_change((change & MISSED) != 0),
+            "late": by_change((change & LATE) != 0),
+            "latency_n": by_change(latency_n, latency_n < 0),
+            "bound_n": by_change(bound_n, bound_n < 0),
             **{
                 f"error_{name}": arrow.array(error, mask=np.isnan(error))
-                for name, error in zip(plan.estimates, trials.error.T, strict=False)
+                for name, error in zip(plan.estimates, trials["error"].T, strict=False)
             },
-            "theta": arrow.array(trials.theta),
-            "why": arrow.array(trials.why, type=arrow.string()),
+            "theta": arrow.array(trials["theta"]),
+            "why": arrow.array(trials["why"], type=arrow.string()),
         }
     )

@@ -144,13 +144,10 @@ class Plan:
         """Plan as JSON text; equal plans give equal text."""
         return json.dumps(self.as_table(), sort_keys=True, separators=(",", ":"))
 
-    def as_plain(self) -> Any:
-        """Plan as JSON has it, with lists for tuples."""
-        return json.loads(self.as_json())
-
-    def check_same(self, table: Any, where: str) -> None:
-        """:raises ConfigurationError: the plan of that table, as JSON has it, is another; names what differs."""
-        if differences := list_differences(table, self.as_plain(), ("there", "here")):
+    def check_same(self, other: Plan, where: str) -> None:
+        """:raises ConfigurationError: the other plan differs; names what differs."""
+        there, here = (json.loads(plan.as_json()) for plan in (other, self))
+        if differences := list_differences(there, here, ("there", "here")):
             raise ConfigurationError(f"{where} ({differences}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
@@ -263,31 +260,25 @@ class Plan:
         if NOISE in axes and any("card" not in table for table in self.rigs):
             raise ConfigurationError(f"{where}: noise_lsb is for emulated rigs")
         for cell in self.cells():
-            for drawn, opposite in (*itertools.permutations(corners(spec.draw), 2), (self.draw(spec.first_seed), {})):
-                problem = self._problem(cell, drawn)
-                if problem:
-                    raise ConfigurationError(f"{where}: {self._blame(cell, drawn, opposite)}{problem}")
-            self._check_parts(cell)
+            self._check_cell(cell, where)
 
-    def _check_parts(self, cell: Cell) -> None:
-        """Set up every trial of a cell in which a pot comes near a stop, where only some draws of parts reach.
+    def _check_cell(self, cell: Cell, where: str) -> None:
+        """:raises ConfigurationError: a trial of the cell cannot be set up."""
+        first, ends = self.draw(self.spec.first_seed), corners(self.spec.draw)
+        for drawn, opposite in (*itertools.permutations(ends, 2), (first, {})):
+            if problem := self._problem(cell, drawn):
+                raise ConfigurationError(f"{where}: {self._blame(cell, drawn, opposite)}{problem}")
+        if any(self._nears_stop(cell, drawn) for drawn in (*ends, first)):
+            for seed in range(self.spec.first_seed, self.spec.first_seed + self.spec.trials):
+                if problem := self._problem(cell, self.draw(seed), seed):
+                    raise ConfigurationError(f"{where}: trial of seed {seed}: {problem}")
 
-        :raises ConfigurationError: a trial cannot be set up.
-        """
-        spec = self.spec
-        if not any(self._nears_a_stop(cell, corner) for corner in (*corners(spec.draw), self.draw(spec.first_seed))):
-            return
-        for seed in range(spec.first_seed, spec.first_seed + spec.trials):
-            problem = self._problem(cell, self.draw(seed), seed)
-            if problem:
-                raise ConfigurationError(f"campaign {spec.name}: trial of seed {seed}: {problem}")
-
-    def _machine(self, cell: Cell, drawn: Mapping[str, float], seed: int) -> SetUp | None:
-        """Machine of a trial on an emulated rig; None on another rig.
+    def _set_up(self, cell: Cell, drawn: Mapping[str, float], seed: int | None = None) -> SetUp | None:
+        """Machine of a trial on an emulated rig, by default of the first seed; None on another rig.
 
         :raises ConfigurationError: it cannot be set up.
         """
-        case = self.case(cell, seed, drawn)
+        case = self.case(cell, self.spec.first_seed if seed is None else seed, drawn)
         if "card" in case.rig and is_emulated(rig := open_table(case.rig)):
             return rig.set_up(case.scenario, case.seed)
         return None
@@ -295,15 +286,14 @@ class Plan:
     def _problem(self, cell: Cell, drawn: Mapping[str, float], seed: int | None = None) -> str:
         """Reason why such a trial cannot be set up on an emulated rig; empty if it can."""
         try:
-            self._machine(cell, drawn, self.spec.first_seed if seed is None else seed)
+            self._set_up(cell, drawn, seed)
         except ConfigurationError as error:
             return str(error)
         return ""
 
-    def _nears_a_stop(self, cell: Cell, drawn: Mapping[str, float]) -> bool:
-        """True if a pot of a trial comes near an end of its track."""
-        machine = self._machine(cell, drawn, self.spec.first_seed)
-        if machine is None:
+    def _nears_stop(self, cell: Cell, drawn: Mapping[str, float]) -> bool:
+        """True if a pot of a trial comes near an end of its track, where only some draws of parts reach."""
+        if (machine := self._set_up(cell, drawn)) is None:
             return False
         turns = [machine.computer.dials_for(**turn.values) for turn in machine.changes]
         dials = [dial for each in (machine.computer.dials, *turns) for dial in each.values()]
@@ -352,14 +342,12 @@ def device_of(table: Mapping[str, Any]) -> DeviceDescription:
     device = from_table(described, f"device {table['name']}")
     if "build" in table:
         if (file := builds.supplied(device, table["build"])) is not None:
-            placed = {key: str(file) if _is_path(value, device.program) else value for key, value in described.items()}
-            device = from_table(placed, f"device {table['name']}")
+            for key, value in described.items():
+                if isinstance(value, str) and value and Path(value).absolute() == device.program:
+                    described[key] = str(file)
+            device = from_table(described, f"device {table['name']}")
         builds.check_device(device, table["build"])
     return device
-
-
-def _is_path(value: Any, path: Path | None) -> bool:
-    return isinstance(value, str) and path is not None and bool(value) and Path(value).absolute() == path
 
 
 def device_files(devices: Iterable[Mapping[str, Any]]) -> dict[str, bytes]:

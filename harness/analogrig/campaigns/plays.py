@@ -17,9 +17,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.campaigns import builds
 from analogrig.campaigns.plan import Case, Cell, Part, Plan, device_of, open_table
-from analogrig.campaigns.rows import Row, row, row_of_none
 from analogrig.campaigns.together import DirectBench, can_be_direct, direct_bench, judge_all
-from analogrig.campaigns.trials import Trials
+from analogrig.campaigns.trials import Trial, columns_of, encode
 from analogrig.devices.device import Device
 from analogrig.errors import AnalogrigError, ConfigurationError, DeviceError, LinkError, RigError
 from analogrig.judging.exposure import exposure, exposures, until_latched
@@ -133,7 +132,7 @@ class PlayedTask(NamedTuple):
     """Result of a task, as a worker returns it."""
 
     parts: list[tuple[Part, tuple[bytes, ...]]]
-    """Parts, each with the columns of its trials (``Trials.encode``)."""
+    """Parts, each with the columns of its trials (``trials.encode``)."""
     seconds: float
     """Time that they took."""
 
@@ -146,49 +145,48 @@ def play_task(plan: str, task: Sequence[Part]) -> PlayedTask:
     start_s = time.monotonic()
     planned, _ = _plan(plan)
     axes = list(planned.spec.draw)
-    parts = [(part, Trials.of(play_part(plan, part), axes).encode()) for part in task]
+    parts = [(part, encode(columns_of(play_part(plan, part), axes))) for part in task]
     return PlayedTask(parts, time.monotonic() - start_s)
 
 
-def play_part(plan: str, part: Part) -> list[Row]:
-    """Rows of a part; errors as ``play_task``."""
-    planned, cells = _plan(plan)
-    seeds = planned.seeds(part)
-    trials = max(1, BATCH_SAMPLES // planned.samples)
-    batches = (seeds[first : first + trials] for first in range(0, len(seeds), trials))
-    return [row for batch in batches for row in _play_batch(planned, part.cell, cells[part.cell], batch)]
+def play_part(plan: str, part: Part) -> list[Trial]:
+    """Trials of a part; errors as ``play_task``."""
+    planned, _ = _plan(plan)
+    seeds, step = planned.seeds(part), max(1, BATCH_SAMPLES // planned.samples)
+    batches = (seeds[first : first + step] for first in range(0, len(seeds), step))
+    return [trial for batch in batches for trial in _play_batch(plan, part.cell, batch)]
 
 
-def _play_batch(plan: Plan, number: int, cell: Cell, seeds: Sequence[int]) -> Iterator[Row]:
-    """Rows of some trials, played together where they can be. One that cannot be played is inconclusive."""
-    drawn = [plan.draw(seed) for seed in seeds]
-    played: Sequence[Run | str] = [] if any(drawn) else _benches.play_together(plan.case(cell, seeds[0], {}), seeds)
-    played = played or [_play_trial(plan, number, cell, *each) for each in zip(seeds, drawn, strict=True)]
+def _play_batch(plan: str, cell: int, seeds: Sequence[int]) -> Iterator[Trial]:
+    """Some trials, played together where they can be. One that cannot be played is inconclusive."""
+    drawn = [_plan(plan)[0].draw(seed) for seed in seeds]
+    played: Sequence[Run | str] = [] if any(drawn) else _benches.play_together(_fixed_case(plan, cell), seeds)
+    played = played or [_play_trial(plan, cell, *each) for each in zip(seeds, drawn, strict=True)]
     verdicts = iter(judge_all(each for each in played if isinstance(each, Run)))
     for each, seed, values in zip(played, seeds, drawn, strict=True):
-        yield row(each, next(verdicts), values) if isinstance(each, Run) else row_of_none(seed, values, each)
+        if isinstance(each, Run):
+            yield Trial.of(each, next(verdicts), values)
+        else:
+            yield Trial(seed, "inconclusive", each, drawn=values)
 
 
-def _play_trial(plan: Plan, number: int, cell: Cell, seed: int, drawn: Mapping[str, float]) -> Run | str:
+def _play_trial(plan: str, cell: int, seed: int, drawn: Mapping[str, float]) -> Run | str:
     """Run of a trial; the reason if it cannot be played. The next one may succeed."""
+    planned, cells = _plan(plan)
     try:
-        return _benches.play(plan.case(cell, seed, drawn) if drawn else _fixed_case(plan, cell, seed))
+        case = planned.case(cells[cell], seed, drawn) if drawn else _fixed_case(plan, cell)
+        return _benches.play(dataclasses.replace(case, seed=seed))
     except (DeviceError, LinkError, RigError) as error:
         return " ".join(str(error).split())
     except ConfigurationError as error:
-        raise ConfigurationError(f"campaign {plan.spec.name}, cell {number}, seed {seed}: {error}") from error
+        raise ConfigurationError(f"campaign {planned.spec.name}, cell {cell}, seed {seed}: {error}") from error
 
 
-_cases: dict[int, tuple[Cell, Case]] = {}
-"""Case of the cell that is being played, by thread: its trials differ in the seed alone."""
-
-
-def _fixed_case(plan: Plan, cell: Cell, seed: int) -> Case:
-    """Case of a cell without drawn values."""
-    thread = threading.get_ident()
-    if thread not in _cases or _cases[thread][0] is not cell:
-        _cases[thread] = cell, plan.case(cell, seed, {})
-    return dataclasses.replace(_cases[thread][1], seed=seed)
+@functools.lru_cache(maxsize=MOST_KEPT)
+def _fixed_case(plan: str, cell: int) -> Case:
+    """Case of a cell without drawn values; its trials differ in the seed alone."""
+    planned, cells = _plan(plan)
+    return planned.case(cells[cell], planned.spec.first_seed, {})
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ before anything in it is used: its schema must be the one below, and it has no v
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
-import os
 import sqlite3
 import urllib.parse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,9 +18,10 @@ from typing import Any, Self
 
 from analogrig import config
 from analogrig.campaigns.plan import Part, Plan
-from analogrig.campaigns.trials import COLUMNS, MOST_TRIALS, Trials
+from analogrig.campaigns.trials import COLUMNS, MOST_TRIALS, Trials, decode, encode
 from analogrig.errors import AnalogrigError, ConfigurationError, RecordingError
 from analogrig.identity import Identity
+from analogrig.storage import replace_file
 
 APPLICATION, VERSION = 0x616E7267, 3
 """``application_id`` and ``user_version`` of the file."""
@@ -60,18 +61,17 @@ class Store:
         """
         self.path = path
         _check_header(path)
-        with self._wrapped():
+        with self._guarded():
             mode = "ro" if is_read_only else "rw"
             name = f"file:{urllib.parse.quote(str(path.absolute()))}?mode={mode}"
             self._file = sqlite3.connect(name, uri=True, isolation_level=None, timeout=0.0)
         try:
-            with self._wrapped():
+            with self._guarded():
                 self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_VALUE_BYTES)
                 self._file.execute("PRAGMA trusted_schema = OFF")
                 self._file.execute("PRAGMA cell_size_check = ON")
                 self._file.execute(f"PRAGMA locking_mode = {'NORMAL' if is_read_only else 'EXCLUSIVE'}")
-                self._check_schema()
-                self.plan_text = self._read_plan()
+                self._plan_text = self._read_plan()
         except BaseException:
             self._file.close()
             raise
@@ -95,10 +95,10 @@ class Store:
         except NotAStoreError as error:
             raise ConfigurationError(f"{error}: choose another --out, or remove it") from error
         try:
-            if store.plan_text != plan.as_json():
-                plan.check_same(store.plan().as_plain(), f"{path}: holds another campaign")
+            if store._plan_text != plan.as_json():
+                plan.check_same(store.plan, f"{path}: holds another campaign")
             if not store.is_ended:
-                with store._wrapped():
+                with store._guarded():
                     store._file.execute("PRAGMA journal_mode = WAL")
                     store._file.execute("PRAGMA synchronous = FULL")
                     store._file.execute("BEGIN IMMEDIATE")  # takes the lock, which stays
@@ -121,105 +121,100 @@ class Store:
     @property
     def is_ended(self) -> bool:
         """True if the campaign has ended."""
-        with self._wrapped():
+        with self._guarded():
             return self._file.execute("SELECT 1 FROM cells LIMIT 1").fetchone() is not None
 
+    @functools.cached_property
     def plan(self) -> Plan:
         """:raises RecordingError: what is there is no plan."""
-        with self._checked():
-            return Plan.from_json(self.plan_text)
+        with self._guarded():
+            return Plan.from_json(self._plan_text)
 
     def damage(self, what: str) -> RecordingError:
         """Error of a file that no campaign leaves."""
         cure = "take another copy of the file, or remove it and play the campaign again"
         return RecordingError(f"{self.path}: damaged results of a campaign ({what}): {cure}")
 
-    def check_whole(self, plan: Plan) -> None:
+    def check_whole(self) -> None:
         """Check that the campaign has ended, with as many trials of each cell as its summary says.
 
         :raises RecordingError: it has not, or trials were removed or added.
         """
         if not self.is_ended:
             raise RecordingError(f"{self.path}: a campaign that has not ended: the command that began it goes on")
-        found, trials = [0] * plan.size, plan.spec.trials
-        with self._wrapped(), self._checked():
-            for first, count in self._file.execute("SELECT first, count FROM trials"):
-                found[first // trials] += count
-            rows = self._file.execute("SELECT cell, summary FROM cells ORDER BY cell LIMIT ?", (plan.size + 1,))
-            expected = {cell: json.loads(text)["trials"] for cell, text in rows}
-            if list(expected) != list(range(plan.size)):
+        size, trials = self.plan.size, self.plan.spec.trials
+        with self._guarded():
+            query = "SELECT first / ?, sum(count) FROM trials GROUP BY 1 LIMIT ?"
+            found = dict(self._file.execute(query, (trials, size + 1)).fetchall())
+            query = "SELECT cell, summary FROM cells ORDER BY cell LIMIT ?"
+            expected = {cell: json.loads(text)["trials"] for cell, text in self._file.execute(query, (size + 1,))}
+            if list(expected) != list(range(size)):
                 raise ValueError("not one summary for each cell")
-            for cell, count in expected.items():
-                if found[cell] != count:
-                    raise ValueError(f"{found[cell]} trials of cell {cell}, {count} in its summary")
+            for cell in sorted({*found, *expected}):
+                if found.get(cell) != expected.get(cell):
+                    raise ValueError(
+                        f"{found.get(cell, 0)} trials of cell {cell}, {expected.get(cell, 0)} in its summary"
+                    )
 
     def commands(self) -> tuple[Identity, ...]:
         """Commands that have played a part, in order."""
         query = "SELECT identity FROM commands ORDER BY number LIMIT ?"
-        with self._wrapped(), self._checked():
+        with self._guarded():
             return tuple(
                 config.build(Identity, json.loads(text), str(self.path))
                 for (text,) in self._file.execute(query, (_MOST_COMMANDS,))
             )
 
     def add_command(self, identity: Identity) -> None:
-        with self._wrapped():
+        with self._guarded():
             self._file.execute("INSERT INTO commands (identity) VALUES (?)", (json.dumps(identity.as_table()),))
 
-    def add(self, plan: Plan, played: Iterable[tuple[Part, Sequence[bytes]]]) -> None:
+    def add(self, played: Iterable[tuple[Part, Sequence[bytes]]]) -> None:
         """Append the encoded trials of a task in one transaction; they are on the disk when this returns.
 
         :raises RecordingError: they cannot be written.
         """
         with self._transaction():
             for part, columns in played:
-                self._insert(plan, part, columns)
+                self._insert(part, columns)
 
-    def finish(self, plan: Plan, counted: Sequence[int], summaries: Sequence[Mapping[str, Any]]) -> None:
+    def finish(self, counted: Sequence[int], summaries: Iterable[Mapping[str, Any]]) -> None:
         """Remove the trials beyond the end of each cell, add the summaries, and leave a file that stands alone.
 
         :param counted: number of trials that count, by cell.
         """
         with self._transaction():
             for cell, (count, summary) in enumerate(zip(counted, summaries, strict=True)):
-                if count < plan.spec.trials:
-                    self._cut(plan, cell, count)
+                begin, end = ((cell + each) * self.plan.spec.trials for each in range(2))
+                if begin + count < end:
+                    ((part, trials),) = self.parts(range(begin + count - 1, begin + count))
+                    query = "DELETE FROM trials WHERE first >= ? AND first < ?"
+                    self._file.execute(query, (begin + part.first, end))
+                    kept = count - part.first
+                    self._insert(part._replace(trials=kept), encode(trials[:kept]))
                 self._file.execute("INSERT INTO cells VALUES (?, ?)", (cell, json.dumps(summary, sort_keys=True)))
-        with self._wrapped():
+        with self._guarded():
             self._file.execute("PRAGMA journal_mode = DELETE")
         with contextlib.suppress(OSError):  # a reader may have left it; without a log it means nothing
             self.path.with_name(f"{self.path.name}-shm").unlink()
 
-    def _cut(self, plan: Plan, cell: int, count: int) -> None:
-        """Remove the trials of a cell beyond the first ``count``."""
-        begin = cell * plan.spec.trials
-        (last,) = list(self.parts(plan, range(begin + count - 1, begin + count)))
-        part, trials = last
-        end = begin + plan.spec.trials
-        self._file.execute("DELETE FROM trials WHERE first >= ? AND first < ?", (begin + part.first, end))
-        kept = count - part.first
-        self._insert(plan, part._replace(trials=kept), trials[:kept].encode())
-
-    def _insert(self, plan: Plan, part: Part, columns: Sequence[bytes]) -> None:
+    def _insert(self, part: Part, columns: Sequence[bytes]) -> None:
         marks = ", ".join("?" * (2 + len(COLUMNS)))
-        values = (part.cell * plan.spec.trials + part.first, part.trials, *columns)
+        values = (part.cell * self.plan.spec.trials + part.first, part.trials, *columns)
         self._file.execute(f"INSERT INTO trials VALUES ({marks})", values)  # noqa: S608 - question marks
 
-    def parts(
-        self, plan: Plan, numbers: range | None = None, columns: Sequence[str] = COLUMNS
-    ) -> Iterator[tuple[Part, Trials]]:
+    def parts(self, numbers: range | None = None) -> Iterator[tuple[Part, Trials]]:
         """Yield the parts with any of these trials in the order of cells and seeds, each with its trials.
 
         :param numbers: numbers of trials, as ``first`` in the table; None: all.
-        :param columns: columns to read; the others are 0.
         :raises RecordingError: what is there is no part of this campaign.
         """
-        trials, size = plan.spec.trials, plan.size * plan.spec.trials
-        wanted = numbers if numbers is not None else range(size)
-        query = f"SELECT first, count, {', '.join(columns)} FROM trials WHERE first > ? AND first < ? ORDER BY first"  # noqa: S608 - names of COLUMNS
+        trials, size = self.plan.spec.trials, self.plan.size * self.plan.spec.trials
+        wanted = range(size) if numbers is None else numbers
+        query = "SELECT * FROM trials WHERE first > ? AND first < ? ORDER BY first"
         end = -1
-        with self._wrapped(), self._checked():
-            for first, count, *values in self._file.execute(query, (wanted.start - MOST_TRIALS, wanted.stop)):
+        with self._guarded():
+            for first, count, *columns in self._file.execute(query, (wanted.start - MOST_TRIALS, wanted.stop)):
                 if not (isinstance(first, int) and isinstance(count, int) and 1 <= count <= MOST_TRIALS):
                     raise ValueError("a part of no size")
                 cell, place = divmod(first, trials)
@@ -227,26 +222,22 @@ class Store:
                     raise ValueError("parts that overlap")
                 end = first + count
                 if end > wanted.start:
-                    if not all(isinstance(value, bytes) for value in values):
+                    if not all(isinstance(column, bytes) for column in columns):
                         raise ValueError("a column that is no blob")
-                    found = dict(zip(columns, values, strict=True))
-                    axes = len(plan.spec.draw)
-                    yield Part(cell, place, count), Trials.decode(count, found, axes)
-
-    def _check_schema(self) -> None:
-        found = dict(self._file.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall())
-        if found != _SCHEMA:
-            raise self.damage("other tables")
+                    yield Part(cell, place, count), decode(count, columns, len(self.plan.spec.draw))
 
     def _read_plan(self) -> str:
-        rows = self._file.execute("SELECT plan FROM campaign LIMIT 2").fetchall()
-        if len(rows) != 1 or not isinstance(rows[0][0], str) or len(rows[0][0]) > _MOST_PLAN_CHARACTERS:
+        """Text of the plan, after a check of the tables."""
+        if dict(self._file.execute("SELECT name, sql FROM sqlite_schema LIMIT 9").fetchall()) != _SCHEMA:
+            raise self.damage("other tables")
+        plans = self._file.execute("SELECT plan FROM campaign LIMIT 2").fetchall()
+        if len(plans) != 1 or not isinstance(plans[0][0], str) or len(plans[0][0]) > _MOST_PLAN_CHARACTERS:
             raise self.damage("no plan")
-        return str(rows[0][0])
+        return str(plans[0][0])
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        with self._wrapped():
+        with self._guarded():
             self._file.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -257,25 +248,19 @@ class Store:
                 raise
 
     @contextlib.contextmanager
-    def _wrapped(self) -> Iterator[None]:
-        """:raises RecordingError: SQLite failed.
+    def _guarded(self) -> Iterator[None]:
+        """:raises RecordingError: SQLite failed, or a value is none that a campaign writes.
         :raises ConfigurationError: another process has the file."""
         try:
             yield
+        except RecordingError:
+            raise
         except sqlite3.Error as error:
             if _BUSY in str(error):
                 raise ConfigurationError(f"{self.path}: another campaign is writing to it") from error
             if isinstance(error, sqlite3.OperationalError):  # of the disk, not of what is in the file
                 raise RecordingError(f"{self.path}: {error}") from error
             raise self.damage("no sound SQLite file") from error
-
-    @contextlib.contextmanager
-    def _checked(self) -> Iterator[None]:
-        """:raises RecordingError: values that no campaign writes."""
-        try:
-            yield
-        except RecordingError:
-            raise
         except (AnalogrigError, LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as e:
             raise self.damage(str(e)) from e
 
@@ -297,20 +282,21 @@ def _check_header(path: Path) -> None:
             head = file.read(100)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror or error}") from error
-    found = [int.from_bytes(head[at : at + 4], "big") for at in (68, 60)]
-    if not head.startswith(_MAGIC) or found[0] != APPLICATION:
+    application, version = (int.from_bytes(head[at : at + 4], "big") for at in (68, 60))
+    if not head.startswith(_MAGIC) or application != APPLICATION:
         cure = ": name the .sqlite file beside it" if path.suffix == ".json" else ""
         raise NotAStoreError(f"{path}: not the results of a campaign{cure}")
-    if found[1] != VERSION:
+    if version != VERSION:
         raise NotAStoreError(f"{path}: results of another version of analogrig")
 
 
 def _create(path: Path, plan: Plan) -> None:
     """Create an empty store; it is at ``path`` as a whole or not at all."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.closing(sqlite3.connect(partial, isolation_level=None)) as file:
+        with (
+            replace_file(path) as partial,
+            contextlib.closing(sqlite3.connect(partial.name, isolation_level=None)) as file,
+        ):
             file.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
             file.execute("BEGIN")
             file.execute(f"PRAGMA application_id = {APPLICATION}")
@@ -319,11 +305,5 @@ def _create(path: Path, plan: Plan) -> None:
                 file.execute(statement)
             file.execute("INSERT INTO campaign VALUES (?)", (plan.as_json(),))
             file.execute("COMMIT")
-        partial.replace(path)
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror or error}") from error
     except sqlite3.Error as error:
         raise RecordingError(f"{path}: {error}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()

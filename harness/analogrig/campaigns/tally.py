@@ -1,52 +1,51 @@
-"""Tally of a campaign: the parts received so far, in any order, and the trials that count."""
+"""Tally of a campaign: the parts received so far, in any order, the trials that count, and the results of them."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
+import functools
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
 
-from analogrig.campaigns.plan import Part, Plan
-from analogrig.campaigns.summary import COUNTED, Aggregate, Distribution
-from analogrig.campaigns.trials import MOST_TRIALS, Trials
+from analogrig.campaigns.aggregates import Aggregate, Distribution, Histogram, Summary
+from analogrig.campaigns.plan import Cell, Part, Plan
+from analogrig.campaigns.store import Store
+from analogrig.campaigns.trials import Trials
+from analogrig.identity import Identity
 from analogrig.judging.statistics import Decision
-
-Task = tuple[Part, ...]
-
-FIRST_N = 10
-"""Number of trials of the first tasks, before the duration of a trial is known."""
-
-TASK_S, SHORTEST_S = 5.0, 0.2
-"""Duration of a task in seconds, and of the last ones, which are made shorter so that all workers end together."""
 
 
 class Tally:
     """Aggregates of the trials that count: in each cell, those without a gap up to the cell's end."""
 
-    def __init__(self, plan: Plan, read: Callable[[Part], Trials]) -> None:
-        """Start with no trials.
+    def __init__(self, plan: Plan, store: Store | None = None) -> None:
+        """Count all trials that a store holds; without a store there are none.
 
-        :param read: returns the trials of a part that came before those in front of it.
+        :raises RecordingError: the store is damaged.
         """
         self.cells = [Aggregate(most) for most in plan.most_alarms]
         self.distribution = Distribution(plan.spec.draw)
         self.trials = 0
-        self._plan, self._read = plan, read
+        self._plan, self._store = plan, store
         self._decided = [False] * plan.size
         self._early: list[dict[int, int]] = [{} for _ in range(plan.size)]
         """Numbers of trials by place of the first one, for parts behind a gap."""
+        for part, trials in () if store is None else store.parts():
+            self.add(part, trials)
 
     def add(self, part: Part, trials: Trials) -> None:
-        """Add a part, and count all that is now without a gap."""
+        """Add a part that the store has, and count all that is now without a gap."""
         early, cell = self._early[part.cell], self.cells[part.cell]
-        if self._decided[part.cell]:
-            return
         if part.first != cell.trials:
             early[part.first] = part.trials
             return
         self._count(part, trials)
-        while not self._decided[part.cell] and (count := early.pop(cell.trials, None)) is not None:
-            following = Part(part.cell, cell.trials, count)
-            self._count(following, self._read(following))
+        while self._store is not None and early.pop(cell.trials, None) is not None:
+            number = part.cell * self._plan.spec.trials + cell.trials
+            ((following, trials),) = self._store.parts(range(number, number + 1))
+            self._count(following, trials)
 
     def _count(self, part: Part, trials: Trials) -> None:
         cell, stop, chunk = self.cells[part.cell], self._plan.spec.stop, self._plan.spec.chunk
@@ -66,71 +65,64 @@ class Tally:
         """True if all trials of a cell are there that count."""
         return self._decided[cell] or self.cells[cell].trials == self._plan.spec.trials
 
-    def total(self) -> dict[str, int]:
-        """Total counts over all cells."""
-        return {name: sum(each.counted[name] for each in self.cells) for name in COUNTED}
+    def total(self) -> Counter[str]:
+        """Total counts over all cells (``Aggregate.counts``)."""
+        return sum((each.counts for each in self.cells), Counter())
 
     def gaps(self, cell: int) -> deque[tuple[int, int]]:
         """First and end of the ranges of trials of a cell that are still to be played."""
         found: deque[tuple[int, int]] = deque()
         at = self.cells[cell].trials
-        for first, count in sorted(self._early[cell].items()):
+        for first, count in sorted([*self._early[cell].items(), (self._plan.spec.trials, 0)]):
             if first > at:
                 found.append((at, first))
             at = first + count
-        if at < self._plan.spec.trials:
-            found.append((at, self._plan.spec.trials))
         return found
 
 
-class Tasks:
-    """Tasks of about TASK_S each, whatever a trial takes.
+@dataclass(frozen=True)
+class Results:
+    """Summary of each cell in the order of ``Plan.cells``, and the distributions over all, without dates."""
 
-    Cells that ``[stop]`` may end progress together; others are played one after the other.
-    """
+    plan: Plan
+    aggregates: Sequence[Aggregate]
+    distribution: Distribution
+    played_by: tuple[Identity, ...] = ()
+    """Commands that have played a part; nothing else depends on them."""
 
-    def __init__(self, plan: Plan, tally: Tally, slots: int) -> None:
-        self._tally, self._slots, self._stops = tally, slots, plan.spec.stop is not None
-        self._chunk = plan.spec.chunk if self._stops else MOST_TRIALS
-        """Least number of trials of a cell in a task: large parts are stored better, small ones end a cell earlier."""
-        self._cells = deque(
-            (cell, gaps) for cell in range(plan.size) if not tally.has_ended(cell) and (gaps := tally.gaps(cell))
-        )
-        self._open = sum(end - first for _, gaps in self._cells for first, end in gaps)
-        self._trial_s: float | None = None
+    @classmethod
+    def load(cls, store: Store | Path) -> Self:
+        """Results of a store whose campaign has ended, folded part by part.
 
-    def note(self, trials: int, seconds: float) -> None:
-        """Take note of the duration of a task."""
-        self._trial_s = max(seconds / trials, 1e-6)
+        :raises RecordingError: absent, not the results of a campaign, not ended, or damaged.
+        """
+        if isinstance(store, Path):
+            with Store.read(store) as opened:
+                return cls.load(opened)
+        store.check_whole()
+        tally = Tally(store.plan, store)
+        if not all(map(tally.has_ended, range(store.plan.size))):
+            raise store.damage("trials are missing")
+        return cls(store.plan, tally.cells, tally.distribution, store.commands())
 
-    def __iter__(self) -> Iterator[Task]:
-        """Yield tasks; the trials still to be played are evaluated at each step."""
-        while task := self._next():
-            yield task
+    @functools.cached_property
+    def cells(self) -> list[tuple[Cell, Summary]]:
+        """Cells, each with the summary of its trials."""
+        return [
+            (cell, Summary.of(each, self.plan.estimates))
+            for cell, each in zip(self.plan.cells(), self.aggregates, strict=True)
+        ]
 
-    def _next(self) -> Task:
-        wanted, parts, count = self._wanted(), [], 0
-        while self._cells and count < wanted:
-            cell, gaps = self._cells.popleft()
-            if self._tally.has_ended(cell):
-                continue
-            first, end = gaps.popleft()
-            share = max(self._chunk, wanted // (len(self._cells) + 1))
-            part = Part(cell, first, min(end - first, share, wanted - count, MOST_TRIALS))
-            parts.append(part)
-            count += part.trials
-            if first + part.trials < end:
-                gaps.appendleft((first + part.trials, end))
-            if gaps and self._stops:
-                self._cells.append((cell, gaps))
-            elif gaps:
-                self._cells.appendleft((cell, gaps))
-        self._open -= count
-        return tuple(parts)
+    @functools.cached_property
+    def total(self) -> Summary:
+        return Summary.of(Aggregate.merged(self.aggregates), self.plan.estimates)
 
-    def _wanted(self) -> int:
-        """Number of trials of the next task."""
-        if self._trial_s is None:
-            return FIRST_N
-        share = max(self._open / (2 * self._slots), SHORTEST_S / self._trial_s)
-        return max(1, int(min(TASK_S / self._trial_s, share, MOST_TRIALS)))
+    @functools.cached_property
+    def latencies(self) -> Histogram:
+        """Detection delays of all cells."""
+        return Aggregate.merged(self.aggregates).latency_n
+
+    @property
+    def outcome(self) -> str:
+        """``failed`` if a trial failed; ``inconclusive`` if one was not valid; else ``passed``."""
+        return "failed" if self.total.failed else "inconclusive" if self.total.inconclusive else "passed"

@@ -1,6 +1,7 @@
 """Plays of one scenario with many seeds, within this process: computed and judged together, in half of the time.
 
-The runs and verdicts are those of ``Bench.play`` and ``judge``, to the bit, without what needs messages.
+The runs and verdicts are those of ``Bench.play`` and ``judge``, to the bit, without what needs messages. Computed
+together are plays whose seeds draw offsets and phase alone.
 """
 
 from __future__ import annotations
@@ -8,26 +9,54 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
+import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.answers import EVENTS, AlarmLevel, Answers
 from analogrig.bench import Bench, RunBuilder, overloads_until, reports
-from analogrig.campaigns.repeated import DIRECT_BLOCK_SAMPLES, RepeatedRig
 from analogrig.devices.device import DeviceDescription
+from analogrig.errors import RigError
 from analogrig.judging import information
 from analogrig.judging.courses import Model, Trajectory, Values
 from analogrig.judging.exposure import exposures
 from analogrig.judging.machine_model import PREFIX, Machine, RecordedRig, is_played
 from analogrig.judging.verdict import Verdict, is_exact, judge_with, segment_estimates
-from analogrig.rigs.emulator import EmulatorRig, emulator_errors, is_emulated
-from analogrig.rigs.rig import Block, Performance, Rig
-from analogrig.run import Conditions, Run
+from analogrig.plant import Segment
+from analogrig.rigs.emulator import (
+    EmulatorRig,
+    Stream,
+    channels_of,
+    drawn_machine,
+    emulator_errors,
+    is_emulated,
+    lit_lamps,
+    nominal_machine,
+)
+from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
+from analogrig.run import OUTPUT, Channel, Conditions, Run
 from analogrig.scenario import Scenario
-from analogrig_emulator import Moment, RepeatedCourses
+from analogrig_emulator import (
+    Card,
+    Moment,
+    RepeatedCourses,
+    RepeatedPlay,
+    SuspensionComputer,
+    Wired,
+    ahead_ticks,
+    drawn_offsets_v,
+    is_repeatable,
+    normals,
+    probes_per_sample,
+    sample_plays,
+    uniforms,
+)
+
+DIRECT_BLOCK_SAMPLES = 131_072
+"""Longest play that is computed together. The circuit of a longer one is prepared anew for each seed."""
 
 _RETAINED_BYTES = 30_000_000
 """Size of the largest array whose memory the allocator keeps for the next play."""
@@ -37,6 +66,128 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 _Played = tuple[Block, tuple[Answers, Mapping[str, int]]]
 """Block that is a whole run, with the answers to it and the counters of its record."""
+
+
+class _Prepared(NamedTuple):
+    """Data that all plays of one scenario share, for every seed."""
+
+    key: tuple[object, ...]
+    """Parts of the scenario on which the data depend."""
+    computer: SuspensionComputer
+    card: Card
+    play: RepeatedPlay | None
+    """Repeated play; None where more than offsets and phase depends on the seed."""
+    channels: Mapping[str, Channel]
+    segments: tuple[Segment, ...]
+
+
+class RepeatedRig(EmulatorRig):
+    """Emulated rig whose plays are those of ``EmulatorRig`` to the bit, in blocks of DIRECT_BLOCK_SAMPLES.
+
+    Data for a scenario that fits in one block are prepared once for all seeds.
+    """
+
+    def __init__(self, rig: EmulatorRig) -> None:
+        """Rig of the description of ``rig``."""
+        super().__init__(rig.described, DIRECT_BLOCK_SAMPLES)
+        self._last_prepared: _Prepared | None = None
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        return (self._repeat(scenario, [seed]) or [super().perform(scenario, seed)])[0]
+
+    def perform_all(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
+        """Performance of each seed, as of ``perform``; their blocks are computed together where they can be."""
+        return self._repeat(scenario, seeds) or [self.perform(scenario, seed) for seed in seeds]
+
+    def courses_together(self, scenario: Scenario, seeds: Sequence[int], samples: int) -> RepeatedCourses | None:
+        """Courses without ramps of the machines of several plays; None where these differ in more than offsets.
+
+        :raises EmulatorError: as ``courses``.
+        """
+        program, card = scenario.program, self.card(scenario.program)
+        if not self._draws_offsets_and_phase_alone(scenario):
+            return None
+        machine = drawn_machine(self.described.computer, program.circuit, seeds[0], card.true_rate_hz)
+        if not is_repeatable(machine, ()):
+            return None
+        wired = Wired(machine, nominal_machine(program) if self.described.computer.pots == "dial" else machine)
+        phases, offsets_v = self._draw(scenario, seeds, machine)
+        return RepeatedCourses(wired, scenario.excitation, phases, offsets_v, samples, OUTPUT)
+
+    def _draw(
+        self, scenario: Scenario, seeds: Sequence[int], computer: SuspensionComputer
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Phases (seeds,) and offsets of the amplifiers (seeds, amplifiers) in volts."""
+        numbers = uniforms(seeds, Stream.COMPONENTS, computer.program.amplifiers)
+        offsets_v = drawn_offsets_v(self.amplifier, numbers, self.described.computer.offset_v)
+        if scenario.random_phase:
+            return uniforms(seeds, Stream.EXCITATION, 1)[:, 0], offsets_v
+        return np.full(len(seeds), scenario.excitation.phase), offsets_v
+
+    def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
+        """Prepared data of the scenario; the last set is reused for the same key."""
+        key = (scenario.samples, scenario.plant, scenario.changes, scenario.excitation)
+        if self._last_prepared is None or self._last_prepared.key != key:
+            computer, excitation, changes = self.set_up(scenario, seed)
+            card = self.card(scenario.program)
+            with emulator_errors(f"scenario {scenario.name}: "):
+                excitation.check_rate(computer.sample_rate_hz)
+                able = self._draws_offsets_and_phase_alone(scenario) and is_repeatable(computer, changes)
+                play = RepeatedPlay(computer, scenario.samples, changes) if able else None
+            channels = channels_of(card, computer, scenario.program)
+            self._last_prepared = _Prepared(key, computer, card, play, channels, scenario.segments())
+        return self._last_prepared
+
+    def _draws_offsets_and_phase_alone(self, scenario: Scenario) -> bool:
+        """True if plays of the scenario differ in the amplifiers' offsets and the phase of their edges alone."""
+        card, drawn = self.card(scenario.program), self.described.computer
+        is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm
+        is_nominal &= not drawn.noise and not drawn.supply_hum_v
+        is_nominal &= drawn.specimen is None and drawn.values is None
+        is_on_time = probes_per_sample(card) == 1 and not ahead_ticks(card) and card.clock_drift_ppm == 0
+        return is_nominal and is_on_time and not scenario.excitation.is_smooth
+
+    def _repeat(self, scenario: Scenario, seeds: Sequence[int]) -> list[Performance]:
+        """Performances whose blocks are computed together with the first one; none if there is no repeated play."""
+        if scenario.samples > self._block_samples:
+            return []
+        prepared = self._prepare(scenario, seeds[0])
+        if (play := prepared.play) is None:
+            return []
+        taken: list[tuple[Block, Mapping[str, int]]] = []
+
+        def blocks(i: int) -> Iterator[Block]:
+            if not taken:
+                taken.extend(self._repeated_blocks(prepared, play, scenario, seeds))
+            yield taken[i][0]
+
+        def hindsight(i: int) -> Hindsight:
+            return Hindsight(prepared.segments, taken[i][1] if taken else {})
+
+        return [
+            Performance(
+                sample_period_s=1.0 / prepared.card.rate_hz,
+                time_scale=prepared.computer.scales.time,
+                channels=prepared.channels,
+                blocks=blocks(i),
+                hindsight=functools.partial(hindsight, i),
+            )
+            for i in range(len(seeds))
+        ]
+
+    def _repeated_blocks(
+        self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seeds: Sequence[int]
+    ) -> Iterator[tuple[Block, Mapping[str, int]]]:
+        """Samples and lit lamps of each seed."""
+        phases, offsets_v = self._draw(scenario, seeds, prepared.computer)
+        with emulator_errors(as_error=RigError):
+            volts, lamps = play.play_all(scenario.excitation, phases, offsets_v)
+            codes, clipped = sample_plays(prepared.card, volts, normals(seeds, Stream.CARD, volts.shape[1:]))
+        for each, *samples in zip(lamps, volts, codes, clipped, strict=True):
+            yield Block(0, *samples), lit_lamps(each, 1)
+
+
+# ------------------------------------------------------------------------------------------------------------ playing
 
 
 def can_be_direct(rig: Rig, device: DeviceDescription) -> TypeGuard[EmulatorRig]:
@@ -54,19 +205,13 @@ def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bo
     :raises ConfigurationError: the estimator refuses its configuration.
     :raises LinkError: the library of the device was not built.
     """
-    _retain_freed_memory()
-    return DirectBench(RepeatedRig(rig), device.direct(alarms_only=alarms_only))
-
-
-def _retain_freed_memory() -> None:
-    """Make glibc keep the arrays of a play for the next one; otherwise each play faults their pages in again.
-
-    Its thresholds would grow by themselves, but not in a worker of Dask: they are fixed at 128 kB by the variable
-    MALLOC_TRIM_THRESHOLD_, whatever its value, and Dask sets it.
-    """
+    # glibc keeps the arrays of a play for the next one; otherwise each play would fault their pages in again. Its
+    # thresholds would grow by themselves, but not in a worker of Dask: they are fixed at 128 kB by the variable
+    # MALLOC_TRIM_THRESHOLD_, whatever its value, and Dask sets it.
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(_M_MMAP_THRESHOLD, _RETAINED_BYTES)
         mallopt(_M_TRIM_THRESHOLD, 2 * _RETAINED_BYTES)
+    return DirectBench(RepeatedRig(rig), device.direct(alarms_only=alarms_only))
 
 
 class DirectBench(Bench):
@@ -140,19 +285,19 @@ def judge_all(runs: Iterable[Run]) -> list[Verdict]:
 
     Consecutive runs that differ in seed and samples alone are judged together, in a part of the time.
     """
-    return [verdict for _, alike in itertools.groupby(runs, _common) for verdict in _judge_alike(list(alike))]
+    verdicts: list[Verdict] = []
+    for _, group in itertools.groupby(runs, _COMMON):
+        alike = list(group)
+        models = models_of(alike) if is_exact(alike[0]) else [None] * len(alike)
+        expect = itertools.repeat(alike[0].conditions.played.expect)
+        verdicts += map(judge_with, alike, expect, models, exposures(alike), segment_estimates(alike))
+    return verdicts
 
 
-def _common(run: Run) -> tuple[object, ...]:
-    """What two runs must share to be judged together."""
-    known = run.conditions
-    return run.samples, known.segments, known.records, known.channels, known.scenario, known.dut, known.rig
-
-
-def _judge_alike(runs: Sequence[Run]) -> Iterator[Verdict]:
-    models = models_of(runs) if is_exact(runs[0]) else [None] * len(runs)
-    expect = itertools.repeat(runs[0].conditions.played.expect)
-    return map(judge_with, runs, expect, models, exposures(runs), segment_estimates(runs))
+_COMMON = operator.attrgetter(
+    "samples", *(f"conditions.{name}" for name in ("segments", "records", "channels", "scenario", "dut", "rig"))
+)
+"""Values that runs share if they are judged together."""
 
 
 def models_of(runs: Sequence[Run]) -> Sequence[Model | None]:

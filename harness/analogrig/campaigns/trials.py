@@ -1,216 +1,219 @@
-"""Trials as columns: the form in which they are stored, counted and compared."""
+"""Trials: what a campaign keeps of each run, as a record and as columns of many records.
+
+Columns are one structured array (``Trials``), in which trials are stored, counted and compared.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 import math
 import zlib
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.campaigns.rows import Row, changes
+from analogrig.judging.verdict import ChangeVerdict, Verdict
 from analogrig.plant import MAX_SAMPLES
+from analogrig.run import Run
 
 OUTCOMES = ("passed", "failed", "inconclusive")
 PASSED, FAILED, INCONCLUSIVE = range(3)
 
 EXISTS, MISSED, LATE = 1, 2, 4
-"""Bits of ``Trials.change``."""
+"""Bits of the column ``change``."""
 
 MOST_TRIALS = 20_000
 """Largest number of trials in one part."""
 
-_MOST_BYTES = 16_000_000
-"""Largest size of a column of one part."""
-
-_NONE = -1
-
-_MOST_WHY = 300
-"""Most characters of a reason."""
-
-_TYPES = {
-    "outcome": "u1",
-    "samples": "<u4",
-    "armed": "<u4",
-    "false_alarms": "<u4",
-    "change": "u1",
-    "latency_n": "<i4",
-    "bound_n": "<i4",
-    "error": "<f4",
-    "theta": "<u8",
-    "drawn": "<f4",
-}
-"""Types of the columns of numbers."""
-
-_COUNTS = ("outcome", "samples", "armed", "false_alarms", "theta")
-
-_PER_CHANGE = ("change", "latency_n", "bound_n")
-
-COLUMNS = (*_TYPES, "why")
-"""Names of all columns, in the order of ``Trials.encode``."""
-
-
 MOST_ERRORS = 3
 """Estimated parameters whose errors are kept."""
 
-_NO_ERRORS = [math.nan] * MOST_ERRORS
+_MOST_BYTES = 16_000_000
+"""Largest size of a column of one part."""
+
+_MOST_REASON = 300
+"""Most characters of a reason."""
+
+_NONE = -1
+
+COLUMNS = (
+    "outcome",  # index of OUTCOMES
+    "samples",
+    "armed",  # samples in which the trigger was armed
+    "false_alarms",
+    "change",  # (c,) bits EXISTS, MISSED, LATE; 0: the trial ended before this change
+    "latency_n",  # (c,) detection delays in samples; -1: not detected
+    "bound_n",  # (c,) information bounds; -1: not detectable
+    "error",  # (MOST_ERRORS,) relative errors of the last estimates; NaN: none
+    "theta",  # first 64 bits of the hash of all estimates; 0: nothing was played
+    "drawn",  # (axes,) drawn values, rounded
+    "why",  # first reason of a trial that has not passed; empty otherwise
+)
+"""Names of the columns of ``Trials``, and of those of the store. c is the number of changes."""
+
+_PER_CHANGE = frozenset({"change", "latency_n", "bound_n"})
+
+Trials: TypeAlias = NDArray[np.void]
+"""Array (n,) with the fields COLUMNS."""
 
 
-@dataclass(frozen=True, eq=False)
-class Trials:
-    """n trials of one cell with consecutive seeds; c is the number of changes, d of drawn axes."""
+class Change(NamedTuple):
+    """Change of the plant, and its detection; samples are relative to the change."""
 
-    outcome: NDArray[np.uint8]
-    """(n,) indices of OUTCOMES."""
-    samples: NDArray[np.uint32]
-    armed: NDArray[np.uint32]
-    """(n,) samples in which the trigger was armed."""
-    false_alarms: NDArray[np.uint32]
-    change: NDArray[np.uint8]
-    """(n, c) bits EXISTS, MISSED, LATE; 0: the trial ended before this change."""
-    latency_n: NDArray[np.int32]
-    """(n, c) detection delays in samples; -1: not detected."""
-    bound_n: NDArray[np.int32]
-    """(n, c) information bounds; -1: not detectable."""
-    error: NDArray[np.float32]
-    """(n, MOST_ERRORS) relative errors of the last estimates; NaN: none."""
-    theta: NDArray[np.uint64]
-    """(n,) first 64 bits of the hash of all estimates; 0: nothing was played."""
-    drawn: NDArray[np.float32]
-    """(n, d) drawn values, rounded."""
-    why: tuple[str, ...]
-    """First reason of each trial that has not passed; empty otherwise."""
-
-    def __len__(self) -> int:
-        return len(self.outcome)
-
-    @property
-    def is_valid(self) -> NDArray[np.bool_]:
-        """(n,): not inconclusive."""
-        return np.asarray(self.outcome != INCONCLUSIVE)
+    latency_n: int | None
+    bound_n: int | None
+    """Information bound; None: the change was not detectable."""
+    missed: bool
+    late: bool
 
     @classmethod
-    def of(cls, rows: Sequence[Row], axes: Sequence[str] = ()) -> Trials:
-        """Columns of rows; ``axes``: names of the drawn values."""
-        n = len(rows)
-        found = [changes(row) for row in rows]
-        width = max(map(len, found), default=0)
-        change, latency_n, bound_n = np.zeros((n, width), np.uint8), *np.full((2, n, width), _NONE, np.int32)
-        for i, each in enumerate(found):
-            for k, one in enumerate(each):
-                change[i, k] = EXISTS | MISSED * one.missed | LATE * one.late
-                latency_n[i, k] = _NONE if one.latency_n is None else one.latency_n
-                bound_n[i, k] = _NONE if one.bound_n is None else one.bound_n
-        with np.errstate(over="ignore"):  # an error beyond float32 is none
-            error = np.array([[*row["errors"], *_NO_ERRORS][:MOST_ERRORS] for row in rows], np.float32)
-        error = error.reshape(n, MOST_ERRORS)
-        error[~np.isfinite(error[:, 0])] = np.nan
-        drawn = np.array([[row.get("drawn", {}).get(axis, 0.0) for axis in axes] for row in rows], np.float32)
+    def of(cls, change: ChangeVerdict) -> Self:
+        """Change at its likeliest instant; one that was not found in the samples is recorded as not detectable."""
+        if change.unseen:
+            return cls(None, None, missed=False, late=False)
+        return cls(change.latency_n, change.bound_n, change.missed, change.late)
+
+
+class Trial(NamedTuple):
+    """Record of one trial."""
+
+    seed: int
+    outcome: str
+    """One of OUTCOMES."""
+    why: str = ""
+    """First reason why the trial has not passed."""
+    samples: int = 0
+    armed: int = 0
+    """Samples in which the trigger was armed."""
+    false_alarms: int = 0
+    changes: tuple[Change, ...] = ()
+    errors: tuple[float, ...] = ()
+    """Relative errors of the last estimates; empty if there are none, or one is non-finite."""
+    theta: int = 0
+    """First 64 bits of the hash of all estimates, which identifies the build."""
+    drawn: Mapping[str, float] = {}
+    """Drawn values, by axis."""
+
+    @classmethod
+    def of(cls, run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) -> Self:
+        """Record of a run."""
+        errors = tuple(verdict.estimates[-1].error.values()) if verdict.estimates else ()
         return cls(
-            outcome=np.array([OUTCOMES.index(row["outcome"]) for row in rows], np.uint8),
-            samples=np.array([row["samples"] for row in rows], np.uint32),
-            armed=np.array([row["armed"] for row in rows], np.uint32),
-            false_alarms=np.array([row["false_alarms"] for row in rows], np.uint32),
-            change=change,
-            latency_n=latency_n,
-            bound_n=bound_n,
-            error=error,
-            theta=np.array([int(row["theta"] or "0", 16) for row in rows], np.uint64),
-            drawn=drawn.reshape(n, len(axes)),
-            why=tuple(" ".join(row.get("why", "").split())[:_MOST_WHY] for row in rows),
+            seed=run.conditions.seed,
+            outcome=verdict.outcome if verdict.valid else "inconclusive",
+            why=verdict.reasons[0] if verdict.reasons else "",
+            samples=run.samples,
+            armed=verdict.armed_n,
+            false_alarms=len(verdict.false_alarms),
+            changes=tuple(map(Change.of, verdict.changes)),
+            errors=errors if all(map(math.isfinite, errors)) else (),
+            theta=int((verdict.theta_hash or verdict.alarm_hash)[:16] or "0", 16),
+            drawn=drawn or {},
         )
 
-    def __getitem__(self, part: slice) -> Trials:
-        return Trials(**{field.name: getattr(self, field.name)[part] for field in dataclasses.fields(self)})
+    @property
+    def is_valid(self) -> bool:
+        return self.outcome != "inconclusive"
 
-    def at(self, places: NDArray[np.int64]) -> Trials:
-        """Trials at these places, without their reasons."""
-        numbers = {name: getattr(self, name)[places] for name in _TYPES}
-        return Trials(**numbers, why=("",) * len(places))
 
-    @classmethod
-    def joined(cls, parts: Sequence[Trials]) -> Trials:
-        """Trials of all parts, in order; the ends of shorter lists of changes are filled as changes that never came."""
-        if not parts:
-            return cls.of([])
-        width = max(part.change.shape[1] for part in parts)
-        found = {}
-        for name in _TYPES:
-            columns = [getattr(part, name) for part in parts]
-            if name in _PER_CHANGE:
-                fill = 0 if name == "change" else _NONE
-                columns = [np.pad(each, ((0, 0), (0, width - each.shape[1])), constant_values=fill) for each in columns]
-            found[name] = np.concatenate(columns)
-        return cls(**found, why=tuple(text for part in parts for text in part.why))
+def _blank(count: int, changes: int, axes: int) -> Trials:
+    """So many trials without any result."""
+    kinds = ("u1", "<u4", "<u4", "<u4", "u1", "<i4", "<i4", "<f4", "<u8", "<f4", object)
+    shapes = ((), (), (), (), (changes,), (changes,), (changes,), (MOST_ERRORS,), (), (axes,), ())
+    trials = np.zeros(count, list(zip(COLUMNS, kinds, shapes, strict=True)))
+    trials["latency_n"] = trials["bound_n"] = _NONE
+    trials["error"], trials["why"] = np.nan, ""
+    return trials
 
-    def encode(self) -> tuple[bytes, ...]:
-        """Columns as zlib streams of little-endian numbers, row by row, in the order of COLUMNS.
 
-        ``why`` has one line of UTF-8 for each trial that has not passed.
-        """
-        numbers = (np.ascontiguousarray(getattr(self, name), kind).tobytes() for name, kind in _TYPES.items())
-        why = "\n".join(text for text, outcome in zip(self.why, self.outcome, strict=True) if outcome != PASSED)
-        return tuple(map(zlib.compress, (*numbers, why.encode("utf-8", "replace"))))
+def columns_of(records: Sequence[Trial], axes: Sequence[str] = ()) -> Trials:
+    """Columns of records; ``axes``: names of the drawn values."""
+    trials = _blank(len(records), max((len(each.changes) for each in records), default=0), len(axes))
+    change, latency_n, bound_n, error = (trials[name] for name in ("change", "latency_n", "bound_n", "error"))
+    for i, each in enumerate(records):
+        for k, one in enumerate(each.changes):
+            change[i, k] = EXISTS | MISSED * one.missed | LATE * one.late
+            latency_n[i, k] = _NONE if one.latency_n is None else one.latency_n
+            bound_n[i, k] = _NONE if one.bound_n is None else one.bound_n
+    trials["outcome"] = [OUTCOMES.index(each.outcome) for each in records]
+    trials["why"] = [" ".join(each.why.split())[:_MOST_REASON] for each in records]
+    for name in ("samples", "armed", "false_alarms", "theta"):
+        trials[name] = [getattr(each, name) for each in records]
+    if len(records):
+        trials["drawn"] = [[each.drawn.get(axis, 0.0) for axis in axes] for each in records]
+        with np.errstate(over="ignore"):  # an error beyond float32 is none
+            error[:] = [[*each.errors, *[math.nan] * MOST_ERRORS][:MOST_ERRORS] for each in records]
+    error[~np.isfinite(error[:, 0])] = np.nan
+    return trials
 
-    @classmethod
-    def decode(cls, count: int, columns: Mapping[str, bytes], axes: int) -> Trials:
-        """Trials of ``encode``, or of some of its columns: the others are zero.
 
-        :param axes: number of drawn axes.
-        :raises ValueError: no campaign writes such columns.
-        """
-        found: dict[str, NDArray[np.generic]] = {}
-        for name, kind in _TYPES.items():
-            numbers = np.frombuffer(_inflate(columns[name]), kind) if name in columns else np.zeros(0, kind)
-            if name in _COUNTS:
-                found[name] = numbers if name in columns else np.zeros(count, kind)
-            else:
-                found[name] = numbers.reshape(count, -1) if numbers.size else np.zeros((count, 0), kind)
-        outcome = found["outcome"]
-        why = [""] * count
-        if "why" in columns:
-            lines = _inflate(columns["why"])
-            texts = lines.decode().split("\n") if lines.count(b"\n") < count else []
-            not_passed = np.flatnonzero(outcome != PASSED).tolist()
-            if len(texts) != max(1, len(not_passed)):
-                raise ValueError("reasons of other trials")
-            for i, text in zip(not_passed, texts, strict=False):
-                why[i] = text
-        trials = cls(**found, why=tuple(why))  # type: ignore[arg-type]  # their types are those of _TYPES
-        trials._check(count, columns.keys(), axes)
-        return trials
+def is_valid(trials: Trials) -> NDArray[np.bool_]:
+    """(n,): True for trials that are not inconclusive."""
+    return np.asarray(trials["outcome"] != INCONCLUSIVE)
 
-    def _check(self, count: int, names: Collection[str], axes: int) -> None:
-        """:raises ValueError: the values are impossible."""
-        if {len(getattr(self, name)) for name in _TYPES} != {count}:
-            raise ValueError("columns of different lengths")
-        if self.outcome.max(initial=0) > INCONCLUSIVE:
-            raise ValueError("a trial without an outcome")
-        rising = [getattr(self, name) for name in ("false_alarms", "armed", "samples") if name in names]
-        if any((low > high).any() for low, high in itertools.pairwise([*rising, np.uint32(MAX_SAMPLES)])):
-            raise ValueError("counts that cannot be")
-        if "change" in names:
-            self._check_changes()
-        if "error" in names and self.error.shape != (count, MOST_ERRORS):
-            raise ValueError(f"errors that are not {MOST_ERRORS}")
-        if np.isinf(self.error).any():
-            raise ValueError("an infinite error")
-        if "drawn" in names and (self.drawn.shape[1] != axes or not np.isfinite(self.drawn).all()):
-            raise ValueError("drawn values of another campaign")
 
-    def _check_changes(self) -> None:
-        """:raises ValueError: the values are impossible."""
-        if not self.change.shape == self.latency_n.shape == self.bound_n.shape:
-            raise ValueError("columns of different lengths")
-        if (self.change > (EXISTS | MISSED | LATE)).any():
-            raise ValueError("a change without a result")
-        for times in (self.latency_n, self.bound_n):
-            if ((times < _NONE) | (times > MAX_SAMPLES)).any():
-                raise ValueError("a time that cannot be")
+def join(parts: Sequence[Trials]) -> Trials:
+    """Trials of all parts, in order. In a part with fewer changes than another, the rest of them never came."""
+    widths = [part["change"].shape[1] for part in parts]
+    trials = _blank(sum(map(len, parts)), max(widths, default=0), parts[0]["drawn"].shape[1] if parts else 0)
+    end = 0
+    for part, width in zip(parts, widths, strict=True):
+        begin, end = end, end + len(part)
+        for name in COLUMNS:
+            column = trials[name][begin:end]
+            (column[:, :width] if name in _PER_CHANGE else column)[:] = part[name]
+    return trials
+
+
+def encode(trials: Trials) -> tuple[bytes, ...]:
+    """Columns as zlib streams of little-endian numbers, trial by trial, in the order of COLUMNS.
+
+    ``why`` has one line of UTF-8 for each trial that has not passed.
+    """
+    why = "\n".join(trials["why"][trials["outcome"] != PASSED])
+    numbers = (trials[name].tobytes() for name in COLUMNS[:-1])
+    return tuple(map(zlib.compress, (*numbers, why.encode("utf-8", "replace"))))
+
+
+def decode(count: int, columns: Sequence[bytes], axes: int) -> Trials:
+    """Trials of ``encode``; ``axes``: number of drawn axes.
+
+    :raises ValueError: no campaign writes such columns.
+    """
+    streams = dict(zip(COLUMNS, map(_inflate, columns), strict=True))
+    width, rest = divmod(len(streams["change"]), count)
+    trials = _blank(count, width, axes)
+    if rest or any(len(streams[name]) != trials[name].nbytes for name in COLUMNS[:-1]):
+        raise ValueError("columns of different lengths")
+    for name in COLUMNS[:-1]:
+        trials[name] = np.frombuffer(streams[name], trials.dtype[name].base).reshape(trials[name].shape)
+    lines = streams["why"]
+    reasons = lines.decode().split("\n") if lines.count(b"\n") < count else []
+    not_passed = np.flatnonzero(trials["outcome"] != PASSED)
+    if len(reasons) != max(1, len(not_passed)):
+        raise ValueError("reasons of other trials")
+    trials["why"][not_passed] = reasons[: len(not_passed)]
+    _check(trials)
+    return trials
+
+
+def _check(trials: Trials) -> None:
+    """:raises ValueError: the values are impossible."""
+    if trials["outcome"].max(initial=0) > INCONCLUSIVE:
+        raise ValueError("a trial without an outcome")
+    counts = np.stack([trials[name] for name in ("false_alarms", "armed", "samples")])
+    if (np.diff(counts.astype(np.int64), axis=0) < 0).any() or counts.max(initial=0) > MAX_SAMPLES:
+        raise ValueError("counts that cannot be")
+    if (trials["change"] > (EXISTS | MISSED | LATE)).any():
+        raise ValueError("a change without a result")
+    times = np.stack((trials["latency_n"], trials["bound_n"]))
+    if ((times < _NONE) | (times > MAX_SAMPLES)).any():
+        raise ValueError("a time that cannot be")
+    if np.isinf(trials["error"]).any():
+        raise ValueError("an infinite error")
+    if not np.isfinite(trials["drawn"]).all():
+        raise ValueError("drawn values that cannot be")
 
 
 def _inflate(stream: bytes) -> bytes:

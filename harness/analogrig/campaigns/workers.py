@@ -91,40 +91,39 @@ class Workers(Protocol):
         """
 
 
-class CampaignWorkers(Workers, Protocol):
+class CampaignWorkers(ABC):
     """Workers that a campaign can use."""
 
     @property
+    @abstractmethod
     def slots(self) -> int:
         """Number of tasks that can be in flight."""
 
-    def supply(self, files: Mapping[str, bytes]) -> None:
+    @abstractmethod
+    def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
+        """As ``Workers.play``."""
+
+    def supply(self, files: Mapping[str, bytes]) -> None:  # noqa: B027 - workers of this machine need nothing
         """Bring the files that devices run to workers on other machines; ``files``: contents by hash."""
 
 
-class ThisProcess:
+class ThisProcess(CampaignWorkers):
     """Worker that plays the tasks one after the other in this process."""
 
     slots = 1
-
-    def supply(self, files: Mapping[str, bytes]) -> None:
-        """Files are where they are."""
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         for task in tasks:
             yield task, work(task)
 
 
-class _Executors(ABC):
+class _Executors(CampaignWorkers):
     """Workers behind executors of concurrent.futures."""
 
     _broken: type[Exception] = BrokenProcessPool
     """Error of a task whose worker has died."""
     _most_deaths = MOST_DEATHS
     _complaint = f"{number_of(MOST_DEATHS, 'worker')} died over it, one after the other"
-
-    def supply(self, files: Mapping[str, bytes]) -> None:  # noqa: B027 - workers of this machine need nothing
-        """Bring the files that devices run to workers on other machines."""
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         busy: dict[Future[Result], tuple[int, Task, int]] = {}
@@ -151,11 +150,6 @@ class _Executors(ABC):
         finally:
             self._end()
 
-    @property
-    @abstractmethod
-    def slots(self) -> int:
-        """Number of tasks that can be in flight."""
-
     @abstractmethod
     def _start(self) -> None:
         """Prepare for the first task."""
@@ -177,16 +171,16 @@ class Processes(_Executors):
         if count < 1:
             raise ConfigurationError(f"there must be at least one worker, not {count}")
         _check_descriptors(count)
-        self._count = count
+        self._slots = count
         self._pools: list[ProcessPoolExecutor] = []
 
     @property
     def slots(self) -> int:
-        return self._count
+        return self._slots
 
     def _start(self) -> None:
         prepare()
-        self._pools = [_pool() for _ in range(self._count)]
+        self._pools = [_pool() for _ in range(self.slots)]
 
     def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:
         try:
@@ -284,11 +278,10 @@ def _pool() -> ProcessPoolExecutor:
 def _begin() -> None:
     """Initialise a worker process: leave signals to the parent, and exit when the parent has gone."""
     leave_to_parent()
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    if (parent := multiprocessing.parent_process()) is not None:
 
+        def end_with_parent() -> None:
+            connection.wait([parent.sentinel])
+            os._exit(1)
 
-def _end_with(sentinel: int) -> None:
-    connection.wait([sentinel])
-    os._exit(1)
+        threading.Thread(target=end_with_parent, daemon=True).start()

@@ -75,8 +75,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError, WorkerError
     from analogrig.identity import Identity
     from analogrig.output import move_aside
-    from analogrig.reporting.campaign import as_json, places_of, text, write_json
-    from analogrig.reporting.campaign_page import write_page
+    from analogrig.reporting.campaign_page import as_json, places_of, text, write_json, write_page
 
     if arguments.parquet is not None:
         check_available()
@@ -149,7 +148,7 @@ def progress(plan: Plan) -> Callable[[Tally], None] | None:
     line = open_progress_line()
     if line is None:
         return None
-    from analogrig.reporting.campaign import counts_text
+    from analogrig.reporting.campaign_page import counts_text
 
     most = len(plan.cells()) * plan.spec.trials
 

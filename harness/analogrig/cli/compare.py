@@ -10,7 +10,7 @@ from analogrig.cli.options import FILE, add_command, add_json
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, show_work
 
 if TYPE_CHECKING:
-    from analogrig.campaigns.comparison import Comparison
+    from analogrig.campaigns.differences import Comparison
 
 
 def add(commands: Any) -> None:
@@ -43,7 +43,7 @@ def _probability(text: str) -> float:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from analogrig.campaigns.comparison import PAIRED, compare_sides, load
+    from analogrig.campaigns.differences import PAIRED, compare_sides, load
 
     with show_work(f"comparing {arguments.a} and {arguments.b}"):
         found = compare_sides(load(arguments.a), load(arguments.b), arguments.alpha)

@@ -25,7 +25,7 @@ from tests.soak.mutated.trial import MOST_CPU_S, MOST_MB, Case, Outcome, Running
 
 _LOADED = (
     *("analogrig.bench", "analogrig.judging.verdict", "analogrig.reporting", "analogrig.reporting.summary"),
-    *("analogrig.campaigns.conduct", "analogrig.reporting.campaign", "analogrig.rigs.description"),
+    *("analogrig.campaigns.conduct", "analogrig.reporting.campaign_page", "analogrig.rigs.description"),
     *("analogrig_instruments.self_test", "analogrig.recordings"),
     *("cantools", "asammdf"),
 )

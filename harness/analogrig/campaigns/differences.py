@@ -13,6 +13,7 @@ Campaigns are read from their stores some seeds at a time, for all cells.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -25,9 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.campaigns.plan import Plan, list_differences
-from analogrig.campaigns.rows import Row, is_valid, row
 from analogrig.campaigns.store import Store
-from analogrig.campaigns.trials import MISSED, MOST_ERRORS, Trials
+from analogrig.campaigns.trials import MISSED, MOST_ERRORS, Trial, Trials, columns_of, is_valid, join
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
@@ -52,16 +52,8 @@ SEEDS_AT_ONCE = 100_000
 """Largest number of trials of each side that are in memory at once, and of seeds of which differences are."""
 
 
-Observation = tuple[tuple[object, ...], Row]
-"""Key of a trial, seed included, and its row."""
-
-
-@dataclass(frozen=True)
-class Values:
-    """Values of a quantity in n trials: the sum over each trial, and their number."""
-
-    sums: NDArray[np.float64]
-    counts: NDArray[np.int64]
+Observation = tuple[tuple[object, ...], Trial]
+"""Key of a trial, seed included, and the trial."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +62,9 @@ class Measure:
 
     name: str
     unit: str
-    of: Callable[[Trials, Trials | None], Values]
-    """Values of trials, limited to those that the other side's trials have too, if there are any."""
+    of: Callable[[Trials, Trials], tuple[NDArray[np.float64], NDArray[np.int64]]]
+    """Sum over the values of each of n trials, and their number, limited to those that the trials of the other side
+    have too."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +79,8 @@ class Difference:
     seeds: int
     test: str
     p: float
-    adjusted_p: float
-    word: Word
+    adjusted_p: float = 1.0
+    word: Word = NO_DIFFERENCE
 
     @property
     def shown(self) -> bool:
@@ -130,33 +123,24 @@ def compare(
     :param estimates: names of the estimated parameters.
     """
     measures = _measures(estimates)
-    ours, theirs = _valid(a), _valid(b)
-    common = [key for key in ours if key in theirs]
+    ours, theirs = ({key: trial for key, trial in side if trial.is_valid} for side in (a, b))
+    counts = (len(ours), len(theirs)), (len(a) - len(ours), len(b) - len(theirs))
+    common = sorted((key for key in ours if key in theirs), key=lambda key: ours[key].seed)
     if not common:
-        found = [each for measure in measures if (each := _unpaired(measure, ours, theirs)) is not None]
-        return _comparison(found, alpha, (len(ours), len(theirs)), (len(a), len(b)), (0, 0))
-    common.sort(key=lambda key: int(ours[key]["seed"]))
-    seeds = np.array([ours[key]["seed"] for key in common], np.int64)
-    places = np.unique(seeds, return_inverse=True)[1]
-    pairing = Pairing(int(places[-1]) + 1, measures)
-    pairing.add(places, *(Trials.of([side[key] for key in common]) for side in (ours, theirs)))
-    return _comparison(
-        pairing.differences(), alpha, (len(ours), len(theirs)), (len(a), len(b)), (pairing.identical, len(common))
-    )
+        sides = (list(ours.values()), list(theirs.values()))
+        found = [each for measure in measures if (each := _unpaired(measure, *sides)) is not None]
+        return _comparison(found, alpha, *counts, (0, 0))
+    seeds = np.unique([ours[key].seed for key in common], return_inverse=True)[1]
+    pairing = Pairing(int(seeds[-1]) + 1, measures)
+    pairing.add(seeds, *(columns_of([side[key] for key in common]) for side in (ours, theirs)))
+    return _comparison(pairing.differences(), alpha, *counts, (pairing.identical, len(common)))
 
 
-def _comparison(
-    found: Sequence[Difference], alpha: float, valid: tuple[int, int], played: tuple[int, int], same: tuple[int, int]
-) -> Comparison:
+def _comparison(found: Sequence[Difference], alpha: float, *counts: tuple[int, int]) -> Comparison:
+    """Comparison; ``counts``: its last three fields."""
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"alpha must be between 0 and 1, not {alpha:g}")
-    return Comparison(
-        differences=adjust_by_holm(found, alpha),
-        alpha=alpha,
-        trials=valid,
-        inconclusive=(played[0] - valid[0], played[1] - valid[1]),
-        identical=same,
-    )
+    return Comparison(adjust_by_holm(found, alpha), alpha, *counts)
 
 
 class Pairing:
@@ -173,89 +157,85 @@ class Pairing:
         self._moved: NDArray[np.float64] = np.zeros((len(measures), self._units))
         """(measures, units) sums of the differences of the seeds that flip together."""
 
-    def add(self, places: NDArray[np.int64], a: Trials, b: Trials) -> None:
+    def add(self, seeds: NDArray[np.int64], a: Trials, b: Trials) -> None:
         """Add the valid trials of some seeds: all of each of these seeds, the same trials on both sides.
 
-        :param places: (n,) places of the trials' seeds among all, rising or not.
+        :param seeds: (n,) numbers of the trials' seeds among all, from 0 on, in any order.
         """
-        self.identical += int(np.count_nonzero(a.theta == b.theta))
-        first = int(places.min(initial=self._seeds))
-        at = places - first
-        unit = (first + np.arange(at.max(initial=-1) + 1)) * self._units // self._seeds
+        self.identical += int(np.count_nonzero(a["theta"] == b["theta"]))
+        first = int(seeds.min(initial=self._seeds))
+        own = seeds - first
+        unit = (first + np.arange(own.max(initial=-1) + 1)) * self._units // self._seeds
         for i, measure in enumerate(self._measures):
-            x, y = (_by_place(at, measure.of(mine, other)) for mine, other in ((a, b), (b, a)))
+            x, y = (_mean_by_seed(own, *measure.of(mine, other)) for mine, other in ((a, b), (b, a)))
             both = ~(np.isnan(x) | np.isnan(y))
             self._sums[i] += x[both].sum(), y[both].sum(), np.count_nonzero(both)
             self._moved[i] += np.bincount(unit[both], (y - x)[both], self._units)
 
     def differences(self) -> list[Difference]:
         """Differences of the measures of which both sides have values, not yet adjusted."""
-        out = []
-        for measure, (a, b, count), moved in zip(self._measures, self._sums.tolist(), self._moved, strict=True):
-            if count:
-                means, p = (a / count, b / count), sign_flip_p(moved)
-                out.append(Difference(measure.name, measure.unit, *means, int(count), PAIRED, p, p, NO_DIFFERENCE))
-        return out
+        return [
+            Difference(measure.name, measure.unit, a / count, b / count, int(count), PAIRED, sign_flip_p(moved))
+            for measure, (a, b, count), moved in zip(self._measures, self._sums.tolist(), self._moved, strict=True)
+            if count
+        ]
 
 
-def _by_place(places: NDArray[np.int64], values: Values) -> NDArray[np.float64]:
-    """Mean of the values at each place; NaN where there are none."""
-    sums, counts = (np.bincount(places, each) for each in (values.sums, values.counts))
-    return np.asarray(np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0))
+def _mean_by_seed(
+    seeds: NDArray[np.int64], sums: NDArray[np.float64], counts: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Mean of the values of each seed; NaN where there are none."""
+    total, number = np.bincount(seeds, sums), np.bincount(seeds, counts)
+    return np.asarray(np.divide(total, number, out=np.full(len(total), np.nan), where=number > 0))
 
 
-def _latencies(trials: Trials, other: Trials | None) -> Values:
-    mine, others = trials.latency_n, (trials if other is None else other).latency_n
-    width = min(mine.shape[1], others.shape[1])
-    both = (mine[:, :width] >= 0) & (others[:, :width] >= 0)
-    return Values(np.where(both, mine[:, :width], 0).sum(axis=1, dtype=np.float64), both.sum(axis=1))
-
-
-def _missed(trials: Trials, _: Trials | None) -> Values:
-    visible = trials.bound_n >= 0
-    missed = visible & ((trials.change & MISSED) > 0)
-    return Values(missed.sum(axis=1, dtype=np.float64), visible.sum(axis=1))
-
-
-def _false_alarms(trials: Trials, _: Trials | None) -> Values:
-    armed = trials.armed > 0
-    rate = np.divide(trials.false_alarms, trials.armed, out=np.zeros(len(trials)), where=armed)
-    return Values(rate, armed.astype(np.int64))
-
-
-def _error(i: int) -> Callable[[Trials, Trials | None], Values]:
-    def errors(trials: Trials, other: Trials | None) -> Values:
-        error = np.abs(trials.error[:, i].astype(np.float64))
-        if other is not None:
-            error[np.isnan(error) & ~np.isnan(other.error[:, i])] = LOST_ESTIMATE
-        known = ~np.isnan(error)
-        return Values(np.where(known, error, 0.0), known.astype(np.int64))
-
-    return errors
-
-
-def _measures(estimates: Sequence[str]) -> tuple[Measure, ...]:
+def _measures(estimates: Sequence[str]) -> list[Measure]:
     """Everything that is compared; ``estimates``: names of the estimated parameters."""
-    return (
-        Measure("latency", "samples", _latencies),
-        Measure("missed", "of the visible changes", _missed),
-        Measure("false alarms", "per sample", _false_alarms),
-        *(Measure(f"error of {name}", "relative", _error(i)) for i, name in enumerate(estimates[:MOST_ERRORS])),
-    )
+
+    def latencies(trials: Trials, other: Trials) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        width = min(each["latency_n"].shape[1] for each in (trials, other))
+        latency_n = trials["latency_n"][:, :width]
+        both = (latency_n >= 0) & (other["latency_n"][:, :width] >= 0)
+        return np.where(both, latency_n, 0).sum(axis=1, dtype=np.float64), both.sum(axis=1)
+
+    def missed(trials: Trials, _: Trials) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        visible = trials["bound_n"] >= 0
+        return (visible & ((trials["change"] & MISSED) > 0)).sum(axis=1, dtype=np.float64), visible.sum(axis=1)
+
+    def false_alarms(trials: Trials, _: Trials) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        armed = trials["armed"] > 0
+        rate = np.divide(trials["false_alarms"], trials["armed"], out=np.zeros(len(trials)), where=armed)
+        return rate, armed.astype(np.int64)
+
+    def errors(i: int, trials: Trials, other: Trials) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        error = np.abs(trials["error"][:, i].astype(np.float64))
+        error[np.isnan(error) & ~np.isnan(other["error"][:, i])] = LOST_ESTIMATE
+        known = ~np.isnan(error)
+        return np.where(known, error, 0.0), known.astype(np.int64)
+
+    return [
+        Measure("latency", "samples", latencies),
+        Measure("missed", "of the visible changes", missed),
+        Measure("false alarms", "per sample", false_alarms),
+        *(
+            Measure(f"error of {name}", "relative", functools.partial(errors, i))
+            for i, name in enumerate(estimates[:MOST_ERRORS])
+        ),
+    ]
 
 
-def _unpaired(measure: Measure, a: Mapping[Any, Row], b: Mapping[Any, Row]) -> Difference | None:
+def _unpaired(measure: Measure, a: Sequence[Trial], b: Sequence[Trial]) -> Difference | None:
+    """Difference of a measure between sides without a common seed; None if one has no values."""
     sides = []
-    for rows in (a.values(), b.values()):
-        seeds = np.array([each["seed"] for each in rows], np.int64)
-        means = _by_place(np.unique(seeds, return_inverse=True)[1], measure.of(Trials.of(list(rows)), None))
+    for side in (a, b):
+        trials, seeds = columns_of(side), np.unique([each.seed for each in side], return_inverse=True)[1]
+        means = _mean_by_seed(seeds, *measure.of(trials, trials))
         sides.append(means[~np.isnan(means)])
     x, y = sides
     if not (len(x) and len(y)):
         return None
-    p = permutation_p(x, y)
     return Difference(
-        measure.name, measure.unit, float(x.mean()), float(y.mean()), len(x), UNPAIRED, p, p, NO_DIFFERENCE
+        measure.name, measure.unit, float(x.mean()), float(y.mean()), len(x), UNPAIRED, permutation_p(x, y)
     )
 
 
@@ -303,14 +283,9 @@ def adjust_by_holm(found: Sequence[Difference], alpha: float) -> tuple[Differenc
     floor = 0.0
     for rank, i in enumerate(sorted(range(len(found)), key=lambda i: found[i].p)):
         floor = max(floor, min(1.0, (len(found) - rank) * found[i].p))
-        adjusted[i] = dataclasses.replace(found[i], adjusted_p=floor, word=_word(found[i], floor, alpha))
+        word: Word = NO_DIFFERENCE if floor > alpha else "worse" if found[i].b > found[i].a else "better"
+        adjusted[i] = dataclasses.replace(found[i], adjusted_p=floor, word=word)
     return tuple(adjusted[i] for i in range(len(found)))
-
-
-def _word(difference: Difference, p: float, alpha: float) -> Word:
-    if p > alpha:
-        return NO_DIFFERENCE
-    return "worse" if difference.b > difference.a else "better"
 
 
 @dataclass(frozen=True)
@@ -339,13 +314,12 @@ def load(path: Path) -> Recorded | Campaign:
     """
     if path.is_dir() or path.suffix == ".npz":
         side = _load_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path])
-        if not _valid(side.trials):
+        if not any(trial.is_valid for _, trial in side.trials):
             raise RecordingError(f"{path}: holds no valid trial")
         return side
     with Store.read(path) as store:
-        plan = store.plan()
-        store.check_whole(plan)
-        return Campaign(path, plan)
+        store.check_whole()
+        return Campaign(path, store.plan)
 
 
 def compare_sides(a: Recorded | Campaign, b: Recorded | Campaign, alpha: float = 0.01) -> Comparison:
@@ -354,95 +328,70 @@ def compare_sides(a: Recorded | Campaign, b: Recorded | Campaign, alpha: float =
     :raises ConfigurationError: they are of different campaigns, or played nothing in common; names what differs.
     :raises RecordingError: a campaign's file is damaged, or holds no valid trial.
     """
-    match a, b:
-        case Recorded(), Recorded():
-            return compare(*common_plays(a, b), alpha, a.estimates)
-        case Campaign(), Campaign():
-            _check_same("A and B are different campaigns", _decisive_settings(a.plan), _decisive_settings(b.plan))
-            return _compare_campaigns(a, b, alpha)
-    raise ConfigurationError("A and B cannot be compared: one is a campaign, the other are recordings")
-
-
-def common_plays(a: Recorded, b: Recorded) -> tuple[Sequence[Observation], Sequence[Observation]]:
-    """Recordings of both sides that played the same.
-
-    :raises ConfigurationError: they played nothing in common; names what differs.
-    """
+    if isinstance(a, Campaign) and isinstance(b, Campaign):
+        _check_same("A and B are different campaigns", _decisive_settings(a.plan), _decisive_settings(b.plan))
+        return _compare_campaigns(a, b, alpha)
+    if not (isinstance(a, Recorded) and isinstance(b, Recorded)):
+        raise ConfigurationError("A and B cannot be compared: one is a campaign, the other are recordings")
     common = {key[:-1] for key, _ in a.trials} & {key[:-1] for key, _ in b.trials}
     if not common:
-        _check_same("A and B played nothing in common", *(_recorded_tables(side.trials[0]) for side in (a, b)))
+        keys = (side.trials[0][0] for side in (a, b))
+        tables = ({"scenario": json.loads(str(key[0])), "rig": json.loads(str(key[1]))} for key in keys)
+        _check_same("A and B played nothing in common", *tables)
     ours, theirs = ([each for each in side.trials if each[0][:-1] in common] for side in (a, b))
-    return ours, theirs
+    return compare(ours, theirs, alpha, a.estimates)
 
 
 def _compare_campaigns(a: Campaign, b: Campaign, alpha: float) -> Comparison:
-    valid, played, common = np.zeros(2, np.int64), np.zeros(2, np.int64), 0
-    pairing, cells = Pairing(a.plan.spec.trials, _measures(a.plan.estimates)), _matched_cells(a.plan, b.plan)
+    valid, played, common, trials = np.zeros(2, np.int64), np.zeros(2, np.int64), 0, a.plan.spec.trials
+    pairing, cells = Pairing(trials, _measures(a.plan.estimates)), _matched_cells(a.plan, b.plan)
     with Store.read(a.path) as ours, Store.read(b.path) as theirs:
         step = max(1, SEEDS_AT_ONCE // a.plan.size)
-        for first in range(0, a.plan.spec.trials, step):
-            window = range(first, min(first + step, a.plan.spec.trials))
+        for first in range(0, trials, step):
+            window = range(first, min(first + step, trials))
             pairs: list[tuple[NDArray[np.int64], Trials, Trials]] = []
-            for mine, other in enumerate(cells):
-                x, y = _read(ours, a.plan, mine, window), _read(theirs, b.plan, other, window)
-                valid += np.count_nonzero(x.is_valid), np.count_nonzero(y.is_valid)
+            for cell, other in enumerate(cells):
+                x, y = _read(ours, cell, window), _read(theirs, other, window)
                 played += len(x), len(y)
-                both = np.flatnonzero(x.is_valid[: len(y)] & y.is_valid[: len(x)])
+                valid += np.count_nonzero(is_valid(x)), np.count_nonzero(is_valid(y))
+                both = np.flatnonzero(is_valid(x)[: len(y)] & is_valid(y)[: len(x)])
                 if len(both):
-                    pairs.append((window.start + both, x.at(both), y.at(both)))
+                    pairs.append((first + both, x[both], y[both]))
             if pairs:
-                places, xs, ys = zip(*pairs, strict=True)
-                pairing.add(np.concatenate(places), Trials.joined(xs), Trials.joined(ys))
-                common += sum(map(len, places))
+                seeds, xs, ys = zip(*pairs, strict=True)
+                pairing.add(np.concatenate(seeds), join(xs), join(ys))
+                common += sum(map(len, seeds))
     for side, count in zip((a, b), valid.tolist(), strict=True):
         if not count:
             raise RecordingError(f"{side.path}: holds no valid trial")
-    counts = (valid.tolist(), played.tolist())
-    return _comparison(
-        pairing.differences(),
-        alpha,
-        (counts[0][0], counts[0][1]),
-        (counts[1][0], counts[1][1]),
-        (pairing.identical, common),
-    )
+    counts = ((int(x), int(y)) for x, y in (valid, played - valid))
+    return _comparison(pairing.differences(), alpha, *counts, (pairing.identical, common))
 
 
-_COMPARED = ("outcome", "armed", "false_alarms", "change", "latency_n", "bound_n", "error", "theta")
-
-
-def _read(store: Store, plan: Plan, cell: int, window: range) -> Trials:
+def _read(store: Store, cell: int, window: range) -> Trials:
     """Trials of a cell whose places are in ``window``: those from its start on, up to the end of the cell."""
-    begin = cell * plan.spec.trials
-    found = []
-    for part, trials in store.parts(plan, range(begin + window.start, begin + window.stop), _COMPARED):
-        if part.cell == cell:
-            found.append(trials[max(0, window.start - part.first) : max(0, window.stop - part.first)])
-    return Trials.joined(found)
+    begin = cell * store.plan.spec.trials
+    return join(
+        [
+            trials[max(0, window.start - part.first) : max(0, window.stop - part.first)]
+            for part, trials in store.parts(range(begin + window.start, begin + window.stop))
+            if part.cell == cell
+        ]
+    )
 
 
 def _matched_cells(a: Plan, b: Plan) -> list[int]:
     """Cells of b in the order of those of a: devices are matched by name, or by place if their names differ."""
-    wanted, names = _names(a), _names(b)
-    cells = b.cells()
+    wanted, names = ([str(device["name"]) for device in plan.devices] for plan in (a, b))
     if set(wanted) != set(names):
-        return list(range(len(cells)))
-    places = {(cell.rig, names[cell.device], *cell.values.items()): i for i, cell in enumerate(cells)}
-    return [places[cell.rig, wanted[cell.device], *cell.values.items()] for cell in a.cells()]
+        return list(range(b.size))
+    numbers = {(cell.rig, names[cell.device], *cell.values.items()): i for i, cell in enumerate(b.cells())}
+    return [numbers[cell.rig, wanted[cell.device], *cell.values.items()] for cell in a.cells()]
 
 
 def _check_same(otherwise: str, ours: Any, theirs: Any) -> None:
     if differences := list_differences(ours, theirs, ("in A", "in B")):
         raise ConfigurationError(f"{otherwise}: {differences}")
-
-
-def _names(plan: Plan) -> list[str]:
-    """Names of the devices."""
-    return [str(device["name"]) for device in plan.devices]
-
-
-def _recorded_tables(trial: Observation) -> dict[str, Any]:
-    (scenario, rig, _), _ = trial
-    return {"scenario": json.loads(str(scenario)), "rig": json.loads(str(rig))}
 
 
 def _decisive_settings(plan: Plan) -> dict[str, Any]:
@@ -469,27 +418,16 @@ def _without_names(table: Mapping[str, Any]) -> dict[str, Any]:
     return rest or dict(table)
 
 
-def _valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
-    """Rows of the valid trials, by key."""
-    return {key: each for key, each in trials if is_valid(each)}
-
-
 def _load_recordings(paths: Sequence[Path]) -> Recorded:
     estimates: tuple[str, ...] = ()
-    found: dict[tuple[object, ...], tuple[Path, Row]] = {}
+    found: dict[tuple[object, ...], tuple[Path, Trial]] = {}
     for path in paths:
-        key, trial, named = _load_recording(path)
-        estimates = estimates or named
+        run = Run.load(path)
+        of = run.conditions
+        played = json.dumps(dict(of.scenario), sort_keys=True)  # many may have one name: what strategies draw
+        key = (played, json.dumps(_without_names(of.rig), sort_keys=True), of.seed)
         if key in found:
             raise ConfigurationError(f"{found[key][0]} and {path} are of one scenario, rig and seed: which is meant?")
-        found[key] = path, trial
+        found[key] = path, Trial.of(run, judge(run))
+        estimates = estimates or of.program.estimates
     return Recorded(tuple((key, trial) for key, (_, trial) in found.items()), estimates)
-
-
-def _load_recording(path: Path) -> tuple[Any, Row, tuple[str, ...]]:
-    """Key and row of a recording, and the parameters that it estimates."""
-    run = Run.load(path)
-    of = run.conditions
-    played = json.dumps(dict(of.scenario), sort_keys=True)  # many may have one name: what strategies draw
-    machine = json.dumps(_without_names(of.rig), sort_keys=True)
-    return (played, machine, of.seed), row(run, judge(run)), of.program.estimates

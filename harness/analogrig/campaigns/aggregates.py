@@ -1,4 +1,4 @@
-"""Summary of trials: counts, delays and errors, folded part by part.
+"""Aggregates of trials: counts, delays and errors, folded part by part, and their summary.
 
 The trials of a cell are folded in the order of their seeds. Sums of integers are exact, and sums of floating-point
 numbers are taken one by one, so that the result does not depend on how the trials are divided into parts.
@@ -14,7 +14,16 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.campaigns.trials import EXISTS, FAILED, INCONCLUSIVE, LATE, MISSED, MOST_ERRORS, OUTCOMES, PASSED, Trials
+from analogrig.campaigns.trials import (
+    EXISTS,
+    LATE,
+    MISSED,
+    MOST_ERRORS,
+    OUTCOMES,
+    PASSED,
+    Trials,
+    is_valid,
+)
 from analogrig.judging.betting import BettingSequence
 
 CONFIDENCE = 0.95
@@ -93,19 +102,12 @@ class Aggregate:
 
     most_alarms: int = 0
     """Largest number of alarms that a trial can have; 0: one a sample."""
-    trials: int = 0
-    passed: int = 0
-    failed: int = 0
-    inconclusive: int = 0
-    late: int = 0
-    counted: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
+    counts: Counter[str] = field(default_factory=Counter)
+    """COUNTED, OUTCOMES, ``trials``, ``late``; the sum of the bounds of the changes that were detected and detectable
+    (``bound_n``), and their number (``bounds``); the number of trials with an estimate (``estimates``)."""
     latency_n: Histogram = field(default_factory=Histogram)
-    bound_n: int = 0
-    """Sum over the changes that were detected and detectable, and their number."""
-    bounds: int = 0
     error_squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(MOST_ERRORS))
-    """Sums over the trials with an estimate, and their number."""
-    estimates: int = 0
+    """Sums over the trials with an estimate."""
     plays: dict[str, Counter[tuple[int, int]]] = field(default_factory=lambda: {name: Counter() for name in RATES})
     """Number of valid trials by events and exposure, for each of RATES."""
     longest: dict[str, int] = field(default_factory=lambda: dict.fromkeys(RATES, 1))
@@ -115,50 +117,43 @@ class Aggregate:
     not_passed: list[tuple[int, str, str]] = field(default_factory=list)
     """Seed, outcome and reason of the first trials that have not passed."""
 
+    @property
+    def trials(self) -> int:
+        """Number of trials."""
+        return self.counts["trials"]
+
     def add(self, trials: Trials, first_seed: int) -> None:
         """Fold the next trials."""
-        self.trials += len(trials)
-        outcomes = np.bincount(trials.outcome, minlength=3).tolist()
-        self.passed += outcomes[PASSED]
-        self.failed += outcomes[FAILED]
-        self.inconclusive += outcomes[INCONCLUSIVE]
-        if outcomes[INCONCLUSIVE] and not self.doubt:
-            i = int(np.argmax(trials.outcome == INCONCLUSIVE))
-            self.doubt = f"seed {first_seed + i}: {trials.why[i]}"
-        for i in np.flatnonzero(trials.outcome != PASSED)[: MOST_NOT_PASSED - len(self.not_passed)].tolist():
-            self.not_passed.append((first_seed + i, OUTCOMES[trials.outcome[i]], trials.why[i]))
-        sound = slice(None) if not outcomes[INCONCLUSIVE] else trials.is_valid
-        change, latency_n, bound_n = trials.change[sound], trials.latency_n[sound], trials.bound_n[sound]
-        exists = (change & EXISTS) > 0
-        visible = exists & (bound_n >= 0)
-        by_trial = {
-            "samples": trials.samples[sound],
-            "armed": trials.armed[sound],
-            "false_alarms": trials.false_alarms[sound],
+        outcomes, reasons, valid = trials["outcome"], trials["why"], is_valid(trials)
+        if not valid.all():
+            i = int(np.argmin(valid))
+            self.doubt = self.doubt or f"seed {first_seed + i}: {reasons[i]}"
+        for i in np.flatnonzero(outcomes != PASSED)[: MOST_NOT_PASSED - len(self.not_passed)].tolist():
+            self.not_passed.append((first_seed + i, OUTCOMES[outcomes[i]], reasons[i]))
+        self.counts.update(dict(zip(OUTCOMES, np.bincount(outcomes, minlength=3).tolist(), strict=True)))
+        self.counts["trials"] += len(trials)
+        sound = trials if valid.all() else trials[valid]
+        exists = (sound["change"] & EXISTS) > 0
+        visible, detected = exists & (sound["bound_n"] >= 0), exists & (sound["latency_n"] >= 0)
+        by_trial = {name: sound[name] for name in ("samples", "armed", "false_alarms")} | {
             "visible": visible.sum(axis=1),
-            "missed": (visible & ((change & MISSED) > 0)).sum(axis=1),
+            "missed": (visible & ((sound["change"] & MISSED) > 0)).sum(axis=1),
         }
-        for name, counts in by_trial.items():
-            self.counted[name] += int(counts.sum(dtype=np.int64))
-        self.longest["missed"] = max(self.longest["missed"], change.shape[1])
+        bounded = sound["bound_n"][detected & visible]
+        known = sound["error"][~np.isnan(sound["error"][:, 0])].astype(np.float64)
+        late = exists & ((sound["change"] & LATE) > 0)
+        sums = {**by_trial, "late": late, "bound_n": bounded}
+        self.counts.update({name: int(each.sum(dtype=np.int64)) for name, each in sums.items()})
+        self.counts.update(bounds=len(bounded), estimates=len(known))
+        self.latency_n.add(sound["latency_n"][detected])
+        # cumsum adds one by one, where sum adds in an order that depends on the length
+        self.error_squares = np.cumsum(np.vstack((self.error_squares, known**2)), axis=0)[-1]
+        self.longest["missed"] = max(self.longest["missed"], exists.shape[1])
         self.longest["false_alarms"] = max(self.longest["false_alarms"], int(by_trial["samples"].max(initial=1)))
         for rate in RATES.values():
             both = (by_trial[rate.events].astype(np.int64) << 32) + by_trial[rate.exposure].astype(np.int64)
             for key, times in zip(*(each.tolist() for each in np.unique(both, return_counts=True)), strict=True):
                 self.plays[rate.events][key >> 32, key & 0xFFFFFFFF] += times
-        self.late += int((exists & ((change & LATE) > 0)).sum())
-        detected = exists & (latency_n >= 0)
-        self.latency_n.add(latency_n[detected])
-        bounded = bound_n[detected & visible]
-        self.bound_n += int(bounded.sum(dtype=np.int64))
-        self.bounds += len(bounded)
-        self._add_errors(trials.error[sound])
-
-    def _add_errors(self, error: NDArray[np.float32]) -> None:
-        known = error[~np.isnan(error[:, 0])].astype(np.float64)
-        self.estimates += len(known)
-        # cumsum adds one by one, where sum adds in an order that depends on the length
-        self.error_squares = np.cumsum(np.vstack((self.error_squares, known**2)), axis=0)[-1]
 
     @classmethod
     def merged(cls, parts: Iterable[Aggregate]) -> Self:
@@ -166,10 +161,7 @@ class Aggregate:
         whole = cls()
         for each in parts:
             whole.most_alarms = max(whole.most_alarms, each.most_alarms)
-            for name in ("trials", "passed", "failed", "inconclusive", "late", "bound_n", "bounds", "estimates"):
-                setattr(whole, name, getattr(whole, name) + getattr(each, name))
-            for name in COUNTED:
-                whole.counted[name] += each.counted[name]
+            whole.counts.update(each.counts)
             whole.latency_n.add(each.latency_n.values, each.latency_n.counts)
             whole.error_squares = whole.error_squares + each.error_squares
             for name in RATES:
@@ -216,20 +208,16 @@ class Summary:
     def of(cls, found: Aggregate, estimates: Sequence[str]) -> Summary:
         """Summary of an aggregate; ``estimates``: names of the estimated parameters."""
         rates = {name: found.sequence(name).bounds for name in RATES}
-        rms = np.sqrt(found.error_squares / max(1, found.estimates)).tolist()
+        estimated = found.counts["estimates"]
+        rms = np.sqrt(found.error_squares / max(1, estimated)).tolist()
         return cls(
-            **found.counted,
-            trials=found.trials,
-            passed=found.passed,
-            failed=found.failed,
-            inconclusive=found.inconclusive,
+            **{name: found.counts[name] for name in ("trials", "late", *OUTCOMES, *COUNTED)},
             false_alarm_rate=rates["false_alarms"],
-            late=found.late,
             miss_rate=rates["missed"],
             latency_n=found.latency_n.mean,
             latency_p95_n=found.latency_n.quantile(95),
-            bound_n=found.bound_n / found.bounds if found.bounds else None,
-            error=dict(zip(estimates, rms, strict=False)) if found.estimates else {},
+            bound_n=found.counts["bound_n"] / found.counts["bounds"] if found.counts["bounds"] else None,
+            error=dict(zip(estimates, rms, strict=False)) if estimated else {},
             doubt=found.doubt,
         )
 
@@ -249,26 +237,21 @@ class Distribution:
 
     def add(self, trials: Trials) -> None:
         """Add trials, in any order."""
-        sound = trials.is_valid
-        error = trials.error[sound & ~np.isnan(trials.error[:, 0])].astype(np.float64)
-        place = np.clip(np.floor(error / ERROR_STEP) + ERROR_BINS // 2 + 1, 0, ERROR_BINS + 1).astype(np.int64)
-        for i, places in enumerate(place.T):
-            self.errors[i] += np.bincount(places, minlength=ERROR_BINS + 2)
-        if self.axes:
-            self._add_drawn(trials, sound)
-
-    def _add_drawn(self, trials: Trials, sound: NDArray[np.bool_]) -> None:
-        change, latency_n = trials.change, trials.latency_n
-        exists = ((change & EXISTS) > 0) & sound[:, None]
-        visible, detected = exists & (trials.bound_n >= 0), exists & (latency_n >= 0)
-        places = []
-        for i, (low, high) in enumerate(self.axes.values()):
-            share = (trials.drawn[:, i].astype(np.float64) - low) / (high - low)
-            places.append(np.clip((share * DRAWN_BINS).astype(np.int64), 0, DRAWN_BINS - 1))
+        valid, error, latency_n = is_valid(trials), trials["error"], trials["latency_n"]
+        known = error[valid & ~np.isnan(error[:, 0])].astype(np.float64)
+        bins = np.clip(np.floor(known / ERROR_STEP) + ERROR_BINS // 2 + 1, 0, ERROR_BINS + 1).astype(np.int64)
+        self.errors += [np.bincount(each, minlength=ERROR_BINS + 2) for each in bins.T]
+        if not self.axes:
+            return
+        exists = ((trials["change"] & EXISTS) > 0) & valid[:, None]
+        visible, detected = exists & (trials["bound_n"] >= 0), exists & (latency_n >= 0)
+        ends = np.array(list(self.axes.values()), np.float64)
+        shares = (trials["drawn"][:, : len(ends)].astype(np.float64) - ends[:, 0]) / (ends[:, 1] - ends[:, 0])
+        places = tuple(np.clip((shares * DRAWN_BINS).astype(np.int64), 0, DRAWN_BINS - 1).T)
         for counts, values in (
             (self.visible, visible),
-            (self.missed, visible & ((change & MISSED) > 0)),
+            (self.missed, visible & ((trials["change"] & MISSED) > 0)),
             (self.detected, detected),
             (self.latency_n, np.where(detected, latency_n, 0)),
         ):
-            np.add.at(counts, tuple(places), values.sum(axis=1, dtype=np.int64))
+            np.add.at(counts, places, values.sum(axis=1, dtype=np.int64))
