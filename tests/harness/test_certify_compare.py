@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -36,6 +37,7 @@ from analogrig.devices.registry import describe, open_dut
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.judging.bursts import upper_count
 from analogrig.rigs.description import open_rig
+from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 from tests.harness.simulated_alarms import BEYOND, COVERED, SimulatedPlays
 
@@ -225,21 +227,8 @@ def test_device_that_is_not_excited_is_not_certified_by_its_silence(
     """Edges of 0.1 mV, where a code is 4.9 mV, over less than the 1000 samples after which the device calls it idle."""
     still = tmp_path / "still.toml"
     still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
-    options = [
-        "--far",
-        "0.03",
-        "--confidence",
-        "0.9",
-        "--allowed",
-        "0",
-        "--burst",
-        "5",
-        "--scenario",
-        str(still),
-        "--workers",
-        "1",
-    ]
-    assert main(["certify", "--dut", "inproc", *options, *way]) == 3
+    options = "--dut inproc --far 0.03 --confidence 0.9 --allowed 0 --burst 5 --workers 1".split()
+    assert main(["certify", *options, "--scenario", str(still), *way]) == 3
     assert "INCONCLUSIVE\n  seed 0: the trigger was armed in none of" in capsys.readouterr().out
 
 
@@ -290,6 +279,13 @@ def test_command_tells_outcome_by_its_status(tmp_path: Path, capsys: pytest.Capt
     assert main(["certify", "--dut", noisy_device(tmp_path), "--far", "1e-3", *options]) == 1
     assert main(["certify", "--dut", "serial:/dev/absent", *options]) == 3
     assert main(["certify", "--dut", "inproc", "--far", "2"]) == 2
+
+
+def test_device_without_a_trigger_cannot_be_certified(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    none = tmp_path / "none.toml"
+    none.write_text('kind = "inproc"\n[estimator]\ntrigger = "none"\n')
+    assert main(["certify", "--dut", str(none)]) == 2
+    assert "no trigger" in capsys.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------------------- comparisons
@@ -408,6 +404,21 @@ def test_sides_without_a_seed_in_common_are_compared_as_groups() -> None:
     assert found.identical == (0, 0)
 
 
+# ----------------------------------------------------------------------------------------- comparisons of recordings
+
+
+def record(folder: Path, *seeds: int, dut: str = "inproc", rig: str = "emulator", **changed: Any) -> None:
+    """Record a run of each seed below a folder, by default of 700 samples of ``healthy`` with these changes."""
+    scenario = dataclasses.replace(Scenario.load("healthy"), **{"samples": 700, **changed})
+    with open_rig(rig) as opened, open_dut(dut, exchange="block") as device:
+        for seed in seeds:
+            Bench(opened, device).play(scenario, seed).save(folder / str(seed) / "run.npz")
+
+
+def softened(factor: float) -> tuple[PotChange, ...]:
+    return (PotChange(400, {"K": 24500.0 * factor}),)
+
+
 def recorded(path: Path) -> Sequence[Observation]:
     """Trials of a folder of recordings."""
     side = load(path)
@@ -415,40 +426,84 @@ def recorded(path: Path) -> Sequence[Observation]:
     return side.trials
 
 
+def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], a: str = "a", b: str = "b", status: int = 2) -> str:
+    """Complaint of a comparison of two folders that ends with this status."""
+    assert main(["compare", str(tmp_path / a), str(tmp_path / b)]) == status
+    return capsys.readouterr().err
+
+
 def test_recordings_of_one_name_that_played_something_else_are_not_paired(tmp_path: Path) -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700, name="drawn")
-    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
-        for factor in (0.7, 0.9):
-            drawn = dataclasses.replace(scenario, changes=(PotChange(400, {"K": 24500.0 * factor}),))
-            Bench(rig, dut).play(drawn, 0).save(tmp_path / "both" / str(factor) / "run.npz")
-    assert len(dict(recorded(tmp_path / "both"))) == 2
-    found = compare(recorded(tmp_path / "both" / "0.7"), recorded(tmp_path / "both" / "0.9"))
+    for factor in (0.7, 0.9):
+        record(tmp_path / str(factor), 0, name="drawn", changes=softened(factor))
+    assert len(dict(recorded(tmp_path))) == 2
+    found = compare(recorded(tmp_path / "0.7"), recorded(tmp_path / "0.9"))
     assert found.identical == (0, 0)
 
 
-def test_device_without_a_trigger_cannot_be_certified(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    none = tmp_path / "none.toml"
-    none.write_text('kind = "inproc"\n[estimator]\ntrigger = "none"\n')
-    assert main(["certify", "--dut", str(none)]) == 2
-    assert "no trigger" in capsys.readouterr().err
-
-
 def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scenario = Scenario.load("thesis")
-    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
-        for seed in range(2):
-            Bench(rig, dut).play(scenario, seed).save(tmp_path / "a" / str(seed) / "run.npz")
+    record(tmp_path / "a", 0, 1, changes=softened(0.8))
     played = [key for key, _ in recorded(tmp_path / "a")]
     assert [key[2] for key in played] == [0, 1]
     assert played[0][:2] == played[1][:2]
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "0" / "run.npz"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["identical"] == [1, 1]
+    assert json.loads(capsys.readouterr().out)["identical"] == [1, 1]
     (tmp_path / "empty").mkdir()
     with pytest.raises(RecordingError, match="empty: holds no valid trial"):
         load(tmp_path / "empty")
-    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "absent.json")]) == 2
+    refused(tmp_path, capsys, b="absent.json")
 
+
+def test_too_few_seeds_to_show_anything_are_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, dut in (("a", "inproc"), ("b", "mean-between-faults")):
+        record(tmp_path / name, 0, dut=dut, changes=softened(0.8))
+    said = refused(tmp_path, capsys, status=3)
+    assert "INCONCLUSIVE: too few seeds (1) to show anything at alpha 0.01: at least" in said
+
+
+def test_rigs_of_one_name_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shipped = Path("fixtures/rigs/emulator.toml").read_text()
+    for folder, noise_lsb in (("a", 0.2), ("b", 6.0)):
+        (tmp_path / folder).mkdir()
+        rig_file = tmp_path / folder / "bench.toml"
+        rig_file.write_text(shipped.replace("noise_lsb = 1.0", f"noise_lsb = {noise_lsb}"))
+        record(tmp_path / folder, 0, rig=str(rig_file))
+    said = refused(tmp_path, capsys)
+    assert "played nothing in common: rig.card.noise_lsb is 0.2 in A and 6.0 in B" in said
+
+
+def test_two_recordings_of_one_play_on_one_side_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(tmp_path / "a" / "one", 0)
+    shutil.copytree(tmp_path / "a" / "one", tmp_path / "a" / "two")
+    named = " and ".join(str(tmp_path / "a" / name / "0" / "run.npz") for name in ("one", "two"))
+    assert f"{named} are of one scenario, rig and seed" in refused(tmp_path, capsys, b="a/one")
+
+
+def test_recordings_that_have_no_play_in_common_are_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(tmp_path / "a", 0)
+    record(tmp_path / "b", 0, samples=710)
+    said = refused(tmp_path, capsys)
+    assert "A and B played nothing in common: scenario.samples is 700 in A and 710 in B" in said
+
+
+def test_trials_that_were_inconclusive_on_one_side_alone_are_no_pass(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(tmp_path / "a", 0, 1, 2)
+    for seed in range(3):
+        run = Run.load(tmp_path / "a" / str(seed) / "run.npz")
+        faults = ("the device was reset",) if seed else ()
+        broken = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, faults=faults))
+        broken.save(tmp_path / "b" / str(seed) / "run.npz")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
+    said = capsys.readouterr()
+    assert "inconclusive: 0 of A, 2 of B" in said.out
+    assert "2 trials of B were inconclusive, 0 of A" in said.err
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a")]) == 0
+
+
+# ------------------------------------------------------------------------------------------- comparisons of campaigns
 
 CAMPAIGN = """
 name = "mine"
@@ -461,24 +516,31 @@ stiffness_factor = [0.8, 0.9]
 """
 
 
-def campaign(tmp_path: Path, name: str, *changes: tuple[str, str]) -> str:
+@pytest.fixture(scope="module")
+def own_devices(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Two within this process that differ in their settings."""
+    paths = [tmp_path_factory.mktemp("devices") / f"{name}.toml" for name in ("keen", "calm")]
+    for path, arl0 in zip(paths, (1e3, 1e6), strict=True):
+        path.write_text(f'kind = "inproc"\n[estimator]\narl0 = {arl0}\n')
+    return list(map(str, paths))
+
+
+def campaign(folder: Path, name: str, devices: Sequence[str], *changes: tuple[str, str]) -> str:
     """Plays CAMPAIGN with these changes of its words; the file of its results."""
-    spec = CAMPAIGN
+    spec = CAMPAIGN.replace("DEVICES", ", ".join(map(repr, devices)))
     for old, new in changes:
         assert spec.count(old) == 1
         spec = spec.replace(old, new)
-    (tmp_path / f"{name}.toml").write_text(spec)
-    out = str(tmp_path / f"{name}.sqlite")
-    assert main(["campaign", str(tmp_path / f"{name}.toml"), "--out", out, "--workers", "1"]) in (0, 1)
+    (folder / f"{name}.toml").write_text(spec)
+    out = str(folder / f"{name}.sqlite")
+    assert main(["campaign", str(folder / f"{name}.toml"), "--out", out, "--workers", "1"]) in (0, 1)
     return out
 
 
-@pytest.fixture
-def own_devices(tmp_path: Path) -> list[str]:
-    """Two within this process that differ in their settings."""
-    for name, arl0 in (("keen", 1e3), ("calm", 1e6)):
-        (tmp_path / f"{name}.toml").write_text(f'kind = "inproc"\n[estimator]\narl0 = {arl0}\n')
-    return [str(tmp_path / f"{name}.toml") for name in ("keen", "calm")]
+@pytest.fixture(scope="module")
+def keen(tmp_path_factory: pytest.TempPathFactory, own_devices: list[str]) -> str:
+    """Results of CAMPAIGN with the first device."""
+    return campaign(tmp_path_factory.mktemp("keen"), "a", own_devices[:1])
 
 
 @pytest.mark.parametrize(
@@ -496,99 +558,32 @@ def own_devices(tmp_path: Path) -> list[str]:
     ],
 )
 def test_campaigns_that_played_something_else_are_not_compared(
-    change: tuple[str, str], named: str, tmp_path: Path, own_devices: list[str], capsys: pytest.CaptureFixture[str]
+    change: tuple[str, str],
+    named: str,
+    tmp_path: Path,
+    keen: str,
+    own_devices: list[str],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    devices = ("DEVICES", repr(own_devices[0]))
-    a, b = campaign(tmp_path, "a", devices), campaign(tmp_path, "b", devices, change)
-    assert main(["compare", a, b]) == 2
-    said = capsys.readouterr().err
+    said = refused(tmp_path, capsys, keen, campaign(tmp_path, "b", own_devices[:1], change))
     assert "A and B are different campaigns: " in said
     assert named in said
     assert said.count("\n") == 1
 
 
 def test_campaigns_that_differ_in_device_name_and_chunk_are_compared(
-    tmp_path: Path, own_devices: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, keen: str, own_devices: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    a = campaign(tmp_path, "a", ("DEVICES", repr(own_devices[0])))
-    b = campaign(
-        tmp_path, "b", ("DEVICES", repr(own_devices[1])), ("mine", "other"), ("trials = 12", "trials = 12\nchunk = 1")
-    )
+    b = campaign(tmp_path, "b", own_devices[1:], ("mine", "other"), ("trials = 12", "trials = 12\nchunk = 1"))
     capsys.readouterr()
-    assert main(["compare", a, b, "--json"]) == 0
+    assert main(["compare", keen, b, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["trials"] == [24, 24]
     assert said["identical"][1] == 24
 
 
 def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own_devices: list[str]) -> None:
-    keen, calm = own_devices
-    a = campaign(tmp_path, "a", ("DEVICES", f"{keen!r}, {calm!r}"))
-    b = campaign(tmp_path, "b", ("DEVICES", f"{calm!r}, {keen!r}"))
-    found = compare_sides(load(Path(a)), load(Path(b)))
+    a, b = (Path(campaign(tmp_path, name, own_devices[::step])) for name, step in (("a", 1), ("b", -1)))
+    found = compare_sides(load(a), load(b))
     assert found.identical == (48, 48)
     assert not any(each.shown for each in found.differences)
-
-
-def test_too_few_seeds_to_show_anything_are_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    healthy = Scenario.load("healthy")
-    scenario = dataclasses.replace(healthy, samples=700, changes=(PotChange(400, {"K": 20000.0}),))
-    with open_rig("emulator") as rig:
-        for name, dut in (("a", "inproc"), ("b", "mean-between-faults")):
-            with open_dut(dut, exchange="block") as device:
-                Bench(rig, device).play(scenario, 0).save(tmp_path / name / "run.npz")
-    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
-    assert "INCONCLUSIVE: too few seeds (1) to show anything at alpha 0.01: at least" in capsys.readouterr().err
-
-
-def test_rigs_of_one_name_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
-    for folder, noise_lsb in (("a", 0.2), ("b", 6.0)):
-        (tmp_path / folder).mkdir()
-        rig_file = tmp_path / folder / "bench.toml"
-        shipped = Path("fixtures/rigs/emulator.toml").read_text()
-        rig_file.write_text(shipped.replace("noise_lsb = 1.0", f"noise_lsb = {noise_lsb}"))
-        with open_rig(str(rig_file)) as rig, open_dut("inproc", exchange="block") as dut:
-            Bench(rig, dut).play(scenario, 0).save(tmp_path / folder / "run.npz")
-    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
-    assert "played nothing in common: rig.card.noise_lsb is 0.2 in A and 6.0 in B" in capsys.readouterr().err
-
-
-def test_two_recordings_of_one_play_on_one_side_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
-    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
-        run = Bench(rig, dut).play(scenario, 0)
-    for name in ("one", "two"):
-        run.save(tmp_path / "a" / name / "run.npz")
-    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "one")]) == 2
-    named = " and ".join(str(tmp_path / "a" / name / "run.npz") for name in ("one", "two"))
-    assert f"{named} are of one scenario, rig and seed" in capsys.readouterr().err
-
-
-def test_recordings_that_have_no_play_in_common_are_not_compared(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
-    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
-        for name, samples in (("a", 700), ("b", 710)):
-            Bench(rig, dut).play(dataclasses.replace(scenario, samples=samples), 0).save(tmp_path / name / "run.npz")
-    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
-    assert "A and B played nothing in common: scenario.samples is 700 in A and 710 in B" in capsys.readouterr().err
-
-
-def test_trials_that_were_inconclusive_on_one_side_alone_are_no_pass(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
-    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
-        for seed in range(3):
-            run = Bench(rig, dut).play(scenario, seed)
-            run.save(tmp_path / "a" / str(seed) / "run.npz")
-            faults = ("the device was reset",) if seed else ()
-            broken = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, faults=faults))
-            broken.save(tmp_path / "b" / str(seed) / "run.npz")
-    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
-    said = capsys.readouterr()
-    assert "inconclusive: 0 of A, 2 of B" in said.out
-    assert "2 trials of B were inconclusive, 0 of A" in said.err
-    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a")]) == 0

@@ -124,28 +124,28 @@ class Aggregate:
 
     def add(self, trials: Trials, first_seed: int) -> None:
         """Fold the next trials."""
-        outcomes, reasons, valid = trials["outcome"], trials["why"], is_valid(trials)
-        if not valid.all():
-            i = int(np.argmin(valid))
+        outcomes, reasons, mask = trials["outcome"], trials["why"], is_valid(trials)
+        if not mask.all():
+            i = int(np.argmin(mask))
             self.doubt = self.doubt or f"seed {first_seed + i}: {reasons[i]}"
         for i in np.flatnonzero(outcomes != PASSED)[: MOST_NOT_PASSED - len(self.not_passed)].tolist():
             self.not_passed.append((first_seed + i, OUTCOMES[outcomes[i]], reasons[i]))
         self.counts.update(dict(zip(OUTCOMES, np.bincount(outcomes, minlength=3).tolist(), strict=True)))
         self.counts["trials"] += len(trials)
-        sound = trials if valid.all() else trials[valid]
-        exists = (sound["change"] & EXISTS) > 0
-        visible, detected = exists & (sound["bound_n"] >= 0), exists & (sound["latency_n"] >= 0)
-        by_trial = {name: sound[name] for name in ("samples", "armed", "false_alarms")} | {
+        valid = trials if mask.all() else trials[mask]
+        exists = (valid["change"] & EXISTS) > 0
+        visible, detected = exists & (valid["bound_n"] >= 0), exists & (valid["latency_n"] >= 0)
+        by_trial = {name: valid[name] for name in ("samples", "armed", "false_alarms")} | {
             "visible": visible.sum(axis=1),
-            "missed": (visible & ((sound["change"] & MISSED) > 0)).sum(axis=1),
+            "missed": (visible & ((valid["change"] & MISSED) > 0)).sum(axis=1),
         }
-        bounded = sound["bound_n"][detected & visible]
-        known = sound["error"][~np.isnan(sound["error"][:, 0])].astype(np.float64)
-        late = exists & ((sound["change"] & LATE) > 0)
+        bounded = valid["bound_n"][detected & visible]
+        known = valid["error"][~np.isnan(valid["error"][:, 0])].astype(np.float64)
+        late = exists & ((valid["change"] & LATE) > 0)
         sums = {**by_trial, "late": late, "bound_n": bounded}
         self.counts.update({name: int(each.sum(dtype=np.int64)) for name, each in sums.items()})
         self.counts.update(bounds=len(bounded), estimates=len(known))
-        self.latency_n.add(sound["latency_n"][detected])
+        self.latency_n.add(valid["latency_n"][detected])
         # cumsum adds one by one, where sum adds in an order that depends on the length
         self.error_squares = np.cumsum(np.vstack((self.error_squares, known**2)), axis=0)[-1]
         self.longest["missed"] = max(self.longest["missed"], exists.shape[1])

@@ -51,10 +51,17 @@ def conduct(
             return Results.load(store)
         if command is not None:
             store.add_command(command)
+        workers.supply(device_files(plan.devices))
         tally = Tally(plan, store)
+        tasks = Tasks(plan, tally, workers.slots)
+        work: Callable[[Task], PlayedTask] = functools.partial(play_task, plan.as_json())
         try:
-            for trials in _play(plan, workers, store, tally):
-                if progress is not None and trials:
+            for _, played in workers.play(work, iter(tasks)):
+                store.add(played.parts)
+                for part, columns in played.parts:
+                    tally.add(part, decode(part.trials, columns, len(plan.spec.draw)))
+                tasks.note(sum(part.trials for part, _ in played.parts), played.seconds)
+                if progress is not None:
                     progress(tally)
         finally:
             close_devices()
@@ -83,20 +90,6 @@ def ended_results(plan: Plan, out: Path) -> Results | None:
     return results
 
 
-def _play(plan: Plan, workers: CampaignWorkers, store: Store, tally: Tally) -> Iterator[int]:
-    """Play what is left; yield the number of trials of each task that has been stored and counted."""
-    workers.supply(device_files(plan.devices))
-    tasks = Tasks(plan, tally, workers.slots)
-    work: Callable[[Task], PlayedTask] = functools.partial(play_task, plan.as_json())
-    for _, played in workers.play(work, iter(tasks)):
-        store.add(played.parts)
-        for part, columns in played.parts:
-            tally.add(part, decode(part.trials, columns, len(plan.spec.draw)))
-        count = sum(part.trials for part, _ in played.parts)
-        tasks.note(count, played.seconds)
-        yield count
-
-
 class Tasks:
     """Tasks of about TASK_S each, whatever a trial takes.
 
@@ -123,7 +116,10 @@ class Tasks:
             yield task
 
     def _next(self) -> Task:
-        wanted, parts, count = self._wanted(), [], 0
+        wanted, parts, count = FIRST_N, [], 0
+        if self._trial_s is not None:
+            share = max(self._open / (2 * self._slots), SHORTEST_S / self._trial_s)
+            wanted = max(1, int(min(TASK_S / self._trial_s, share, MOST_TRIALS)))
         while self._cells and count < wanted:
             cell, gaps = self._cells.popleft()
             if self._tally.has_ended(cell):
@@ -141,13 +137,6 @@ class Tasks:
                 self._cells.appendleft((cell, gaps))
         self._open -= count
         return tuple(parts)
-
-    def _wanted(self) -> int:
-        """Number of trials of the next task."""
-        if self._trial_s is None:
-            return FIRST_N
-        share = max(self._open / (2 * self._slots), SHORTEST_S / self._trial_s)
-        return max(1, int(min(TASK_S / self._trial_s, share, MOST_TRIALS)))
 
 
 def unreachable(plan: Plan) -> dict[str, str]:

@@ -101,7 +101,7 @@ class CampaignWorkers(ABC):
 
     @abstractmethod
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
-        """As ``Workers.play``."""
+        """Yield each task with its result, as ``Workers.play``."""
 
     def supply(self, files: Mapping[str, bytes]) -> None:  # noqa: B027 - workers of this machine need nothing
         """Bring the files that devices run to workers on other machines; ``files``: contents by hash."""

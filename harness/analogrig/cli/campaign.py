@@ -91,7 +91,7 @@ def _run(arguments: argparse.Namespace) -> int:
         move_aside(page)
         kept = f"what is done is kept in {out}, and the same command goes on from there"
         try:
-            with workers(arguments, one_worker_only(plan.rigs, plan.devices), plan.size * plan.spec.trials) as crew:
+            with workers(arguments, one_worker_only(plan.rigs, plan.devices), plan.size * plan.spec.trials) as pool:
                 lacking = {} if arguments.cluster else unreachable(plan)
                 if len(lacking) == len(plan.devices):
                     return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
@@ -99,7 +99,7 @@ def _run(arguments: argparse.Namespace) -> int:
                     complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
                 files = [file for device in plan.devices for file in device_of(device).files()]
                 command = Identity.here(arguments.command_line, arguments.started, files)
-                results = conduct(plan, crew, out, progress(plan), command)
+                results = conduct(plan, pool, out, progress(plan), command)
         except KeyboardInterrupt:
             return complain(f"interrupted: {kept}", INTERRUPTED)
         except WorkerError as error:
@@ -145,14 +145,13 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
 
 def progress(plan: Plan) -> Callable[[Tally], None] | None:
     """Callback that shows the progress of a plan; None if standard error is no terminal."""
-    line = open_progress_line()
-    if line is None:
+    if (line := open_progress_line()) is None:
         return None
     from analogrig.reporting.campaign_page import counts_text
 
-    most = len(plan.cells()) * plan.spec.trials
+    most = plan.size * plan.spec.trials
 
-    def tell(tally: Tally) -> None:
+    def show_progress(tally: Tally) -> None:
         line.show(f"{tally.trials} of {most} trials; {counts_text(tally.total())}", is_last=tally.trials == most)
 
-    return tell
+    return show_progress

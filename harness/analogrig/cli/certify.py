@@ -74,8 +74,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.burst is not None and arguments.bounds not in (None, "bursts"):
         return complain(f"certify: --burst belongs to --bounds bursts, not to {arguments.bounds}", USAGE)
-    trust = trust_of(arguments)
-    scenario = Scenario.load(arguments.scenario)
+    trust, scenario, burst = trust_of(arguments), Scenario.load(arguments.scenario), arguments.burst
     question = Question(
         rig_table(arguments.rig or scenario.rig or DEFAULT_RIG, trust),
         device_table(arguments.dut or scenario.dut or "host", trust),
@@ -83,51 +82,43 @@ def _run(arguments: argparse.Namespace) -> int:
         far=arguments.far,
         confidence=arguments.confidence,
         allowed=arguments.allowed,
-        burst=arguments.burst
-        if arguments.burst is not None
-        else {"bursts": BURST, "independent": 1.0}.get(arguments.bounds),
+        burst={"bursts": BURST, "independent": 1.0}.get(arguments.bounds) if burst is None else burst,
         samples=arguments.samples,
         first_seed=arguments.seed,
     )
     try:
-        with workers(arguments, one_worker_only([question.rig], [question.device]), question.useful_workers) as crew:
-            answer = certify(question, crew, _progress())
+        with workers(arguments, one_worker_only([question.rig], [question.device]), question.useful_workers) as pool:
+            answer = certify(question, pool, _progress())
     except (DeviceError, LinkError, RigError, WorkerError) as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if arguments.json:
-        show_result(_as_json(question, answer), arguments, device_of(question.device).files())
+        asked = {name: getattr(question, name) for name in ("far", "confidence", "allowed", "burst", "first_seed")}
+        names = {"rig": question.rig["name"], "dut": question.device["name"], "scenario": scenario.name}
+        result = {**names, **asked, "play_samples": question.play_n, **vars(answer)}
+        show_result(result, arguments, device_of(question.device).files())
     else:
         show(_sentence(question, answer))
     return _STATUS[answer.outcome]
 
 
 def _sentence(question: Question, answer: Certificate) -> str:
+    """Question, method with its assumption, and answer."""
+    if question.burst is None:
+        method = f"betting, nothing assumed within a play of {number_of(question.play_n, 'sample')}"
+    else:
+        alike = "independent alarms" if question.burst == 1.0 else f"bursts of {question.burst:g} alarms on average"
+        method = f"{alike} assumed, fixed length, at most {question.allowed_alarms} alarms allowed"
     return (
         f"{question.device['name']} on {question.rig['name']}: at most {question.far:g} false alarms per sample,"
-        f" confidence {question.confidence:g} ({_way(question)}): {answer.outcome.upper()}\n  {answer.reason}"
+        f" confidence {question.confidence:g} ({method}): {answer.outcome.upper()}\n  {answer.reason}"
     )
 
 
-def _way(question: Question) -> str:
-    """Method with its assumption."""
-    if question.burst is None:
-        return f"betting, nothing assumed within a play of {number_of(question.play_n, 'sample')}"
-    assumed = "independent alarms" if question.burst == 1.0 else f"bursts of {question.burst:g} alarms on average"
-    return f"{assumed} assumed, fixed length, at most {question.allowed_alarms} alarms allowed"
-
-
-def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
-    asked = {name: getattr(question, name) for name in ("far", "confidence", "allowed", "burst", "first_seed")}
-    names = {"rig": question.rig["name"], "dut": question.device["name"], "scenario": question.scenario.name}
-    return {**names, **asked, "play_samples": question.play_n, **vars(answer)}
-
-
 def _progress() -> Callable[[int, int, int], None] | None:
-    line = open_progress_line()
-    if line is None:
+    if (line := open_progress_line()) is None:
         return None
 
-    def tell(samples: int, most: int, alarms: int) -> None:
+    def show_progress(samples: int, most: int, alarms: int) -> None:
         line.show(f"{samples} of {most} samples, {number_of(alarms, 'alarm')}", is_last=samples >= most)
 
-    return tell
+    return show_progress

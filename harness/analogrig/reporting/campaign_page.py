@@ -238,7 +238,7 @@ class Map:
 
 @dataclass(frozen=True)
 class PlottedQuantity:
-    """PlottedQuantity of the maps."""
+    """Quantity that maps show."""
 
     name: str
     form: str
