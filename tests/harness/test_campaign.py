@@ -72,6 +72,12 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "reference.sqlite"
 
 
+def command(folder: Path, *more: str | Path, workers: int | None = 1) -> int:
+    """Status of ``analogrig campaign`` with spec.toml and out.sqlite of a folder."""
+    words = ["campaign", folder / "spec.toml", "--out", folder / "out.sqlite", *more]
+    return main([*map(str, words), *([] if workers is None else ["--workers", str(workers)])])
+
+
 def exported(results: Results | Path) -> bytes:
     """The aggregated results as their file has them."""
     found = Results.load(results) if isinstance(results, Path) else results
@@ -600,7 +606,7 @@ def test_command_says_what_came_out_and_writes_the_page(
 ) -> None:
     planned(tmp_path)
     out = tmp_path / "out.sqlite"
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1", "--json"]) == 0
+    assert command(tmp_path, "--json") == 0
     said = json.loads(capsys.readouterr().out)
     assert said["total"]["trials"] == 12
     assert [cell["stiffness_factor"] for cell in said["cells"]] == ["0.8", "0.9"]
@@ -608,7 +614,7 @@ def test_command_says_what_came_out_and_writes_the_page(
     before = Path(said["files"]["results"]).read_bytes()
     assert json.loads(before) == json.loads(exported(reference))
     assert Path(said["files"]["page"]).read_text().startswith("<!doctype html>")
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 0
+    assert command(tmp_path, workers=None) == 0
     assert Path(said["files"]["results"]).read_bytes() == before
 
 
@@ -655,8 +661,7 @@ def test_parquet_without_pyarrow_is_one_line_before_anything_is_played(
 def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ports = ("/dev/absent", "/dev/lacking")
     planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent', 'serial:/dev/lacking']\n", ports)
-    allowed = [word for port in ports for word in ("--allow", port)]
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / "out.sqlite"), *allowed]) == 3
+    assert command(tmp_path, "--allow", ports[0], "--allow", ports[1], workers=None) == 3
     complaint = capsys.readouterr().err
     assert "INCONCLUSIVE: no device can be had: device serial:/dev/absent: cannot open /dev/absent" in complaint
     assert complaint.count("\n") == 1
@@ -670,14 +675,13 @@ def test_device_that_does_not_answer_leaves_the_others_their_results(
     (tmp_path / "mute.toml").write_text(f"kind = 'serial'\nurl = '{os.ttyname(slave)}'\ntimeout_s = 0.05\n")
     spec = f"trials = 3\nsamples = 700\ndevices = ['{tmp_path / 'mute.toml'}', 'inproc']\n"
     planned(tmp_path, spec, [os.ttyname(slave)])
-    out = tmp_path / "out.sqlite"
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--allow", os.ttyname(slave)]) == 3
+    assert command(tmp_path, "--allow", os.ttyname(slave), workers=None) == 3
     os.close(master)
     os.close(slave)
     said = capsys.readouterr()
     assert "mute cannot be had, and its trials are INCONCLUSIVE: device mute: no Hello" in said.err
     assert "3 trials inconclusive, such as seed 0: device mute: no Hello" in said.out
-    mute, others = (stored(out)[cell] for cell in range(2))
+    mute, others = (stored(tmp_path / "out.sqlite")[cell] for cell in range(2))
     assert (mute["outcome"].tolist(), mute["samples"].tolist()) == ([2] * 3, [0] * 3)
     assert (others["outcome"].tolist(), others["samples"].tolist()) == ([0] * 3, [700] * 3)
 
@@ -695,9 +699,8 @@ def test_trial_whose_device_fails_is_inconclusive_and_the_next_is_played(
 
     monkeypatch.setattr(Bench, "play", play)
     planned(tmp_path, "trials = 4\nsamples = 700\ndevices = ['host?exchange=block']\n")
-    out = tmp_path / "out.sqlite"
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 3
-    trials = stored(out)[0]
+    assert command(tmp_path) == 3
+    trials = stored(tmp_path / "out.sqlite")[0]
     assert set(np.flatnonzero(trials["outcome"] == 2).tolist()) == failing
     assert {trials["why"][seed] for seed in failing} == {"the device is gone"}
 
@@ -750,7 +753,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
     close_devices()
     with pytest.raises(ConfigurationError, match=r"own\.so is another build than the one that the campaign was begun"):
         play_part(plan.as_json(), Part(0, 0, 1))
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--allow", str(library)]) == 2
+    assert command(tmp_path, "--allow", library, workers=None) == 2
     complaint = capsys.readouterr().err
     before, after = plan.devices[0]["build"], planned(tmp_path, spec, [str(library)]).devices[0]["build"]
     assert f"devices[0].build is '{before}' there and '{after}' here" in complaint
@@ -843,23 +846,21 @@ def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     planned(tmp_path, "trials = 1\nsamples = 600\ndevices = ['host']\n")
-    out = tmp_path / "out.sqlite"
 
     def interrupted(*_: object) -> Iterator[object]:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
         patched.setattr("analogrig.devices.catalogue_device.CatalogueDevice.play", interrupted)
-        assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 130
+        assert command(tmp_path) == 130
     assert "interrupted: what is done is kept in" in capsys.readouterr().err
-    assert stored_trials(out) == 0
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 0
+    assert stored_trials(tmp_path / "out.sqlite") == 0
+    assert command(tmp_path) == 0
 
 
 def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     planned(tmp_path, "devices = ['serial:/dev/absent']\n", ["/dev/absent"])
-    options = ["--workers", "2", "--out", str(tmp_path / "out.sqlite"), "--allow", "/dev/absent"]
-    assert main(["campaign", str(tmp_path / "spec.toml"), *options]) == 2
+    assert command(tmp_path, "--allow", "/dev/absent", workers=2) == 2
     assert "port:/dev/absent is one device" in capsys.readouterr().err
 
 
