@@ -117,11 +117,16 @@ class Trial(NamedTuple):
         return self.outcome != "inconclusive"
 
 
-def _blank(count: int, changes: int, axes: int) -> Trials:
-    """So many trials without any result."""
+def _fields(changes: int, axes: int) -> np.dtype[np.void]:
+    """Type of an element of ``Trials``."""
     kinds = ("u1", "<u4", "<u4", "<u4", "u1", "<i4", "<i4", "<f4", "<u8", "<f4", object)
     shapes = ((), (), (), (), (changes,), (changes,), (changes,), (MOST_ERRORS,), (), (axes,), ())
-    trials = np.zeros(count, list(zip(COLUMNS, kinds, shapes, strict=True)))
+    return np.dtype(list(zip(COLUMNS, kinds, shapes, strict=True)))
+
+
+def _blank(count: int, changes: int, axes: int) -> Trials:
+    """So many trials without any result."""
+    trials = np.zeros(count, _fields(changes, axes))
     trials["latency_n"] = trials["bound_n"] = _NONE
     trials["error"], trials["why"] = np.nan, ""
     return trials
@@ -183,9 +188,10 @@ def decode(count: int, columns: Sequence[bytes], axes: int) -> Trials:
     """
     streams = dict(zip(COLUMNS, map(_inflate, columns), strict=True))
     width, rest = divmod(len(streams["change"]), count)
-    trials = _blank(count, width, axes)
-    if rest or any(len(streams[name]) != trials[name].nbytes for name in COLUMNS[:-1]):
+    fields = _fields(width, axes)
+    if rest or any(len(streams[name]) != count * fields[name].itemsize for name in COLUMNS[:-1]):
         raise ValueError("columns of different lengths")
+    trials = _blank(count, width, axes)
     for name in COLUMNS[:-1]:
         trials[name] = np.frombuffer(streams[name], trials.dtype[name].base).reshape(trials[name].shape)
     lines = streams["why"]

@@ -403,29 +403,23 @@ def _drawn(results: Results) -> list[PlottedQuantity]:
     ]
     across, down = (*(_axis(results.plan, axis) for axis in found.axes), "")[:2]
     keys = [(name, other) for name in names[0] for other in (names[1] if len(names) > 1 else [""])]
+    detected = [
+        _LATENCY.square(total / count if count else None, title=f"{number_of(count, 'change', form=',')} detected")
+        for total, count in zip(found.latency_n.ravel().tolist(), found.detected.ravel().tolist(), strict=True)
+    ]
+    missed = [
+        _MISSES.square(
+            total / count if count else None,
+            _at_most(independent(total, count).bounds[1]) if count else "",
+            f"{total:,} of {count:,} changes missed",
+        )
+        for total, count in zip(found.missed.ravel().tolist(), found.visible.ravel().tolist(), strict=True)
+    ]
     out = []
-    for quantity, sums, counts in (
-        (_LATENCY, found.latency_n, found.detected),
-        (_MISSES, found.missed, found.visible),
-    ):
-        squares = {
-            key: quantity.square(total / count if count else None, *_drawn_notes(quantity, total, count))
-            for key, total, count in zip(keys, sums.ravel().tolist(), counts.ravel().tolist(), strict=True)
-        }
-        maps = [Map("drawn values, middle of each bin", across, down, squares)]
-        out.append(dataclasses.replace(quantity, most=_most(each.value for each in squares.values()), maps=maps))
+    for quantity, squares in ((_LATENCY, detected), (_MISSES, missed)):
+        maps = [Map("drawn values, middle of each bin", across, down, dict(zip(keys, squares, strict=True)))]
+        out.append(dataclasses.replace(quantity, most=_most(each.value for each in squares), maps=maps))
     return out
-
-
-def _drawn_notes(quantity: PlottedQuantity, total: int, count: int) -> tuple[str, str]:
-    """Second line and tooltip of a bin."""
-    if quantity is _LATENCY:
-        return "", f"{number_of(count, 'change', form=',')} detected"
-    title = f"{total:,} of {count:,} changes missed"
-    if not count:
-        return "", title
-    bound = independent(total, count).bounds[1]
-    return _at_most(bound), title
 
 
 def _histograms(results: Results) -> Iterator[PlottedHistogram]:
