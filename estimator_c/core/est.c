@@ -52,7 +52,7 @@
 /// Value of bridged_n after an outlier: its y was predicted, and its u is known.
 #define OUTLIER_BRIDGED UINT8_MAX
 
-EST_SHARED void increment_long(uint32_t* const counter) {
+static void increment_long(uint32_t* const counter) {
     const uint32_t next = *counter + (uint32_t)1U;
     if (next > 0U) {  // cppcheck F5
         *counter = next;
@@ -112,7 +112,7 @@ bool est_config_valid(const est_config_t* const config) {
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
 /// Shift n values, newest first, by one place.
-EST_ROBUST_SHARED void shift(float* const x, const uint_fast8_t n, const float newest) {
+static void shift(float* const x, const uint_fast8_t n, const float newest) {
     EST_UNROLL
     for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
         x[i] = x[i - 1U];
@@ -146,11 +146,10 @@ static void follow_slip(est_t* const self, const bool late) {
 }
 
 /// Compute theta in the plain form of est.h, after the first coefficient of A.
-EST_SHARED void compute_plain(const est_t* const self, const est_shape_t given, float* const plain) {
-    plain[0] = 1.0F;
+static void compute_plain(const est_t* const self, const est_shape_t shape, float* const plain) {
+    float* const b = &plain[shape.na + 1U];
+    plain[0]       = 1.0F;
     (void)append(&plain[1], self->theta, EST_THETA_MAX);
-    const est_shape_t shape = est_shape_here(self->config, given);
-    float* const      b     = &plain[shape.na + 1U];
 #if EST_WITH_ROBUSTNESS
     if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
         b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
@@ -164,28 +163,26 @@ EST_SHARED void compute_plain(const est_t* const self, const est_shape_t given, 
 
 /// Compute the estimate of A, contracted: 1, c[0], ... With noise on the output, the noise of the equations is coloured
 /// by A (thesis section 3.5).
-EST_SHARED void contract_a(const est_t* const self, const est_shape_t shape, float* const out) {
-    const uint_fast8_t na     = est_shape_here(self->config, shape).na;
-    float              factor = 1.0F;
-    *out                      = 1.0F;
-    (void)append(&out[1], self->theta, na);
+static void contract_a(const est_t* const self, const est_shape_t shape, float* const out) {
+    float factor = 1.0F;
+    *out         = 1.0F;
+    (void)append(&out[1], self->theta, shape.na);
     if (est_delta_applies(self)) {
-        est_delta_to_plain(out, na);
+        est_delta_to_plain(out, shape.na);
     }
     EST_UNROLL
-    for (uint_fast8_t i = 1U; i <= na; i++) {
+    for (uint_fast8_t i = 1U; i <= shape.na; i++) {
         factor *= CONTRACTION;
         out[i] *= factor;
     }
 }
 
-EST_SHARED void refresh_prefilter(est_t* const self, const est_shape_t shape) {
-    const uint_fast8_t na                 = est_shape_here(self->config, shape).na;
-    float              a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
+static void refresh_prefilter(est_t* const self, const est_shape_t shape) {
+    float a[EST_NA_MAX + 1U] = { 0.0F };  // MISRA D2
     contract_a(self, shape, a);
     self->refresh_in = self->config->refresh_n;
     if (est_whitener_accepts(&a[1], EST_NA_MAX)) {
-        est_whitener_set(&self->whitener, &a[1], na);
+        est_whitener_set(&self->whitener, &a[1], shape.na);
         increment(&self->counters.refreshes);
     }
 }
@@ -241,7 +238,7 @@ static void gather(est_t* const self) {
 }
 
 /// Declare the samples so far unknown: the next equation must not use them.
-EST_SHARED void forget_samples(est_t* const self) {
+static void forget_samples(est_t* const self) {
     self->known     = false;
     self->pending_n = count_past(self->config);
     if (EST_WITH_EDGES) {
@@ -250,7 +247,7 @@ EST_SHARED void forget_samples(est_t* const self) {
 }
 
 /// Set theta to zero.
-EST_SHARED void clear_theta(est_t* const self) {
+static void clear_theta(est_t* const self) {
     clear(self->theta, EST_THETA_MAX);
     if (est_delta_applies(self)) {
         self->theta[0] = 1.0F;  // the first coefficient of A, which is no parameter
@@ -299,7 +296,7 @@ static bool same_bits(const float a, const float b) {
 
 /// True iff y has been constant for too long after an edge of u. The plant answers every edge within a few samples,
 /// so a constant y comes from a defective channel. While u rests, y may rest too.
-EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
+static bool is_stuck(est_t* const self, const float y, const bool edge) {
     if (!same_bits(y, self->y[0])) {
         self->same_n = 0U;
         return false;
@@ -315,7 +312,7 @@ EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
 
 /// Innovation of the last equation, with the present theta.
 static float last_innovation(const est_t* const self) {
-    const uint_fast8_t count = EST_FOR_SIZE ? EST_THETA_MAX : est_theta_count(self);  // the rest is zero
+    const uint_fast8_t count = est_theta_count(self);
     float              out   = self->whitener.past[0].x[0];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < count; i++) {
@@ -326,7 +323,7 @@ static float last_innovation(const est_t* const self) {
 #endif
 
 /// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
-EST_SHARED bool other_reading_leads(const est_t* const self) {
+static bool other_reading_leads(const est_t* const self) {
     return (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger);
 }
 
@@ -410,7 +407,7 @@ static void enter_edge(est_t* const self) {
 
 /// True iff the next sample may be predicted: the model is known, and the whitening has nearly settled. y must not be
 /// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
-EST_ROBUST_SHARED bool can_bridge(const est_t* const self) {
+static bool can_bridge(const est_t* const self) {
 #if EST_WITH_ROBUSTNESS
     return (((uint32_t)self->pending_n | self->trigger.quiet_n | self->same_n) == 0U) &&
            (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
@@ -489,7 +486,7 @@ EST_INLINE void watch_edges(est_t* const self, const float e, const float effect
 /// because the estimate has followed the recorded reading since.
 EST_INLINE void
 judge_readings(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float weight) {
-    const bool  same = !EST_FOR_SIZE && (self->doubt_n <= 1U);  // theta has not changed yet
+    const bool  same = self->doubt_n <= 1U;  // theta has not changed yet
     const float e =
         same ? equation->innovation : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     float share[EST_OTHER_READINGS];
@@ -602,7 +599,7 @@ static void raise_alarm(est_t* const self, est_step_t* const step) {
 
 /// Count a slip: edges of u come one sample earlier or later from now on. The samples so far belong to the old
 /// instants.
-EST_SHARED void note_slip(est_t* const self) {
+static void note_slip(est_t* const self) {
     self->renewal = est_trigger_settle_late(&self->trigger) ? EST_RENEWAL_LATE : EST_RENEWAL_EARLY;
     increment(&self->counters.slips);
     forget_samples(self);
@@ -753,21 +750,17 @@ EST_INLINE void watch_scale(est_t* const                self,
 }
 
 /// Limit P. Done in a step without other optional work, unless that comes too late.
-EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
+EST_INLINE void limit_factors(est_t* const self) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
-        if (EST_FOR_SIZE) {
-            est_factors_inflate(self, 1.0F);
-        } else {
-            est_factors_scale(&self->factors, self->config, shape, 1.0F);
-        }
+        est_factors_inflate(self, 1.0F);
     }
 }
 
 /// Replace the y of an equation by its prediction, the one whose innovation is zero. With C close to A the next
 /// equations then lose nothing but the information of this sample. A model that is not stable can predict what no plant
 /// does; the equations then begin anew.
-EST_ROBUST_SHARED void predict(est_t* const self, const float innovation) {
+static void predict(est_t* const self, const float innovation) {
     float* const past = self->whitener.past[0].x;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -804,7 +797,7 @@ static bool returns_at_edge(const est_t* const self) {
 
 /// True iff this innovation alone lifted the statistic over the ceiling, and nothing else explains it. After a change of
 /// the plant the next innovation is large too. `term`: of the innovation in the cumulative sum.
-EST_ROBUST_SHARED bool is_lone_outlier(const est_t* const self, const float term) {
+static bool is_lone_outlier(const est_t* const self, const float term) {
 #if EST_WITH_ROBUSTNESS
     if (may_be_displaced(self)) {
         return false;
@@ -823,7 +816,7 @@ EST_ROBUST_SHARED bool is_lone_outlier(const est_t* const self, const float term
 
 /// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic. A doubt about edges
 /// ends, since its readings have lost their base. The next innovation decides.
-EST_ROBUST_SHARED void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
+static void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
 #if EST_WITH_ROBUSTNESS
     self->bridged_n = OUTLIER_BRIDGED;
     predict(self, innovation);
@@ -882,8 +875,8 @@ EST_INLINE void enter_innovation(
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     float                     x[EST_THETA_MAX + 2U];  // the last one is spare: gcc warns of an access that never is
-    float                     gain[EST_THETA_MAX] EST_ZEROED;  // MISRA D2
-    est_equation_t            equation = { .x = x, .gain = gain };
+    float                     gain[EST_THETA_MAX] = { 0.0F };  // MISRA D2
+    est_equation_t            equation            = { .x = x, .gain = gain };
     float                     weight_min;
     if (self->settled) {
         equation.variance = 1.0F;
@@ -893,7 +886,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         weight_min        = EST_WEIGHT_OVERDUE;
     }
     if (self->factors.weight < weight_min) {
-        limit_factors(self, shape);
+        limit_factors(self);
     }
     est_equation_fill(self, shape, y, equation.x);
     shift_y(self, y);
@@ -941,23 +934,6 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     } else {
         // C is constant
     }
-}
-
-/// Enter the equation with code specialised for the two usual shapes.
-static void dispatch_equation(est_t* const self, const float y, est_step_t* const step) {
-    const est_shape_t shape = est_shape_of(self->config);
-#if EST_SPECIALISED
-    const est_shape_t locked = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
-    if (same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
-        enter_equation(self, EST_SHAPE_FREE_RUNNING, y, step);
-        return;
-    }
-    if (same_shape(shape, locked)) {
-        enter_equation(self, locked, y, step);
-        return;
-    }
-#endif
-    enter_equation(self, shape, y, step);
 }
 
 // ---------------------------------------------          API           ---------------------------------------------
@@ -1008,7 +984,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         has_equation    = (status != EST_GATHERING) && enter_gap(self, status, &y);
     }
     if (has_equation) {
-        dispatch_equation(self, y, &step);
+        enter_equation(self, est_shape_of(self->config), y, &step);
     }
     step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);
     return step;
@@ -1021,29 +997,16 @@ uint8_t est_theta_count(const est_t* const self) {
 
 float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
-#if EST_WITH_ROBUSTNESS
     float plain[EST_THETA_MAX + 1U];
     compute_plain(self, est_shape_of(self->config), plain);
     return plain[index + 1U];
-#else
-    return self->theta[index];
-#endif
 }
 
 void est_copy_theta(const est_t* const self, float* const out) {
     EST_ASSERT((self != NULL) && (out != NULL));
-#if EST_WITH_ROBUSTNESS
-    const est_shape_t shape = est_shape_of(self->config);
-    float             plain[EST_THETA_MAX + 1U];
-    if (EST_SPECIALISED && same_shape(shape, EST_SHAPE_FREE_RUNNING)) {
-        compute_plain(self, EST_SHAPE_FREE_RUNNING, plain);
-    } else {
-        compute_plain(self, shape, plain);
-    }
+    float plain[EST_THETA_MAX + 1U];
+    compute_plain(self, est_shape_of(self->config), plain);
     (void)append(out, &plain[1], EST_THETA_MAX);
-#else
-    (void)append(out, self->theta, EST_THETA_MAX);
-#endif
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {
@@ -1061,8 +1024,7 @@ float est_variance(const est_t* const self, const uint8_t index) {
         factor[shape.na + shape.nb] -= self->reference_u;
     }
 #endif
-    const uint_fast8_t count = EST_FOR_SIZE ? EST_THETA_MAX : est_shape_count(shape);  // the rest is zero
-    return est_factors_variance(&self->factors, count, &factor[1]);
+    return est_factors_variance(&self->factors, est_shape_count(shape), &factor[1]);
 }
 
 float est_noise_variance(const est_t* const self) {

@@ -26,7 +26,7 @@ EST_INLINE bool est_delta_applies(const est_t* const self) {
 }
 
 /// Replace order + 1 consecutive values, newest first, by D^order x(k), D^(order-1) x(k-1), ..., x(k-order).
-EST_ROBUST_SHARED void est_delta_difference(float* const x, const uint_fast8_t order) {
+static inline void est_delta_difference(float* const x, const uint_fast8_t order) {
     EST_UNROLL
     for (uint_fast8_t rest = EST_WITH_ROBUSTNESS ? order : 0U; rest > 0U; rest--) {
         EST_UNROLL
@@ -37,13 +37,13 @@ EST_ROBUST_SHARED void est_delta_difference(float* const x, const uint_fast8_t o
 }
 
 /// Replace y(k), y(k-1), ..., u(k-nk), ... by their differences, and a gradient in plain coefficients likewise.
-EST_ROBUST_SHARED void est_delta_difference_both(float* const x, const uint_fast8_t na, const uint_fast8_t nb) {
+static inline void est_delta_difference_both(float* const x, const uint_fast8_t na, const uint_fast8_t nb) {
     est_delta_difference(x, na);
     est_delta_difference(&x[na + 1U], (uint_fast8_t)(nb - 1U));
 }
 
 /// Add to each coefficient `factor` times the one before it: n passes, each over one coefficient more than the last.
-EST_ROBUST_SHARED void est_delta_add(float* const x, const uint_fast8_t order, const float factor) {
+static inline void est_delta_add(float* const x, const uint_fast8_t order, const float factor) {
     EST_UNROLL
     for (uint_fast8_t n = 1U; n <= (EST_WITH_ROBUSTNESS ? order : 0U); n++) {
         EST_UNROLL

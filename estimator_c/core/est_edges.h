@@ -68,8 +68,7 @@ est_edges_begin(est_edges_t* const self, const est_config_t* const config, const
 /// changes in the sample before it was recorded, with a late one in the sample after. u since the beginning of the
 /// doubt is therefore shifted by one sample against y, including its noise. share[0] is that of early edges, share[1]
 /// that of late ones with the opposite sign.
-EST_ROBUST_SHARED void est_edges_shares(est_t* const self, const est_shape_t of, float* const share) {
-    const est_shape_t  shape = est_shape_here(self->config, of);
+static inline void est_edges_shares(est_t* const self, const est_shape_t shape, float* const share) {
     est_edges_t* const edges = &self->edges;
     share[0]                 = 0.0F;
     share[1]                 = 0.0F;

@@ -39,7 +39,7 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
 }
 
 /// Prediction error of y(k) with this theta of n parameters.
-EST_SHARED float est_equation_residual(const float* const x, const float* const theta, const uint_fast8_t n) {
+static inline float est_equation_residual(const float* const x, const float* const theta, const uint_fast8_t n) {
     float out = x[0];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < n; i++) {
@@ -47,14 +47,6 @@ EST_SHARED float est_equation_residual(const float* const x, const float* const 
     }
     return out;
 }
-
-/// Initialiser against false warnings: gcc does not see that each gain is written before it is read. Omitted in a
-/// build for size, where gcc would call memset().
-#if EST_FOR_SIZE
-#define EST_ZEROED
-#else
-#define EST_ZEROED = { 0.0F }
-#endif
 
 /// Whiten the equation in place and compute its innovation.
 EST_INLINE void est_equation_whiten(est_equation_t* const equation,

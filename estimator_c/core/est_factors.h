@@ -37,7 +37,7 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
 }
 
 /// est_factors_scale() with the shape of the configuration.
-EST_SHARED void est_factors_inflate(est_t* const self, const float factor) {
+static inline void est_factors_inflate(est_t* const self, const float factor) {
     est_factors_scale(&self->factors, self->config, est_shape_of(self->config), factor);
 }
 

@@ -86,12 +86,12 @@
 #if EST_WITH_ROBUSTNESS
 
 /// Factor of the noise variance in the scale.
-EST_SHARED float est_scale_factor(const est_scale_t* const self) {
+static inline float est_scale_factor(const est_scale_t* const self) {
     return self->inflation * (1.0F + (EST_DISPERSION_GAIN * est_max(self->dispersion - EST_DISPERSED, 0.0F)));
 }
 
 /// Begin a block. The scale determines the weight of a squared innovation in the cumulative sum.
-EST_SHARED void est_scale_restart(est_t* const estimator) {
+static inline void est_scale_restart(est_t* const estimator) {
     est_scale_t* const self = &estimator->scale;
     self->weight =
         EST_CUSUM_GAIN / (estimator->noise_variance * est_scale_factor(self) * (1.0F + (EST_MARGIN * self->share)));
@@ -197,7 +197,7 @@ static inline void est_scale_begin_trial(est_scale_t* const self) {
 static inline bool est_scale_on_trial(const est_scale_t* const self) { return self->phase > EST_PHASE_TRIAL; }
 
 /// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
-EST_SHARED void est_scale_conclude(est_t* const estimator) {
+static inline void est_scale_conclude(est_t* const estimator) {
     est_scale_t* const self      = &estimator->scale;
     const bool         justified = (self->phase > (EST_PHASE_TRIAL + EST_TRIAL_LEAST_N)) && (self->sum > 0.0F);
     if (justified && ((self->sum * self->weight) > EST_PLAIN)) {

@@ -48,7 +48,7 @@ static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
 }
 
 /// Smaller statistic of the two other readings: that of the better explanation.
-EST_SHARED float est_trigger_best_rival(const est_trigger_t* const self) {
+static inline float est_trigger_best_rival(const est_trigger_t* const self) {
     return est_min(self->rival[0], self->rival[1]);
 }
 
@@ -106,7 +106,7 @@ EST_INLINE float est_trigger_term(const float innovation, const float weight) {
 }
 
 /// Add one term to a cumulative sum.
-EST_SHARED float est_trigger_sum(const float before, const float term) {
+static inline float est_trigger_sum(const float before, const float term) {
     const float sum = before + (term - EST_CUSUM_DRIFT);
     return est_max(0.0F, sum);
 }

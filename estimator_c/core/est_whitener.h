@@ -18,7 +18,7 @@
 
 /// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin. By the Schur-Cohn
 /// recursion: all zeros are inside iff every reflection coefficient is below 1.
-EST_SHARED bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
+static inline bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
     float a[EST_NA_MAX] = { 0.0F };  // MISRA D2
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < na; i++) {
@@ -44,7 +44,7 @@ EST_SHARED bool est_whitener_accepts(const float* const c, const uint_fast8_t na
 
 /// Store the gains of the newest equation and determine the filter from them. With D = 1 - z^-1, its equation D^n w(k) = x(k) - sum of step[j] D^j
 /// w(k-1) is that of x(k) = w(k) + gain[0] w(k-1) + ..., without the rounding of products that cancel.
-EST_SHARED void store_gains(est_whitener_t* const self, const float* const gain) {
+static inline void store_gains(est_whitener_t* const self, const float* const gain) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_GAIN_COLUMNS; i++) {
         self->gain[0][i] = gain[i];
@@ -67,7 +67,7 @@ EST_SHARED void store_gains(est_whitener_t* const self, const float* const gain)
 }
 
 /// Set the first na coefficients of C. The filter continues from its present state.
-EST_SHARED void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
+static inline void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < na; i++) {
         self->c[i] = c[i];
@@ -145,7 +145,7 @@ EST_INLINE const float* est_filter_of(const est_whitener_t* const self) {
 }
 
 /// Filter one sample of one signal. Gains beyond the order of C are zero: a loop of fixed length is faster.
-EST_SHARED float est_filter(const float* const gain, est_past_t* const past, const float x) {
+static inline float est_filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
 #if EST_WITH_ROBUSTNESS
     EST_UNROLL

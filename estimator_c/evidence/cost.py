@@ -104,8 +104,6 @@ SMALL = Orders(2, 2, 1, 0)
 LARGE = Orders(2, 3, 0, 1)
 FREE = Orders(2, 3, 0, 1, may_slip=True)
 """The default configuration."""
-OTHER = Orders(2, 2, 1, 1)
-"""A shape for which est.c has no code of its own."""
 
 # A build with the default trigger and nothing that can be left out; its configuration has been checked on the host.
 TRIGGER_ALONE = tuple(
@@ -395,8 +393,6 @@ def instructions(bench: ImageRunner) -> Iterator[Cost]:
             yield from bench.estimator(M4F, orders, fixed=fixed).costs(limit)
             if not orders.may_slip:
                 yield from bench.estimator(M4F, orders, fixed=fixed, alone=True).costs(limit)
-    other = bench.estimator(M4F, OTHER)
-    yield Cost(f"{other.name}, not one of the usual shapes", other.typical, "instructions")
 
 
 def soft_float(bench: ImageRunner) -> Iterator[Cost]:

@@ -119,7 +119,7 @@
 static float number(const uint32_t n) { return (float)n; }
 
 /// a / b; 0 unless b is positive.
-EST_SHARED float quotient(const float a, const float b) {
+static float quotient(const float a, const float b) {
     float out = 0.0F;
     if (b > 0.0F) {
         out = a / b;
@@ -235,12 +235,12 @@ static float power_at(const est_fit_watch_t* const self, const uint32_t line) {
 }
 
 /// Power of the larger neighbour of the peak.
-EST_SHARED float neighbour_power(const est_fit_watch_t* const self) {
+static float neighbour_power(const est_fit_watch_t* const self) {
     return est_max(power_at(self, self->peak + 1U), power_at(self, self->peak - 1U));
 }
 
 /// Power of the peak, which may lie between two lines.
-EST_SHARED float peak_power(const est_fit_watch_t* const self) { return self->now[self->peak] + neighbour_power(self); }
+static float peak_power(const est_fit_watch_t* const self) { return self->now[self->peak] + neighbour_power(self); }
 
 /// Frequency of the line at the peak, from the powers of the peak and its larger neighbour [cycles per sample].
 static float find_frequency(const est_fit_watch_t* const self) {
@@ -262,35 +262,31 @@ static float declared_variance(const est_fit_watch_t* const self) {
 }
 
 /// Number of innovations in the block.
-EST_SHARED float count_of(const est_fit_watch_t* const self) {
-    return number(EST_FIT_BLOCK_N) - (float)self->sums.lost_n;
-}
+static float count_of(const est_fit_watch_t* const self) { return number(EST_FIT_BLOCK_N) - (float)self->sums.lost_n; }
 
-EST_SHARED float variance_of(const est_fit_watch_t* const self) { return quotient(self->sums.squares, count_of(self)); }
+static float variance_of(const est_fit_watch_t* const self) { return quotient(self->sums.squares, count_of(self)); }
 
 /// This variance, or that of the resolution if that is more.
-EST_SHARED float resolved(const est_fit_watch_t* const self, const float variance) {
+static float resolved(const est_fit_watch_t* const self, const float variance) {
     return est_max(variance, RESOLUTION * self->config->noise_variance);
 }
 
 /// Variance to which the statistics relate: that of the innovations, or the declared one or that of the resolution if
 /// these are more. The structure of innovations that are smaller than promised does no harm.
-EST_SHARED float reference_variance(const est_fit_watch_t* const self) {
+static float reference_variance(const est_fit_watch_t* const self) {
     return est_max(resolved(self, variance_of(self)), declared_variance(self));
 }
 
 /// Number of innovations in the spectrum.
-EST_SHARED float clear_count_of(const est_fit_watch_t* const self) {
-    return count_of(self) - (float)self->sums.doubted_n;
-}
+static float clear_count_of(const est_fit_watch_t* const self) { return count_of(self) - (float)self->sums.doubted_n; }
 
 /// Energy in the spectrum at that variance.
-EST_SHARED float clear_energy_of(const est_fit_watch_t* const self) {
+static float clear_energy_of(const est_fit_watch_t* const self) {
     return reference_variance(self) * clear_count_of(self);
 }
 
 /// Share of the energy of the drawn innovations that is explained.
-EST_SHARED float share_of(const est_fit_watch_t* const self, const float explained) {
+static float share_of(const est_fit_watch_t* const self, const float explained) {
     return quotient(explained, reference_variance(self) * (float)self->sums.drawn_n);
 }
 
@@ -552,7 +548,7 @@ static void evaluate_region(est_fit_watch_t* const self, const uint32_t region) 
 }
 
 /// Do the share of the evaluation that falls to one of the samples after the block.
-EST_SHARED void evaluate(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t slot) {
+static void evaluate(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t slot) {
     if ((slot >= ENTERED_END) && (slot < EVALUATED_END)) {
         const uint32_t turn = slot - ENTERED_END;
         for (uint32_t line = EVALUATED_N * turn; (line < (EVALUATED_N * (turn + 1U))) && (line < EST_FIT_LINES_N);

@@ -141,7 +141,7 @@ typedef struct {
 EST_RESULT_USED bool est_fit_init(est_fit_watch_t* self, const est_config_t* config);
 
 /// Enter the result of an est_step(); to be called after every step. Cost: typically 62
-/// instructions on a Cortex-M4F, 105 on average, at most 272 (make cost). May be called from an interrupt.
+/// instructions on a Cortex-M4F, 105 on average, at most 273 (make cost). May be called from an interrupt.
 void est_fit_enter(est_fit_watch_t* self, const est_t* estimator, est_step_t step);
 
 /// Present misfit. Cost: constant. May be called from an interrupt.

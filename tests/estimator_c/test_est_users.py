@@ -162,12 +162,12 @@ def test_every_field_of_a_configuration_has_a_comment_with_its_unit_or_range() -
     [
         *(
             pytest.param(processor, level, most, marks=() if level == "-Os" else pytest.mark.heavy)
-            for processor, most in ((stack.CORTEX_M4F, 420), (stack.CORTEX_M0, 420), (stack.AVR, 400))
+            for processor, most in ((stack.CORTEX_M4F, 320), (stack.CORTEX_M0, 320), (stack.AVR, 240))
             for level in ("-Os", "-O2", "-O3")
         ),
-        (stack.CORTEX_M4F, "-O0", 2770),
-        (stack.CORTEX_M0, "-O0", 2770),
-        (stack.AVR, "-O0", 1810),
+        (stack.CORTEX_M4F, "-O0", 1190),
+        (stack.CORTEX_M0, "-O0", 1190),
+        (stack.AVR, "-O0", 760),
     ],
     ids=lambda value: value.name if isinstance(value, stack.Toolchain) else str(value),
 )

@@ -147,7 +147,7 @@ def test_example_fits_an_atmega328p(tmp_path: Path) -> None:
     flags = ("-std=c99", "-mmcu=atmega328p", "-Os", "-DNDEBUG", *WARNINGS, f"-I{ESTIMATOR / 'core'}")
     run("avr-gcc", *flags, EXAMPLE, ESTIMATOR / "core" / "est.c", "-o", tmp_path / "watch.elf")
     text, data, bss, *_ = run("avr-size", tmp_path / "watch.elf").splitlines()[1].split()
-    assert int(text) + int(data) <= 18.5 * 1024, "of 32 kB of flash"
+    assert int(text) + int(data) <= 20.2 * 1024, "of 32 kB of flash"
     assert int(data) + int(bss) <= 544, "of 2 kB of RAM"
 
 
