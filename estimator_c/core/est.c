@@ -2,11 +2,16 @@
 
 #include "est.h"
 #include "est_assert.h"
-#include "est_correlation.h"
 #include "est_edges.h"
 #include "est_equation.h"
-#include "est_scale.h"
+#include "est_samples.h"
 #include "est_trigger.h"
+
+#if EST_WITH_ROBUSTNESS
+#include "est_robust.h"
+#else
+#include "est_lean.h"
+#endif
 
 #include <float.h>
 #include <stddef.h>
@@ -37,20 +42,8 @@
 /// Samples after an edge of u within which another one is part of a slope: no edge that could slip.
 #define SLOPE_N 5U
 
-/// Samples after an edge in which an outlier is one at the edge, and bits of edge_outliers for the two edges before.
-#define AT_EDGE_N 3U
-#define EDGES_BEFORE 6U
-
 /// Square of the smallest ratio of the range of the codes to the standard deviation of the noise.
 #define NOISE_SHARE 1024.0F
-
-/// Longest gap that is bridged by predicted samples, and smallest precision of the whitening at which it is. Soon after
-/// a start the prediction would rest on few noisy samples.
-#define BRIDGED_MAX 8U
-#define BRIDGE_PRECISION 0.6F
-
-/// Value of bridged_n after an outlier: its y was predicted, and its u is known.
-#define OUTLIER_BRIDGED UINT8_MAX
 
 static void increment_long(uint32_t* const counter) {
     const uint32_t next = *counter + (uint32_t)1U;
@@ -58,8 +51,6 @@ static void increment_long(uint32_t* const counter) {
         *counter = next;
     }
 }
-
-static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
@@ -111,24 +102,6 @@ bool est_config_valid(const est_config_t* const config) {
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
-/// Shift n values, newest first, by one place.
-static void shift(float* const x, const uint_fast8_t n, const float newest) {
-    EST_UNROLL
-    for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
-        x[i] = x[i - 1U];
-    }
-    x[0] = newest;
-}
-
-static void shift_u(est_t* const self, const float newest) { shift(self->u, EST_INPUTS_KEPT, newest); }
-
-static void shift_y(est_t* const self, const float newest) { shift(self->y, EST_NA_MAX, newest); }
-
-/// Number of samples before its own that an equation needs.
-static inline uint8_t count_past(const est_config_t* const config) {
-    return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
-}
-
 /// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
 /// u(k), or the reverse. Every parameter becomes less certain.
 static void follow_slip(est_t* const self, const bool late) {
@@ -150,11 +123,7 @@ static void compute_plain(const est_t* const self, const est_shape_t shape, floa
     float* const b = &plain[shape.na + 1U];
     plain[0]       = 1.0F;
     (void)append(&plain[1], self->theta, EST_THETA_MAX);
-#if EST_WITH_ROBUSTNESS
-    if (shape.offset > 0U) {  // A(1) and B(1) are the last parameters of the delta form
-        b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
-    }
-#endif
+    add_reference(self, shape, plain);
     if (est_delta_applies(self)) {
         est_delta_to_plain(plain, shape.na);
         est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
@@ -213,15 +182,6 @@ EST_INLINE void forget_residuals(est_t* const self) {
 #endif
 }
 
-/// Forget the last innovations: the next one does not follow them.
-EST_INLINE void forget_innovations(est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    est_correlation_forget(&self->correlation);
-#else
-    (void)self;
-#endif
-}
-
 /// Count one sample towards the next complete equation. The step has time for the work that an alarm or a slip left,
 /// because it has no equation of its own.
 static void gather(est_t* const self) {
@@ -237,15 +197,6 @@ static void gather(est_t* const self) {
     }
 }
 
-/// Declare the samples so far unknown: the next equation must not use them.
-static void forget_samples(est_t* const self) {
-    self->known     = false;
-    self->pending_n = count_past(self->config);
-    if (EST_WITH_EDGES) {
-        self->doubt_n = 0U;
-    }
-}
-
 /// Set theta to zero.
 static void clear_theta(est_t* const self) {
     clear(self->theta, EST_THETA_MAX);
@@ -255,28 +206,6 @@ static void clear_theta(est_t* const self) {
         *append(self->theta, &self->theta[1], self->config->na) = 0.0F;
     }
 }
-
-/// Subtract the reference from the codes. The first sample becomes the reference: the samples that follow are then
-/// small numbers, which float32 rounds less. Without an offset in the model, codes are what they are.
-EST_INLINE void subtract_reference(est_t* const self, float* const u, float* const y) {
-#if EST_WITH_ROBUSTNESS
-    if (est_shape_of(self->config).offset > 0U) {
-        if ((self->counters.updated == 0U) && est_delta_applies(self)) {
-            self->reference_u = *u;
-            self->reference_y = *y;
-        }
-        *u -= self->reference_u;
-        *y -= self->reference_y;
-    }
-#else
-    (void)self;
-    (void)u;
-    (void)y;
-#endif
-}
-
-/// True iff the code is finite and within +-EST_CODE_LIMIT.
-static bool is_plausible(const float code) { return est_magnitude(code) <= EST_CODE_LIMIT; }
 
 /// True iff the code is within the range of the converter. False for NaN and the infinities.
 static bool in_range(const est_config_t* const config, const float code) {
@@ -308,20 +237,6 @@ static bool is_stuck(est_t* const self, const float y, const bool edge) {
     return (self->config->stuck_n > 0U) && (self->same_n >= self->config->stuck_n);
 }
 
-#if EST_WITH_ROBUSTNESS
-
-/// Innovation of the last equation, with the present theta.
-static float last_innovation(const est_t* const self) {
-    const uint_fast8_t count = est_theta_count(self);
-    float              out   = self->whitener.past[0].x[0];
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < count; i++) {
-        out -= self->whitener.past[i + 1U].x[0] * self->theta[i];
-    }
-    return out;
-}
-#endif
-
 /// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
 static bool other_reading_leads(const est_t* const self) {
     return (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger);
@@ -337,48 +252,7 @@ static void doubt_edge(est_t* const self) {
     self->doubt_n    = 1U;
     est_edges_begin(&self->edges, self->config, self->theta, step);
     est_trigger_begin_doubt(&self->trigger);
-#if EST_WITH_ROBUSTNESS
-    est_edges_begin_comparison(&self->edges, last_innovation(self));
-#endif
-}
-
-/// Position of the edges: as configured, unless the innovations show that it varies.
-EST_INLINE est_edge_instants_t edge_instants_of(const est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    if (self->edges_vary) {
-        return EST_EDGES_ANYWHERE;
-    }
-#endif
-    return self->config->edge_instants;
-}
-
-/// True while the last alarm is on trial: theta before the alarm occupies the place of theta before an edge.
-EST_INLINE bool is_on_trial(const est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    return est_scale_on_trial(&self->scale);
-#else
-    (void)self;
-    return false;
-#endif
-}
-
-/// True iff the previous sample is missing, and was predicted.
-static bool in_gap(const est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    return (self->bridged_n > 0U) && (self->bridged_n <= BRIDGED_MAX);
-#else
-    (void)self;
-    return false;
-#endif
-}
-
-/// End a bridge: the y of the present sample is not predicted.
-EST_INLINE void end_bridge(est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    self->bridged_n = 0U;
-#else
-    (void)self;
-#endif
+    begin_comparison(self);
 }
 
 static void enter_edge(est_t* const self) {
@@ -387,9 +261,7 @@ static void enter_edge(est_t* const self) {
         forget_samples(self);
         return;
     }
-#if EST_WITH_ROBUSTNESS
-    self->correlation.edge_outliers = (uint8_t)(self->correlation.edge_outliers << 1U);
-#endif
+    count_edge(self);
     const bool slope = self->edge_age_n < SLOPE_N;
     self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
@@ -403,19 +275,6 @@ static void enter_edge(est_t* const self) {
     } else {
         // the b's absorb the edge
     }
-}
-
-/// True iff the next sample may be predicted: the model is known, and the whitening has nearly settled. y must not be
-/// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
-static bool can_bridge(const est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    return (((uint32_t)self->pending_n | self->trigger.quiet_n | self->same_n) == 0U) &&
-           (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
-           (est_shape_of(self->config).nc == 0U);
-#else
-    (void)self;
-    return false;
-#endif
 }
 
 /// Subtract the reference and enter u(k). Return EST_GATHERING while the equation of this sample needs unknown
@@ -464,23 +323,6 @@ static est_status_t examine(est_t* const self, const est_sample_t sample, float*
 }
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
-
-/// Compare an innovation after an edge with the effect of a displaced edge. If every edge is displaced by another part
-/// of an interval, edges come anywhere from now on. The innovations so far are those of the wrong model.
-EST_INLINE void watch_edges(est_t* const self, const float e, const float effect) {
-#if EST_WITH_ROBUSTNESS
-    est_edges_compare(&self->edges, e, effect);
-    if ((self->doubt_n >= EST_DOUBT_N) && est_edges_displaced(&self->edges)) {
-        self->edges_vary  = true;
-        self->correlation = (est_correlation_t){ .work = 0U };
-        est_scale_forgive(self);
-    }
-#else
-    (void)self;
-    (void)e;
-    (void)effect;
-#endif
-}
 
 /// Enter the innovation under the other readings of the edges in doubt. They are compared with theta before the doubt,
 /// because the estimate has followed the recorded reading since.
@@ -559,23 +401,6 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
 
-/// Put an alarm of the cumulative sum on trial, unless theta has overflown: the present estimate is kept and compared
-/// with the next one. An earlier trial ends.
-static void put_on_trial(est_t* const self, const bool overflown) {
-#if EST_WITH_ROBUSTNESS
-    if (est_scale_on_trial(&self->scale)) {
-        est_scale_conclude(self);
-    }
-    if (!overflown && is_cusum(self->config)) {
-        est_scale_begin_trial(&self->scale);
-        (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
-    }
-#else
-    (void)self;
-    (void)overflown;
-#endif
-}
-
 /// Raise an alarm. The samples so far belong to the plant before the change. Extreme data can make theta overflow; the
 /// statistic then overflows too, and the estimate is discarded.
 static void raise_alarm(est_t* const self, est_step_t* const step) {
@@ -624,17 +449,10 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
             }
         }
     }
-#if EST_WITH_ROBUSTNESS
     if (self->known) {
-        self->bridged_n++;
-        shift_u(self, self->u[0]);
-        *y = self->y[0];
-        increment(&self->edge_age_n);
+        cross_gap(self, y);
         return true;
     }
-#else
-    (void)y;
-#endif
     forget_samples(self);
     return false;
 }
@@ -645,130 +463,11 @@ static void walk(est_t* const self) {
     est_factors_inflate(self, 1.0F);
 }
 
-/// Weight of a squared innovation of unit precision in the cumulative sum.
-EST_INLINE float weight_of(const est_t* const self) {
-#if EST_WITH_ROBUSTNESS
-    return self->scale.weight;
-#else
-    return EST_CUSUM_GAIN / self->noise_variance;
-#endif
-}
-
-#if EST_WITH_ROBUSTNESS
-
-/// Let the next innovation raise an alarm if the blocks of late were high. `mean`: mean square of the newest one.
-static void find_hidden_change(est_t* const self, const float mean) {
-    est_scale_t* const scale = &self->scale;
-    if ((self->trigger.quiet_n > 0U) || !self->config->noise_estimated) {
-        scale->high_n = 0U;
-        return;
-    }
-    est_scale_count(scale, mean >= (EST_HIGH * self->noise_variance));
-    if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {  // a doubt comes first
-        scale->high_n           = 0U;
-        self->trigger.statistic = 2.0F * self->config->trigger.ceiling;
-    }
-}
-
-/// Let correlation and dispersion of the innovations follow a complete block of this mean square. The dispersion of
-/// squares without peaks does not count. Neither does it before the trigger is armed, while theta settles.
-static void follow_shape(est_t* const self, const float mean) {
-    const bool               armed       = self->trigger.quiet_n == 0U;
-    est_correlation_t* const correlation = &self->correlation;
-    est_scale_t* const       scale       = &self->scale;
-    if ((correlation->work & EST_WORK_LAGS) != 0U) {
-        est_correlation_follow(correlation, scale->product, mean, self->noise_variance,
-                               armed ? EST_PARTIAL_SHARE : EST_PARTIAL_WARM);
-    }
-    if (armed && !est_correlation_smooth(correlation)) {
-        est_scale_disperse(scale, mean / self->noise_variance);
-    } else {
-        scale->dispersion = 1.0F;
-    }
-}
-
-/// Update the scale after a block, by one stage. A block that ends with a large statistic may contain a change and is
-/// discarded.
-static void renew_scale(est_t* const self) {
-    est_scale_t* const scale = &self->scale;
-    if (scale->phase == EST_PHASE_END) {
-        est_scale_relax(scale);
-        est_scale_restart(self);
-        return;
-    }
-    const float mean = est_scale_mean(scale);
-    if (scale->phase == EST_PHASE_CHANGE) {
-        if (is_cusum(self->config)) {
-            find_hidden_change(self, mean);
-            est_correlation_restart(&self->correlation);
-        }
-    } else if (scale->phase == EST_PHASE_NOISE) {
-        est_scale_follow(self, mean);
-    } else if (self->config->noise_estimated && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
-        follow_shape(self, mean);
-    } else {
-        scale->phase = EST_PHASE_NOISE;  // the block is discarded, and its noise variance with it
-    }
-    scale->phase++;
-}
-
-/// Continue the trial of the last alarm by one equation.
-EST_INLINE void
-try_alarm(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float precision) {
-    const float old = est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
-    const float e   = equation->innovation;
-    if (!est_scale_try(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
-        est_scale_conclude(self);
-    }
-}
-#endif
-
-/// Enter the term of an innovation into the scale. Updates wait for a step without other optional work.
-EST_INLINE void watch_scale(est_t* const                self,
-                            const est_shape_t           shape,
-                            const est_equation_t* const equation,
-                            const float                 term,
-                            const float                 precision) {
-#if EST_WITH_ROBUSTNESS
-    if (est_scale_enter(&self->scale, term)) {
-        return;
-    }
-    if (est_scale_on_trial(&self->scale)) {
-        try_alarm(self, shape, equation, precision);
-    } else if (self->renewal == EST_RENEWAL_NONE) {
-        renew_scale(self);
-    } else {
-        // the block waits
-    }
-#else
-    (void)self;
-    (void)shape;
-    (void)equation;
-    (void)term;
-    (void)precision;
-#endif
-}
-
 /// Limit P. Done in a step without other optional work, unless that comes too late.
 EST_INLINE void limit_factors(est_t* const self) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
         est_factors_inflate(self, 1.0F);
-    }
-}
-
-/// Replace the y of an equation by its prediction, the one whose innovation is zero. With C close to A the next
-/// equations then lose nothing but the information of this sample. A model that is not stable can predict what no plant
-/// does; the equations then begin anew.
-static void predict(est_t* const self, const float innovation) {
-    float* const past = self->whitener.past[0].x;
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        past[i] -= innovation;  // the differences contain y(k) with the factor 1
-    }
-    self->y[0] -= innovation;
-    if (!is_plausible(self->y[0])) {
-        forget_samples(self);
     }
 }
 
@@ -781,62 +480,6 @@ EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float i
     predict(self, innovation);
 }
 
-#if EST_WITH_ROBUSTNESS
-
-/// True iff another reading of the edges in doubt may explain the innovations.
-static bool may_be_displaced(const est_t* const self) {
-    return (self->doubt_n > 0U) &&
-           (est_trigger_best_rival(&self->trigger) < (EST_LONE_EXPLAINED * self->config->trigger.ceiling));
-}
-
-/// True iff an outlier comes right after an edge, as at one of the two edges before: a poor model, and no interference.
-static bool returns_at_edge(const est_t* const self) {
-    return (self->edge_age_n < AT_EDGE_N) && ((self->correlation.edge_outliers & EDGES_BEFORE) != 0U);
-}
-#endif
-
-/// True iff this innovation alone lifted the statistic over the ceiling, and nothing else explains it. After a change of
-/// the plant the next innovation is large too. `term`: of the innovation in the cumulative sum.
-static bool is_lone_outlier(const est_t* const self, const float term) {
-#if EST_WITH_ROBUSTNESS
-    if (may_be_displaced(self)) {
-        return false;
-    }
-    const float reached = self->trigger.statistic + est_max(self->correlation.lead, 0.0F);  // sum of the first reading
-    const float before  = (reached - term) + EST_CUSUM_DRIFT;
-    const float least   = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
-    return (term > est_max(before * EST_LONE_RATIO, least)) && (term < FLT_MAX) && (self->bridged_n == 0U) &&
-           is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
-#else
-    (void)self;
-    (void)term;
-    return false;
-#endif
-}
-
-/// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic. A doubt about edges
-/// ends, since its readings have lost their base. The next innovation decides.
-static void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
-#if EST_WITH_ROBUSTNESS
-    self->bridged_n = OUTLIER_BRIDGED;
-    predict(self, innovation);
-    self->trigger.statistic = 0.0F;
-    self->doubt_n           = 0U;
-    est_scale_discard_products(&self->scale);
-    forget_innovations(self);
-    if (self->edge_age_n < AT_EDGE_N) {
-        self->correlation.edge_outliers |= 1U;
-    }
-    increment(&self->counters.outliers);
-    step->status    = EST_OUTLIER;
-    step->statistic = 0.0F;
-#else
-    (void)self;
-    (void)innovation;
-    (void)step;
-#endif
-}
-
 /// Accept an equation: update theta, store its residual, and end the bridge.
 EST_INLINE void accept_equation(est_t* const self, const est_shape_t shape, const est_equation_t* const equation) {
     est_equation_update_theta(equation, shape, self->theta);
@@ -844,32 +487,6 @@ EST_INLINE void accept_equation(est_t* const self, const est_shape_t shape, cons
         store_residual(self, equation->x);
     }
     end_bridge(self);
-}
-
-/// Enter an innovation into the statistic. `term`: of the cumulative sum, `weight`: of a squared innovation in it;
-/// `precision`: reciprocal of the innovation's variance [1 / noise variance]; `held`: the statistic is held at zero.
-EST_INLINE void enter_innovation(
-    est_t* const self, const float e, const float term, const float weight, const float precision, const bool held) {
-    est_trigger_t* const trigger = &self->trigger;
-    const float          share   = est_trigger_share(held);
-#if EST_WITH_ROBUSTNESS
-    est_correlation_t* const correlation = &self->correlation;
-    if (correlation->work == EST_WORK_LAG_1) {
-        est_correlation_multiply(correlation, &self->scale, e, precision);
-    }
-    if (correlation->work <= EST_WORK_LAG_1) {
-        trigger->statistic = est_trigger_sum(trigger->statistic, share * term);
-        return;  // the usual step
-    }
-    if (correlation->work != EST_WORK_OTHER_TRIGGER) {
-        trigger->statistic = est_correlation_enter(correlation, &self->scale, e, trigger->statistic, share * term,
-                                                   share * weight, precision);
-        return;
-    }
-#else
-    (void)weight;
-#endif
-    est_trigger_enter(trigger, &self->config->trigger, e, self->noise_variance / precision, share * term, held);
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
@@ -957,10 +574,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     *self                = (est_t){ .config = config };
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
-#if EST_WITH_ROBUSTNESS
-    est_scale_init(self);
-    self->correlation.work = is_cusum(config) ? 0U : EST_WORK_OTHER_TRIGGER;
-#endif
+    init_robustness(self);
     est_whitener_set(&self->whitener, config->c, config->na);
     clear_theta(self);
     forget_samples(self);
@@ -1018,12 +632,9 @@ float est_variance(const est_t* const self, const uint8_t index) {
     if (est_delta_applies(self)) {
         est_delta_difference_both(factor, shape.na, shape.nb);
     }
-#if EST_WITH_ROBUSTNESS
-    if (est_is_offset(shape, index)) {  // see compute_plain()
-        factor[shape.na] += self->reference_y;
-        factor[shape.na + shape.nb] -= self->reference_u;
+    if (est_is_offset(shape, index)) {
+        add_reference_factors(self, shape, factor);
     }
-#endif
     return est_factors_variance(&self->factors, est_shape_count(shape), &factor[1]);
 }
 
@@ -1034,11 +645,7 @@ float est_noise_variance(const est_t* const self) {
 
 float est_scale(const est_t* const self) {
     EST_ASSERT(self != NULL);
-#if EST_WITH_ROBUSTNESS
-    return self->noise_variance * est_scale_factor(&self->scale);
-#else
-    return self->noise_variance;
-#endif
+    return self->noise_variance * scale_factor(self);
 }
 
 float est_prefilter(const est_t* const self, const uint8_t index) {

@@ -2,7 +2,7 @@
 /// Serial correlation of the innovations. The innovations of a model that fits are white. With coloured noise, or a
 /// model that is not exact, they come in waves, whose squares reach the ceiling of the trigger together. An alarm then
 /// needs a second reading of them: what an autoregression of order 2, estimated here, leaves of each innovation. The
-/// plant has changed only if the sums of both readings have passed the ceiling. EST_WITH_ROBUSTNESS=0 omits the module.
+/// plant has changed only if the sums of both readings have passed the ceiling. Part of est_robust.h.
 
 #ifndef EST_CORRELATION_H_INCLUDED
 #define EST_CORRELATION_H_INCLUDED
@@ -39,8 +39,6 @@
 
 /// Blocks from one with products to the next while there is no second reading: most steps are without work. Even.
 #define EST_RESTING_N 4U
-
-#if EST_WITH_ROBUSTNESS
 
 /// True iff the innovations have a second reading.
 EST_INLINE bool est_correlation_reads(const est_correlation_t* const self) {
@@ -128,6 +126,5 @@ static inline void est_correlation_restart(est_correlation_t* const self) {
         self->work = (self->turn == 0U) ? EST_WORK_LAG_1 : 0U;
     }
 }
-#endif
 
 #endif  // EST_CORRELATION_H_INCLUDED

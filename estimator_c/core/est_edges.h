@@ -18,39 +18,6 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
     return est_magnitude(u[0] - u[1]) >= config->edge_codes;
 }
 
-#if EST_WITH_ROBUSTNESS
-
-/// Weight of the squared residual before an edge, beside those in the doubt after it.
-#define EST_DOUBT_BEFORE_N (2.0F * (float)EST_DOUBT_N)
-
-/// Part of the energy that a displacement must explain, of more than which the excess is evidence, and the evidence
-/// that suffices. Displacements that differ explain 0.7 to 0.9 after each edge; noise explains 0.1 on average.
-#define EST_DISPLACED 0.5F
-#define EST_DISPLACED_SUM 1.5F
-
-/// Begin to compare the innovations after an edge with the effect of a displacement. `before`: residual before it.
-static inline void est_edges_begin_comparison(est_edges_t* const self, const float before) {
-    self->along  = 0.0F;
-    self->span   = 0.0F;
-    self->energy = EST_DOUBT_BEFORE_N * before * before;
-}
-
-/// Enter an innovation with the effect of a displacement on it: the share of early edges less that of late ones.
-EST_INLINE void est_edges_compare(est_edges_t* const self, const float e, const float effect) {
-    self->along += e * effect;
-    self->span += effect * effect;
-    self->energy += e * e;
-}
-
-/// Conclude the comparison. Return true iff the edges are displaced again and again.
-static inline bool est_edges_displaced(est_edges_t* const self) {
-    const float whole = self->span * self->energy;
-    const float part  = (whole > 0.0F) ? ((self->along * self->along) / whole) : 0.0F;
-    self->misfit      = est_max(self->misfit + (part - EST_DISPLACED), 0.0F);
-    return self->misfit > EST_DISPLACED_SUM;
-}
-#endif
-
 /// Begin a doubt at an edge of height `step`, with the present theta. An early edge would also have entered the
 /// equation before; if there was none, the gain of the filter is zero and the term has no effect.
 EST_INLINE void

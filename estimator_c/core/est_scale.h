@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: MIT
 /// Scale of the innovations: the variance that the trigger expects of them. It is the noise variance, followed on line,
 /// times an inflation. The inflation grows with alarms that the new estimate does not justify: the model then does not
-/// fit the plant, and what cannot be told from the misfit must not raise alarms. EST_WITH_ROBUSTNESS=0 omits the
-/// module; the scale is then the configured noise variance.
+/// fit the plant, and what cannot be told from the misfit must not raise alarms. Part of est_robust.h.
 
 #ifndef EST_SCALE_H_INCLUDED
 #define EST_SCALE_H_INCLUDED
@@ -82,8 +81,6 @@
 
 /// Equations to the end of the warm-up below which the noise variance is followed with its final memory.
 #define EST_WARM_N 64U
-
-#if EST_WITH_ROBUSTNESS
 
 /// Factor of the noise variance in the scale.
 static inline float est_scale_factor(const est_scale_t* const self) {
@@ -224,6 +221,5 @@ est_scale_try(est_scale_t* const self, const float old_square, const float new_s
     }
     return (n < EST_TRIAL_N) || ((edge_age_n >= n) && (n < EST_TRIAL_MAX_N));
 }
-#endif
 
 #endif  // EST_SCALE_H_INCLUDED
