@@ -18,7 +18,7 @@
 
 /// Factor by which a slip increases the variance of every parameter. With 10, the covariance of the shifted b's is too
 /// small and false alarms follow. With 10,000, a simultaneous change of the plant passes unnoticed.
-#define SLIP_DOUBT 1000.0F
+#define SLIP_UNCERTAINTY 1000.0F
 
 /// Smallest forgetting factor. It bounds the growth of P between two limitations of the d's.
 #define FORGETTING_MIN 0.5F
@@ -102,31 +102,31 @@ bool est_config_valid(const est_config_t* const config) {
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
-/// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
-/// u(k), or the reverse. Every parameter becomes less certain.
+/// Restore theta from before the ambiguity window, with the b's moved by one place: y(k) now depends on u(k-1) as it
+/// did on u(k), or the reverse. Every parameter becomes less certain.
 static void follow_slip(est_t* const self, const bool late) {
     (void)append(self->theta, self->edges.theta, EST_THETA_MAX);
     const uint_fast8_t last = (uint_fast8_t)(self->config->nb - 1U);
     float* const       b    = &self->theta[self->config->na];
-    est_delta_to_plain(b, last);
+    est_delta_to_coefficients(b, last);
     if (late) {
         shift(b, self->config->nb, 0.0F);
     } else {
         *append(b, &b[1], last) = 0.0F;
     }
-    est_delta_from_plain(b, last);
-    est_factors_inflate(self, SLIP_DOUBT);
+    est_delta_from_coefficients(b, last);
+    est_factors_inflate(self, SLIP_UNCERTAINTY);
 }
 
-/// Compute theta in the plain form of est.h, after the first coefficient of A.
-static void compute_plain(const est_t* const self, const est_shape_t shape, float* const plain) {
-    float* const b = &plain[shape.na + 1U];
-    plain[0]       = 1.0F;
-    (void)append(&plain[1], self->theta, EST_THETA_MAX);
-    add_reference(self, shape, plain);
+/// Compute theta in the coefficients of est.h, after the first coefficient of A.
+static void compute_coefficients(const est_t* const self, const est_shape_t shape, float* const coefficients) {
+    float* const b  = &coefficients[shape.na + 1U];
+    coefficients[0] = 1.0F;
+    (void)append(&coefficients[1], self->theta, EST_THETA_MAX);
+    add_reference(self, shape, coefficients);
     if (est_delta_applies(self)) {
-        est_delta_to_plain(plain, shape.na);
-        est_delta_to_plain(b, (uint_fast8_t)(shape.nb - 1U));
+        est_delta_to_coefficients(coefficients, shape.na);
+        est_delta_to_coefficients(b, (uint_fast8_t)(shape.nb - 1U));
     }
 }
 
@@ -137,7 +137,7 @@ static void contract_a(const est_t* const self, const est_shape_t shape, float* 
     *out         = 1.0F;
     (void)append(&out[1], self->theta, shape.na);
     if (est_delta_applies(self)) {
-        est_delta_to_plain(out, shape.na);
+        est_delta_to_coefficients(out, shape.na);
     }
     EST_UNROLL
     for (uint_fast8_t i = 1U; i <= shape.na; i++) {
@@ -202,7 +202,7 @@ static void clear_theta(est_t* const self) {
     clear(self->theta, EST_THETA_MAX);
     if (est_delta_applies(self)) {
         self->theta[0] = 1.0F;  // the first coefficient of A, which is no parameter
-        est_delta_from_plain(self->theta, self->config->na);
+        est_delta_from_coefficients(self->theta, self->config->na);
         *append(self->theta, &self->theta[1], self->config->na) = 0.0F;
     }
 }
@@ -237,21 +237,21 @@ static bool is_stuck(est_t* const self, const float y, const bool edge) {
     return (self->config->stuck_n > 0U) && (self->same_n >= self->config->stuck_n);
 }
 
-/// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
-static bool other_reading_leads(const est_t* const self) {
-    return (self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger);
+/// True iff another hypothesis of the ambiguous edges explains the innovations better than the recorded one.
+static bool other_hypothesis_leads(const est_t* const self) {
+    return (self->ambiguity_n > 0U) && est_trigger_is_ambiguous(&self->trigger);
 }
 
-/// Enter an edge into the doubt. It joins the doubt about earlier edges if another reading of these leads; otherwise it
-/// begins a new doubt.
-static void doubt_edge(est_t* const self) {
-    if (other_reading_leads(self)) {
+/// Enter an edge into the ambiguity window. It joins the ambiguity window about earlier edges if another hypothesis of
+/// these leads; otherwise it begins a new ambiguity window.
+static void enter_ambiguous_edge(est_t* const self) {
+    if (other_hypothesis_leads(self)) {
         return;
     }
-    const float step = self->u[0] - self->u[1];
-    self->doubt_n    = 1U;
+    const float step  = self->u[0] - self->u[1];
+    self->ambiguity_n = 1U;
     est_edges_begin(&self->edges, self->config, self->theta, step);
-    est_trigger_begin_doubt(&self->trigger);
+    est_trigger_begin_ambiguity(&self->trigger);
     begin_comparison(self);
 }
 
@@ -268,8 +268,8 @@ static void enter_edge(est_t* const self) {
         return;
     }
     const est_edge_instants_t instants = edge_instants_of(self);
-    if ((instants == EST_EDGES_MAY_SLIP) && !slope && !is_on_trial(self) && is_cusum(self->config)) {
-        doubt_edge(self);
+    if ((instants == EST_EDGES_MAY_SLIP) && !slope && !validates_alarm(self) && is_cusum(self->config)) {
+        enter_ambiguous_edge(self);
     } else if (instants == EST_EDGES_ANYWHERE) {
         self->pending_n = larger(self->pending_n, self->config->na);
     } else {
@@ -287,8 +287,8 @@ static est_status_t enter_input(est_t* const self, float u, float* const y) {
         increment(&self->counters.stuck);
         return EST_REFUSED;
     }
-    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        self->doubt_n = (self->doubt_n < EST_DOUBT_N) ? (uint8_t)(self->doubt_n + 1U) : 0U;
+    if (EST_WITH_EDGES && (self->ambiguity_n > 0U)) {
+        self->ambiguity_n = (self->ambiguity_n < EST_AMBIGUITY_N) ? (uint8_t)(self->ambiguity_n + 1U) : 0U;
     }
     if (edge) {
         enter_edge(self);
@@ -324,17 +324,17 @@ static est_status_t examine(est_t* const self, const est_sample_t sample, float*
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
-/// Enter the innovation under the other readings of the edges in doubt. They are compared with theta before the doubt,
-/// because the estimate has followed the recorded reading since.
+/// Enter the innovation under the other hypotheses of the ambiguous edges. They are compared with theta before the
+/// ambiguity window, because the estimate has followed the recorded hypothesis since.
 EST_INLINE void
-judge_readings(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float weight) {
-    const bool  same = self->doubt_n <= 1U;  // theta has not changed yet
+judge_hypotheses(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float weight) {
+    const bool  same = self->ambiguity_n <= 1U;  // theta has not changed yet
     const float e =
         same ? equation->innovation : est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
-    float share[EST_OTHER_READINGS];
+    float share[EST_OTHER_HYPOTHESES];
     est_edges_shares(self, shape, share);
     watch_edges(self, e, share[0] + share[1]);
-    est_trigger_enter_readings(&self->trigger, e, share, weight);
+    est_trigger_enter_hypotheses(&self->trigger, e, share, weight);
 }
 
 /// Store the residual of an equation after its update: it replaces e in the next equations (thesis section 3.5).
@@ -382,10 +382,10 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
 }
 
 /// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while another
-/// reading of the edges leads, because theta may have followed an edge that was misread. A doubt alone does not suspend
-/// it: with edges in quick succession it never ends.
+/// hypothesis of the edges leads, because theta may have followed an edge that was misread. An ambiguity window alone
+/// does not suspend it: with edges in quick succession it never ends.
 EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
-    if (EST_WITH_EDGES && other_reading_leads(self)) {
+    if (EST_WITH_EDGES && other_hypothesis_leads(self)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self, shape);
@@ -406,7 +406,7 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 static void raise_alarm(est_t* const self, est_step_t* const step) {
     step->alarm          = true;
     const bool overflown = !(step->statistic < FLT_MAX);
-    put_on_trial(self, overflown);
+    begin_validation(self, overflown);
     if (overflown || (self->config->trigger.reset == EST_RESET_ALL)) {
         clear_theta(self);
     }
@@ -440,11 +440,12 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
     if (!can_bridge(self)) {
         self->known = false;
     }
-    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        self->doubt_n++;
-        if (!self->known || (self->doubt_n >= EST_DOUBT_N)) {  // the last sample of a doubt decides and must be good
-            self->doubt_n = 0U;
-            if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
+    if (EST_WITH_EDGES && (self->ambiguity_n > 0U)) {
+        self->ambiguity_n++;
+        if (!self->known || (self->ambiguity_n >=
+                             EST_AMBIGUITY_N)) {  // the last sample of an ambiguity window decides and must be good
+            self->ambiguity_n = 0U;
+            if (est_trigger_end_ambiguity(&self->trigger, &self->config->trigger)) {
                 note_slip(self);
             }
         }
@@ -465,7 +466,7 @@ static void walk(est_t* const self) {
 
 /// Limit P. Done in a step without other optional work, unless that comes too late.
 EST_INLINE void limit_factors(est_t* const self) {
-    const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
+    const bool busy = (EST_WITH_EDGES && (self->ambiguity_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
         est_factors_inflate(self, 1.0F);
     }
@@ -473,8 +474,8 @@ EST_INLINE void limit_factors(est_t* const self) {
 
 /// Predict a missing y.
 EST_INLINE void bridge(est_t* const self, const est_shape_t shape, const float innovation) {
-    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        float share[EST_OTHER_READINGS];
+    if (EST_WITH_EDGES && (self->ambiguity_n > 0U)) {
+        float share[EST_OTHER_HYPOTHESES];
         est_edges_shares(self, shape, share);
     }
     predict(self, innovation);
@@ -522,10 +523,10 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     enter_innovation(self, equation.innovation, term, weight, precision, held);
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;
-    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        judge_readings(self, shape, &equation, est_trigger_share(held) * weight);
+    if (EST_WITH_EDGES && (self->ambiguity_n > 0U)) {
+        judge_hypotheses(self, shape, &equation, est_trigger_share(held) * weight);
     }
-    const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->doubt_n);
+    const est_finding_t finding = est_trigger_find(&self->trigger, config->trigger.ceiling, self->ambiguity_n);
     if (finding == EST_QUIET) {  // two copies of accept_equation() save four instructions a step
         accept_equation(self, shape, &equation);
     } else {
@@ -611,16 +612,16 @@ uint8_t est_theta_count(const est_t* const self) {
 
 float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
-    float plain[EST_THETA_MAX + 1U];
-    compute_plain(self, est_shape_of(self->config), plain);
-    return plain[index + 1U];
+    float coefficients[EST_THETA_MAX + 1U];
+    compute_coefficients(self, est_shape_of(self->config), coefficients);
+    return coefficients[index + 1U];
 }
 
 void est_copy_theta(const est_t* const self, float* const out) {
     EST_ASSERT((self != NULL) && (out != NULL));
-    float plain[EST_THETA_MAX + 1U];
-    compute_plain(self, est_shape_of(self->config), plain);
-    (void)append(out, &plain[1], EST_THETA_MAX);
+    float coefficients[EST_THETA_MAX + 1U];
+    compute_coefficients(self, est_shape_of(self->config), coefficients);
+    (void)append(out, &coefficients[1], EST_THETA_MAX);
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {

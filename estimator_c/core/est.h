@@ -7,8 +7,7 @@
 ///
 /// The parameters are theta = (a1 .. a_na, b_0 .. b_(nb-1) [, c_1 .. c_nc] [, d]). They are estimated by Bierman's U-D
 /// factorised least squares on the equation whitened by 1/C. A trigger watches the innovation and raises an alarm when
-/// theta has jumped. Missing samples are tolerated. harness/docs/background/estimator.md derives
-/// the algorithm.
+/// theta has jumped. Missing samples are tolerated. harness/docs/background/estimator.md derives the algorithm.
 ///
 /// The library is freestanding C99 in float32: no heap, no libm, no globals, no recursion. The caller owns the state;
 /// any number of instances may coexist. It is not thread-safe: one instance belongs to one context, which may be an
@@ -31,9 +30,9 @@
 ///
 /// The false-alarm rate holds from the end of the warm-up on, by default 550 innovations after est_init(). It holds for
 /// white noise of 0.3 to 4 codes, 10 to 18 bits, and poles from 0.3 to 0.999. If the edges of u drift by 20 ppm, it
-/// holds on average over such plants, and slow ones have up to 2.5 times as many false alarms. If the noise is coloured,
-/// or the model does not fit the plant, the trigger becomes less sensitive: est_scale() grows, and an alarm needs a second
-/// reading of correlated innovations. est_fit.h names the cause.
+/// holds on average over such plants, and slow ones have up to 2.5 times as many false alarms. If the noise is
+/// coloured, or the model does not fit the plant, the trigger becomes less sensitive: est_scale() grows, and an alarm
+/// needs a second hypothesis of correlated innovations. est_fit.h names the cause.
 ///
 /// Units: signals are in codes of the converter, so that quantisation is 1. The defaults assume noise of about one
 /// code. If signals have another unit, say volts, either divide them by the volts per code, which needs no other
@@ -77,11 +76,11 @@ extern "C" {
 /// | EST_ASSERT(x)               | assert(x)  | statement that must not continue if x is false: the caller made a  |
 /// |                             |            | mistake. Empty by default with NDEBUG or without an assert.h       |
 ///
-/// The five maxima and EST_WITH_ROBUSTNESS determine the layout of the state. They are part of the names that the linker
-/// sees: if the library and its caller disagree, est_init() is an undefined reference. Write the maxima as plain numbers,
-/// with U or without it, alike in every file.
-/// A configuration that requests an omitted feature is refused by est_init(). EST_WITH_CHECKS=0 is for a constant
-/// configuration that est_config_valid() has accepted elsewhere, as in a test on the host.
+/// The five maxima and EST_WITH_ROBUSTNESS determine the layout of the state. They are part of the names that the
+/// linker sees: if the library and its caller disagree, est_init() is an undefined reference. Write the maxima as
+/// numbers, with U or without it, alike in every file. A configuration that requests an omitted feature is refused by
+/// est_init(). EST_WITH_CHECKS=0 is for a constant configuration that est_config_valid() has accepted elsewhere, as in
+/// a test on the host.
 #ifndef EST_NA_MAX
 #define EST_NA_MAX 2U
 #endif
@@ -122,7 +121,8 @@ extern "C" {
 #define EST_WITH_ROBUSTNESS 1
 #endif
 
-/// Names with everything that determines the layout of the state, as est_init_na2U_nb3U_nk1U_nc0U_theta6U_full. Private.
+/// Names with everything that determines the layout of the state, as est_init_na2U_nb3U_nk1U_nc0U_theta6U_full.
+/// Private.
 #if EST_WITH_ROBUSTNESS
 #define EST_NAME_BUILD _full
 #else
@@ -239,10 +239,10 @@ typedef struct {
     float random_walk;
     float p0;         ///< initial variance of each a, b and c; 1e-9 .. 1e9, usually 1 .. 100 [1 / codes^2]
     float p0_offset;  ///< initial variance of d; 1e-9 .. 1e9, usually 1e6 [noise variances]
-    /// Variance of e; 1e-9 .. 1e9 [codes^2], usually 0.1 .. 100. If the noise is estimated, the first value, and 14 times
-    /// the smallest one that is followed: usually 1.2, for noise from 0.3 codes on. Else it is to be measured at rest: too
-    /// small a value causes false alarms, too large a value hides changes. The standard deviation is at most 1/32 of
-    /// code_high - code_low.
+    /// Variance of e; 1e-9 .. 1e9 [codes^2], usually 0.1 .. 100. If the noise is estimated, the first value, and 14
+    /// times the smallest one that is followed: usually 1.2, for noise from 0.3 codes on. Else it is to be measured at
+    /// rest: too small a value causes false alarms, too large a value hides changes. The standard deviation is at most
+    /// 1/32 of code_high - code_low.
     float noise_variance;
     float c[EST_NA_MAX];  ///< prefilter C = 1 + c[0] z^-1 + ...; zeros inside the unit circle; 0: none
     /// Smallest step of u that is an edge; > 0, at most code_high - code_low [codes]. Usually a tenth to a half of the
@@ -395,13 +395,13 @@ typedef struct {
     est_past_t past[EST_THETA_MAX + 1U];  ///< one for each element of the equation
 } est_whitener_t;
 
-/// Readings of the recent edges other than the recorded one: one sample early, one sample late.
-#define EST_OTHER_READINGS 2U
+/// Hypotheses of the recent edges other than the recorded one: one sample early, one sample late.
+#define EST_OTHER_HYPOTHESES 2U
 
-/// Effect of the recent edges of u under the other readings. Private to est_edges.h.
+/// Effect of the recent edges of u under the other hypotheses. Private to est_edges.h.
 typedef struct {
-    est_past_t past[EST_OTHER_READINGS];  ///< their share in the whitened equations
-    float      theta[EST_THETA_MAX];      ///< theta before the first of these edges, or before an alarm on trial
+    est_past_t past[EST_OTHER_HYPOTHESES];  ///< their share in the whitened equations
+    float      theta[EST_THETA_MAX];  ///< theta before the first of these edges, or before an alarm under validation
 #if EST_WITH_ROBUSTNESS
     float along;   ///< sum of innovation times the effect of a displaced edge, since the edge
     float span;    ///< sum of that effect squared
@@ -415,16 +415,16 @@ typedef struct {
     uint16_t quiet_n;  ///< remaining innovations during which the statistic is held at zero
     uint16_t mean_n;   ///< innovations in the mean between faults; 0: the next one is the first
     float    statistic;
-    float    rival[EST_OTHER_READINGS];  ///< cumulative sum under each other reading; rival[0] also holds the mean
+    float    rival[EST_OTHER_HYPOTHESES];  ///< cumulative sum under each other hypothesis; rival[0] also holds the mean
 } est_trigger_t;
 
-/// Scale of the innovations and the trial of the last alarm. Private to est_scale.h.
+/// Scale of the innovations and the validation of the last alarm. Private to est_scale.h.
 typedef struct {
-    uint8_t  phase;       ///< equations in this block; then the stage of the update, or that of the trial of an alarm
-    uint8_t  high_n;      ///< steps of high blocks
-    uint16_t credit_n;    ///< blocks that justify alarms which are not plain
-    float    weight;      ///< of a squared innovation in the cumulative sum
-    float    sum;         ///< terms of this block; in a trial, squared errors of the old estimate less those of the new
+    uint8_t  phase;   ///< equations in this block; then the stage of the update, or that of the validation of an alarm
+    uint8_t  high_n;  ///< steps of high blocks
+    uint16_t budget_n;  ///< blocks that justify alarms which are not evident
+    float    weight;    ///< of a squared innovation in the cumulative sum
+    float    sum;  ///< terms of this block; in a validation, squared errors of the old estimate less those of the new
     float    product;     ///< sum of this block's products of innovations at one lag: see est_correlation.h
     float    share;       ///< share of this block in the noise variance
     float    inflation;   ///< factor for what the model does not explain
@@ -434,11 +434,11 @@ typedef struct {
 /// Serial correlation of the innovations. Private to est_correlation.h.
 typedef struct {
     uint8_t work;           ///< of each step of this block; 0: none
-    uint8_t turn;           ///< blocks so far
+    uint8_t slot;           ///< blocks so far
     uint8_t edge_outliers;  ///< a bit for each recent edge, the last one first: an outlier came right after it
     float   last[2];        ///< innovations of the last two equations, newest first [codes]
     float   partial[2];     ///< partial correlations at lags 1 and 2
-    float   lead;           ///< sum of the first reading less that of the second
+    float   lead;           ///< sum of the first hypothesis less that of the second
 } est_correlation_t;
 
 /// Work that a step leaves to the next one. Private.
@@ -455,13 +455,13 @@ typedef enum {
 /// below 128 bytes fits a short Thumb instruction.
 typedef struct {
     const est_config_t* config;
-    uint16_t            edge_age_n;  ///< samples since the last edge of u
-    uint8_t             same_n;      ///< samples of constant y since an edge of u
-    uint8_t             pending_n;   ///< samples needed before the next equation is complete
-    est_renewal_t       renewal;     ///< work left by the last step
-    bool                known;       ///< the previous sample is known; if not, pending_n > 0
-    bool                settled;     ///< the gains of the whitener are c, and its variance is 1
-    uint8_t             doubt_n;     ///< samples since the first edge in doubt, inclusive; 0: no doubt
+    uint16_t            edge_age_n;   ///< samples since the last edge of u
+    uint8_t             same_n;       ///< samples of constant y since an edge of u
+    uint8_t             pending_n;    ///< samples needed before the next equation is complete
+    est_renewal_t       renewal;      ///< work left by the last step
+    bool                known;        ///< the previous sample is known; if not, pending_n > 0
+    bool                settled;      ///< the gains of the whitener are c, and its variance is 1
+    uint8_t             ambiguity_n;  ///< samples since the first ambiguous edge, inclusive; 0: none
 #if EST_WITH_ROBUSTNESS
     bool    edges_vary;  ///< edges come anywhere, against the configuration
     uint8_t bridged_n;   ///< samples before the next one that were predicted
@@ -500,12 +500,12 @@ est_config_t est_config_default(void);
 /// fail. Cost: constant. May be called from an interrupt.
 bool est_config_valid(const est_config_t* config);
 
-/// Prepare the estimator for the first sample: theta zero, P = P0, counters zero. With an offset and the cumulative sum, d is
-/// that y after the first sample.
-/// The configuration is not copied. It must stay unchanged while the estimator is used: a static object, or a constant
-/// in flash, but no local variable of a function that returns. With assertions, est_step() detects most violations.
-/// Returns false iff the configuration is not valid; the state is then unusable. A build with -DEST_WITH_CHECKS=0 omits
-/// the check. Cost: as one est_step(). RAM: the state. May be called from an interrupt.
+/// Prepare the estimator for the first sample: theta zero, P = P0, counters zero. With an offset and the cumulative
+/// sum, d is that y after the first sample. The configuration is not copied. It must stay unchanged while the estimator
+/// is used: a static object, or a constant in flash, but no local variable of a function that returns. With assertions,
+/// est_step() detects most violations. Returns false iff the configuration is not valid; the state is then unusable. A
+/// build with -DEST_WITH_CHECKS=0 omits the check. Cost: as one est_step(). RAM: the state. May be called from an
+/// interrupt.
 EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 
 /// Enter one sample: whiten the equation, update P, run the trigger, update theta (Bierman 1977).
@@ -528,8 +528,8 @@ uint8_t est_theta_count(const est_t* self);
 /// still contains the effect of the slipped edge. Cost: constant. May be called from an interrupt.
 float est_theta(const est_t* self, uint8_t index);
 
-/// All elements of theta, as est_theta() of each. out has EST_THETA_MAX elements, those beyond est_theta_count() without
-/// meaning. Cost: as one est_theta(). May be called from an interrupt.
+/// All elements of theta, as est_theta() of each. out has EST_THETA_MAX elements, those beyond est_theta_count()
+/// without meaning. Cost: as one est_theta(). May be called from an interrupt.
 void est_copy_theta(const est_t* self, float* out);
 
 /// One diagonal element of P [noise variances]. index is in [0, est_theta_count()), asserted. After an alarm and

@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: MIT
 /// Serial correlation of the innovations. The innovations of a model that fits are white. With coloured noise, or a
 /// model that is not exact, they come in waves, whose squares reach the ceiling of the trigger together. An alarm then
-/// needs a second reading of them: what an autoregression of order 2, estimated here, leaves of each innovation. The
-/// plant has changed only if the sums of both readings have passed the ceiling. Part of est_robust.h.
+/// needs a second hypothesis of them: what an autoregression of order 2, estimated here, leaves of each innovation. The
+/// plant has changed only if the sums of both hypotheses have passed the ceiling. Part of est_robust.h.
 
 #ifndef EST_CORRELATION_H_INCLUDED
 #define EST_CORRELATION_H_INCLUDED
 
 #include "est_scale.h"
 
-/// Sum of the squared partial correlations from which on the innovations have a second reading. That of white
+/// Sum of the squared partial correlations from which on the innovations have a second hypothesis. That of white
 /// innovations is 0.002 on average.
 #define EST_CORRELATED 0.012F
 
@@ -26,23 +26,23 @@
 #define EST_PARTIAL_LOAD 1.05F
 #define EST_PARTIAL_MAX 0.98F
 
-/// Increase of the variance of the second reading per unit of leverage, which is the part of an innovation's variance
-/// that is due to theta. What a poor model leaves is largest where the regressor is larger than those before.
+/// Increase of the variance of the second hypothesis per unit of leverage, which is the part of an innovation's
+/// variance that is due to theta. What a poor model leaves is largest where the regressor is larger than those before.
 #define EST_LEVERAGE 25.0F
 
-/// Work of each step of a block: none, or products of innovations at lag 1 or 2, and the second reading.
+/// Work of each step of a block: none, or products of innovations at lag 1 or 2, and the second hypothesis.
 #define EST_WORK_LAG_1 1U
 #define EST_WORK_LAG_2 2U
 #define EST_WORK_LAGS 3U
-#define EST_WORK_READS 4U
+#define EST_WORK_COLOURED 4U
 #define EST_WORK_OTHER_TRIGGER 8U  ///< none, for good: the trigger is not the cumulative sum
 
-/// Blocks from one with products to the next while there is no second reading: most steps are without work. Even.
+/// Blocks from one with products to the next while there is no second hypothesis: most steps are without work. Even.
 #define EST_RESTING_N 4U
 
-/// True iff the innovations have a second reading.
-EST_INLINE bool est_correlation_reads(const est_correlation_t* const self) {
-    return (self->work & EST_WORK_READS) != 0U;
+/// True iff the innovations have a second hypothesis.
+EST_INLINE bool est_correlation_coloured(const est_correlation_t* const self) {
+    return (self->work & EST_WORK_COLOURED) != 0U;
 }
 
 /// True iff the innovations are the slow residual of a poor model.
@@ -66,9 +66,9 @@ static inline void est_correlation_multiply(est_correlation_t* const self,
     self->last[0] = e;
 }
 
-/// Enter one innovation into the products of the block and into both readings. `statistic`: their smaller sum so far;
-/// `term`: of the first reading; `weight`: of a squared innovation in the sums; `precision`: reciprocal of its variance
-/// [1 / noise variance]. Return the smaller sum.
+/// Enter one innovation into the products of the block and into both hypotheses. `statistic`: their smaller sum so far;
+/// `term`: of the first hypothesis; `weight`: of a squared innovation in the sums; `precision`: reciprocal of its
+/// variance [1 / noise variance]. Return the smaller sum.
 static inline float est_correlation_enter(est_correlation_t* const self,
                                           est_scale_t* const       scale,
                                           const float              e,
@@ -112,18 +112,18 @@ static inline void est_correlation_follow(est_correlation_t* const self,
     *partial             = est_max(est_min(next, EST_PARTIAL_MAX), -EST_PARTIAL_MAX);
 }
 
-/// Begin a block. The correlation at lag 2 is estimated while there is a second reading.
+/// Begin a block. The correlation at lag 2 is estimated while there is a second hypothesis.
 static inline void est_correlation_restart(est_correlation_t* const self) {
-    const float squares = (self->partial[0] * self->partial[0]) + (self->partial[1] * self->partial[1]);
-    const bool  reads   = (squares > EST_CORRELATED) && !est_correlation_smooth(self);
-    if (!est_correlation_reads(self)) {
+    const float squares  = (self->partial[0] * self->partial[0]) + (self->partial[1] * self->partial[1]);
+    const bool  coloured = (squares > EST_CORRELATED) && !est_correlation_smooth(self);
+    if (!est_correlation_coloured(self)) {
         est_correlation_forget(self);
     }
-    self->turn = (uint8_t)((self->turn + 1U) % EST_RESTING_N);
-    if (reads) {
-        self->work = (uint8_t)(EST_WORK_READS + (((self->turn % 2U) == 0U) ? EST_WORK_LAG_1 : EST_WORK_LAG_2));
+    self->slot = (uint8_t)((self->slot + 1U) % EST_RESTING_N);
+    if (coloured) {
+        self->work = (uint8_t)(EST_WORK_COLOURED + (((self->slot % 2U) == 0U) ? EST_WORK_LAG_1 : EST_WORK_LAG_2));
     } else {
-        self->work = (self->turn == 0U) ? EST_WORK_LAG_1 : 0U;
+        self->work = (self->slot == 0U) ? EST_WORK_LAG_1 : 0U;
     }
 }
 

@@ -36,7 +36,7 @@ static inline void est_delta_difference(float* const x, const uint_fast8_t order
     }
 }
 
-/// Replace y(k), y(k-1), ..., u(k-nk), ... by their differences, and a gradient in plain coefficients likewise.
+/// Replace y(k), y(k-1), ..., u(k-nk), ... by their differences, and a gradient in coefficients likewise.
 static inline void est_delta_difference_both(float* const x, const uint_fast8_t na, const uint_fast8_t nb) {
     est_delta_difference(x, na);
     est_delta_difference(&x[na + 1U], (uint_fast8_t)(nb - 1U));
@@ -55,9 +55,9 @@ static inline void est_delta_add(float* const x, const uint_fast8_t order, const
 
 /// Coefficients of the values from those of these differences: the transpose of the above. The first is the same in
 /// both forms.
-EST_INLINE void est_delta_to_plain(float* const x, const uint_fast8_t order) { est_delta_add(x, order, -1.0F); }
+EST_INLINE void est_delta_to_coefficients(float* const x, const uint_fast8_t order) { est_delta_add(x, order, -1.0F); }
 
-/// The inverse of est_delta_to_plain().
-EST_INLINE void est_delta_from_plain(float* const x, const uint_fast8_t order) { est_delta_add(x, order, 1.0F); }
+/// The inverse of est_delta_to_coefficients().
+EST_INLINE void est_delta_from_coefficients(float* const x, const uint_fast8_t order) { est_delta_add(x, order, 1.0F); }
 
 #endif  // EST_DELTA_H_INCLUDED

@@ -31,19 +31,19 @@ static inline void watch_scale(est_t* const                self,
     (void)precision;
 }
 
-// Without trials, every alarm is justified.
+// Without validations, every alarm is justified.
 
-static inline void put_on_trial(est_t* const self, const bool overflown) {
+static inline void begin_validation(est_t* const self, const bool overflown) {
     (void)self;
     (void)overflown;
 }
 
-static inline bool is_on_trial(const est_t* const self) {
+static inline bool validates_alarm(const est_t* const self) {
     (void)self;
     return false;
 }
 
-// Innovations have one reading.
+// Innovations have one hypothesis.
 
 EST_INLINE void enter_innovation(
     est_t* const self, const float e, const float term, const float weight, const float precision, const bool held) {
@@ -74,10 +74,10 @@ static inline void subtract_reference(est_t* const self, float* const u, float* 
     (void)y;
 }
 
-static inline void add_reference(const est_t* const self, const est_shape_t shape, float* const plain) {
+static inline void add_reference(const est_t* const self, const est_shape_t shape, float* const coefficients) {
     (void)self;
     (void)shape;
-    (void)plain;
+    (void)coefficients;
 }
 
 static inline void add_reference_factors(const est_t* const self, const est_shape_t shape, float* const factor) {

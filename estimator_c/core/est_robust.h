@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
-/// Robustness: what est.c does beyond the model that fits. Scale of the innovations and trials of alarms, second reading,
-/// edges that vary, reference of the codes, predicted samples and lone outliers. est_lean.h has the same functions for
-/// EST_WITH_ROBUSTNESS=0, where they do nothing. Private to est.c.
+/// Robustness: what est.c does beyond the model that fits. Scale of the innovations and validations of alarms, second
+/// hypothesis, edges that vary, reference of the codes, predicted samples and lone outliers. est_lean.h has the same
+/// functions for EST_WITH_ROBUSTNESS=0, where they do nothing. Private to est.c.
 
 #ifndef EST_ROBUST_H_INCLUDED
 #define EST_ROBUST_H_INCLUDED
@@ -27,8 +27,8 @@
 /// Value of bridged_n after an outlier: its y was predicted, and its u is known.
 #define OUTLIER_BRIDGED UINT8_MAX
 
-/// Weight of the squared residual before an edge, beside those in the doubt after it.
-#define EST_DOUBT_BEFORE_N (2.0F * (float)EST_DOUBT_N)
+/// Weight of the squared residual before an edge, beside those in the ambiguity window after it.
+#define EST_AMBIGUITY_BEFORE_N (2.0F * (float)EST_AMBIGUITY_N)
 
 /// Part of the energy that a displacement must explain, of more than which the excess is evidence, and the evidence
 /// that suffices. Displacements that differ explain 0.7 to 0.9 after each edge; noise explains 0.1 on average.
@@ -66,7 +66,7 @@ static inline float last_innovation(const est_t* const self) {
 static inline void est_edges_begin_comparison(est_edges_t* const self, const float before) {
     self->along  = 0.0F;
     self->span   = 0.0F;
-    self->energy = EST_DOUBT_BEFORE_N * before * before;
+    self->energy = EST_AMBIGUITY_BEFORE_N * before * before;
 }
 
 /// Enter an innovation with the effect of a displacement on it: the share of early edges less that of late ones.
@@ -84,7 +84,7 @@ static inline bool est_edges_displaced(est_edges_t* const self) {
     return self->misfit > EST_DISPLACED_SUM;
 }
 
-/// Begin that comparison at an edge which begins a doubt.
+/// Begin that comparison at an edge which begins an ambiguity window.
 static inline void begin_comparison(est_t* const self) {
     est_edges_begin_comparison(&self->edges, last_innovation(self));
 }
@@ -97,8 +97,8 @@ EST_INLINE est_edge_instants_t edge_instants_of(const est_t* const self) {
     return self->config->edge_instants;
 }
 
-/// True while the last alarm is on trial: theta before the alarm occupies the place of theta before an edge.
-EST_INLINE bool is_on_trial(const est_t* const self) { return est_scale_on_trial(&self->scale); }
+/// True while the last alarm is under validation: theta before the alarm occupies the place of theta before an edge.
+EST_INLINE bool validates_alarm(const est_t* const self) { return est_scale_validates(&self->scale); }
 
 /// True iff the previous sample is missing, and was predicted.
 static inline bool in_gap(const est_t* const self) {
@@ -148,21 +148,21 @@ static inline void predict(est_t* const self, const float innovation) {
 /// of an interval, edges come anywhere from now on. The innovations so far are those of the wrong model.
 EST_INLINE void watch_edges(est_t* const self, const float e, const float effect) {
     est_edges_compare(&self->edges, e, effect);
-    if ((self->doubt_n >= EST_DOUBT_N) && est_edges_displaced(&self->edges)) {
+    if ((self->ambiguity_n >= EST_AMBIGUITY_N) && est_edges_displaced(&self->edges)) {
         self->edges_vary  = true;
         self->correlation = (est_correlation_t){ .work = 0U };
         est_scale_forgive(self);
     }
 }
 
-/// Put an alarm of the cumulative sum on trial, unless theta has overflown: the present estimate is kept and compared
-/// with the next one. An earlier trial ends.
-static inline void put_on_trial(est_t* const self, const bool overflown) {
-    if (est_scale_on_trial(&self->scale)) {
+/// Put an alarm of the cumulative sum under validation, unless theta has overflown: the present estimate is kept and
+/// compared with the next one. An earlier validation ends.
+static inline void begin_validation(est_t* const self, const bool overflown) {
+    if (est_scale_validates(&self->scale)) {
         est_scale_conclude(self);
     }
     if (!overflown && is_cusum(self->config)) {
-        est_scale_begin_trial(&self->scale);
+        est_scale_begin_validation(&self->scale);
         (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
     }
 }
@@ -178,7 +178,7 @@ static inline void find_hidden_change(est_t* const self, const float mean) {
         return;
     }
     est_scale_count(scale, mean >= (EST_HIGH * self->noise_variance));
-    if ((scale->high_n >= EST_HIGH_LIMIT) && (self->doubt_n == 0U)) {  // a doubt comes first
+    if ((scale->high_n >= EST_HIGH_LIMIT) && (self->ambiguity_n == 0U)) {  // an ambiguity window comes first
         scale->high_n           = 0U;
         self->trigger.statistic = 2.0F * self->config->trigger.ceiling;
     }
@@ -226,12 +226,14 @@ static inline void renew_scale(est_t* const self) {
     scale->phase++;
 }
 
-/// Continue the trial of the last alarm by one equation.
-EST_INLINE void
-try_alarm(est_t* const self, const est_shape_t shape, const est_equation_t* const equation, const float precision) {
+/// Continue the validation of the last alarm by one equation.
+EST_INLINE void validate_alarm(est_t* const                self,
+                               const est_shape_t           shape,
+                               const est_equation_t* const equation,
+                               const float                 precision) {
     const float old = est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
     const float e   = equation->innovation;
-    if (!est_scale_try(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
+    if (!est_scale_validate(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
         est_scale_conclude(self);
     }
 }
@@ -245,8 +247,8 @@ EST_INLINE void watch_scale(est_t* const                self,
     if (est_scale_enter(&self->scale, term)) {
         return;
     }
-    if (est_scale_on_trial(&self->scale)) {
-        try_alarm(self, shape, equation, precision);
+    if (est_scale_validates(&self->scale)) {
+        validate_alarm(self, shape, equation, precision);
     } else if (self->renewal == EST_RENEWAL_NONE) {
         renew_scale(self);
     } else {
@@ -254,9 +256,9 @@ EST_INLINE void watch_scale(est_t* const                self,
     }
 }
 
-/// True iff another reading of the edges in doubt may explain the innovations.
+/// True iff another hypothesis of the ambiguous edges may explain the innovations.
 static inline bool may_be_displaced(const est_t* const self) {
-    return (self->doubt_n > 0U) &&
+    return (self->ambiguity_n > 0U) &&
            (est_trigger_best_rival(&self->trigger) < (EST_LONE_EXPLAINED * self->config->trigger.ceiling));
 }
 
@@ -265,26 +267,27 @@ static inline bool returns_at_edge(const est_t* const self) {
     return (self->edge_age_n < AT_EDGE_N) && ((self->correlation.edge_outliers & EDGES_BEFORE) != 0U);
 }
 
-/// True iff this innovation alone lifted the statistic over the ceiling, and nothing else explains it. After a change of
-/// the plant the next innovation is large too. `term`: of the innovation in the cumulative sum.
+/// True iff this innovation alone lifted the statistic over the ceiling, and nothing else explains it. After a change
+/// of the plant the next innovation is large too. `term`: of the innovation in the cumulative sum.
 static inline bool is_lone_outlier(const est_t* const self, const float term) {
     if (may_be_displaced(self)) {
         return false;
     }
-    const float reached = self->trigger.statistic + est_max(self->correlation.lead, 0.0F);  // sum of the first reading
-    const float before  = (reached - term) + EST_CUSUM_DRIFT;
-    const float least   = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
+    const float reached =
+        self->trigger.statistic + est_max(self->correlation.lead, 0.0F);  // sum of the first hypothesis
+    const float before = (reached - term) + EST_CUSUM_DRIFT;
+    const float least  = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
     return (term > est_max(before * EST_LONE_RATIO, least)) && (term < FLT_MAX) && (self->bridged_n == 0U) &&
            is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
 }
 
-/// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic. A doubt about edges
-/// ends, since its readings have lost their base. The next innovation decides.
+/// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic. An ambiguity
+/// window about edges ends, since its hypotheses have lost their base. The next innovation decides.
 static inline void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
     self->bridged_n = OUTLIER_BRIDGED;
     predict(self, innovation);
     self->trigger.statistic = 0.0F;
-    self->doubt_n           = 0U;
+    self->ambiguity_n       = 0U;
     est_scale_discard_products(&self->scale);
     forget_innovations(self);
     if (self->edge_age_n < AT_EDGE_N) {
@@ -317,12 +320,12 @@ EST_INLINE void enter_innovation(
     est_trigger_enter(trigger, &self->config->trigger, e, self->noise_variance / precision, share * term, held);
 }
 
-/// Replace the offset to the reference by that of the codes, in theta of the delta form. Its last parameters are A(1) and
-/// B(1).
-static inline void add_reference(const est_t* const self, const est_shape_t shape, float* const plain) {
-    float* const b = &plain[shape.na + 1U];
+/// Replace the offset to the reference by that of the codes, in theta of the delta form. Its last parameters are A(1)
+/// and B(1).
+static inline void add_reference(const est_t* const self, const est_shape_t shape, float* const coefficients) {
+    float* const b = &coefficients[shape.na + 1U];
     if (shape.offset > 0U) {
-        b[shape.nb + shape.nc] += (plain[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
+        b[shape.nb + shape.nc] += (coefficients[shape.na] * self->reference_y) - (b[shape.nb - 1U] * self->reference_u);
     }
 }
 

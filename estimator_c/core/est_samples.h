@@ -31,7 +31,7 @@ static inline void forget_samples(est_t* const self) {
     self->known     = false;
     self->pending_n = count_past(self->config);
     if (EST_WITH_EDGES) {
-        self->doubt_n = 0U;
+        self->ambiguity_n = 0U;
     }
 }
 

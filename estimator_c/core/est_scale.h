@@ -14,12 +14,12 @@
 
 /// Phases of the scale. During a block it is the number of equations. Then come the stages of the update, one a step,
 /// so that none is long: correlation and dispersion of the innovations follow the block in phase EST_BLOCK_N, the noise
-/// variance follows it, a hidden change is found, and the next block begins. During a trial the phase is EST_PHASE_TRIAL
-/// and the number of equations.
+/// variance follows it, a hidden change is found, and the next block begins. During a validation the phase is
+/// EST_PHASE_VALIDATION and the number of equations.
 #define EST_PHASE_NOISE (EST_BLOCK_N + 1U)
 #define EST_PHASE_CHANGE (EST_BLOCK_N + 2U)
 #define EST_PHASE_END (EST_BLOCK_N + 3U)
-#define EST_PHASE_TRIAL EST_PHASE_END
+#define EST_PHASE_VALIDATION EST_PHASE_END
 
 /// Smallest share of a new block in the noise variance: a memory of 1,100 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
@@ -42,8 +42,8 @@
 #define EST_DISPERSION_GAIN 2.0F
 #define EST_DISPERSION_MAX 10.0F
 
-/// Smallest noise variance that is followed, in configured ones: quantisation alone, with the default. The innovations of
-/// a plant without noise come in bursts.
+/// Smallest noise variance that is followed, in configured ones: quantisation alone, with the default. The innovations
+/// of a plant without noise come in bursts.
 #define EST_NOISE_LEAST 0.07F
 
 /// Largest mean square of a block that counts, in noise variances. Before the trigger is armed, an outlier might pass
@@ -57,24 +57,24 @@
 #define EST_INFLATION_MAX 1.0e6F
 
 /// After an alarm, whose equation counts as the first, the old estimate is compared with the new one from equation
-/// EST_TRIAL_BEGIN_N + 1 to EST_TRIAL_N, and further until an edge of u came, but no further than EST_TRIAL_MAX_N. A
-/// trial that ends at an alarm needs EST_TRIAL_LEAST_N equations.
-#define EST_TRIAL_BEGIN_N 16U
-#define EST_TRIAL_LEAST_N 20U
-#define EST_TRIAL_N 56U
-#define EST_TRIAL_MAX_N 120U
+/// EST_VALIDATION_BEGIN_N + 1 to EST_VALIDATION_N, and further until an edge of u came, but no further than
+/// EST_VALIDATION_MAX_N. A validation that ends at an alarm needs EST_VALIDATION_LEAST_N equations.
+#define EST_VALIDATION_BEGIN_N 16U
+#define EST_VALIDATION_LEAST_N 20U
+#define EST_VALIDATION_N 56U
+#define EST_VALIDATION_MAX_N 120U
 
 /// An alarm is justified if the squared errors of the old estimate exceed those of the new one by this factor.
 #define EST_JUSTIFIED 4.0F
 
-/// A justified alarm is plain if its sum exceeds 64 expected variances per equation.
-#define EST_PLAIN (64.0F * ((float)EST_TRIAL_N - (float)EST_TRIAL_BEGIN_N) * EST_CUSUM_GAIN)
+/// A justified alarm is evident if its sum exceeds 64 expected variances per equation.
+#define EST_EVIDENT (64.0F * ((float)EST_VALIDATION_N - (float)EST_VALIDATION_BEGIN_N) * EST_CUSUM_GAIN)
 
-/// Blocks that justify an alarm which is not plain, and largest number of them: one alarm per 5,700 equations, at most
-/// four in close succession. A plant whose equations fit it only for a while justifies every alarm, but its squared
-/// errors stay comparable to the scale.
-#define EST_CREDIT_N 157U
-#define EST_CREDIT_MAX_N (4U * EST_CREDIT_N)
+/// Blocks that justify an alarm which is not evident, and largest number of them: one alarm per 5,700 equations, at
+/// most four in close succession. A plant whose equations fit it only for a while justifies every alarm, but its
+/// squared errors stay comparable to the scale.
+#define EST_BUDGET_N 157U
+#define EST_BUDGET_MAX_N (4U * EST_BUDGET_N)
 
 /// Mean square of a block, of the sum of its terms over their weight.
 #define EST_MEAN_SQUARE (1.0F / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE * (float)EST_BLOCK_N))
@@ -104,7 +104,7 @@ static inline void est_scale_init(est_t* const estimator) {
     if (estimator->config->noise_estimated) {
         self->share = 1.0F;
     }
-    self->credit_n = EST_CREDIT_MAX_N;
+    self->budget_n = EST_BUDGET_MAX_N;
     est_scale_restart(estimator);
 }
 
@@ -179,28 +179,28 @@ static inline void est_scale_count(est_scale_t* const self, const bool high) {
 /// Let the inflation decrease, and the number of alarms that may be justified increase, by one block.
 static inline void est_scale_relax(est_scale_t* const self) {
     self->inflation = est_max(self->inflation * EST_INFLATION_DECAY, 1.0F);
-    if (self->credit_n < EST_CREDIT_MAX_N) {
-        self->credit_n++;
+    if (self->budget_n < EST_BUDGET_MAX_N) {
+        self->budget_n++;
     }
 }
 
-/// Begin the trial of an alarm. The block restarts after it.
-static inline void est_scale_begin_trial(est_scale_t* const self) {
+/// Begin the validation of an alarm. The block restarts after it.
+static inline void est_scale_begin_validation(est_scale_t* const self) {
     self->sum   = 0.0F;
-    self->phase = (uint8_t)(EST_PHASE_TRIAL + 1U);
+    self->phase = (uint8_t)(EST_PHASE_VALIDATION + 1U);
 }
 
-/// True while an alarm is on trial.
-static inline bool est_scale_on_trial(const est_scale_t* const self) { return self->phase > EST_PHASE_TRIAL; }
+/// True while an alarm is under validation.
+static inline bool est_scale_validates(const est_scale_t* const self) { return self->phase > EST_PHASE_VALIDATION; }
 
-/// Conclude the trial of an alarm: the alarm is justified, or the scale is inflated.
+/// Conclude the validation of an alarm: the alarm is justified, or the scale is inflated.
 static inline void est_scale_conclude(est_t* const estimator) {
-    est_scale_t* const self      = &estimator->scale;
-    const bool         justified = (self->phase > (EST_PHASE_TRIAL + EST_TRIAL_LEAST_N)) && (self->sum > 0.0F);
-    if (justified && ((self->sum * self->weight) > EST_PLAIN)) {
-        // a plain one costs no credit
-    } else if (justified && (self->credit_n >= EST_CREDIT_N)) {
-        self->credit_n = (uint16_t)(self->credit_n - EST_CREDIT_N);
+    est_scale_t* const self = &estimator->scale;
+    const bool justified    = (self->phase > (EST_PHASE_VALIDATION + EST_VALIDATION_LEAST_N)) && (self->sum > 0.0F);
+    if (justified && ((self->sum * self->weight) > EST_EVIDENT)) {
+        // an evident one costs no budget
+    } else if (justified && (self->budget_n >= EST_BUDGET_N)) {
+        self->budget_n = (uint16_t)(self->budget_n - EST_BUDGET_N);
     } else if (self->inflation < EST_INFLATION_MAX) {
         self->inflation *= EST_INFLATION_STEP;
     } else {
@@ -209,17 +209,19 @@ static inline void est_scale_conclude(est_t* const estimator) {
     est_scale_restart(estimator);
 }
 
-/// Enter one equation into the trial of an alarm: the squared errors of the old and the new estimate, the latter
-/// relative to its variance. The sum is that of the trial instead of a block. Return false iff the equation is the last
-/// one.
-EST_INLINE bool
-est_scale_try(est_scale_t* const self, const float old_square, const float new_square, const uint_fast16_t edge_age_n) {
+/// Enter one equation into the validation of an alarm: the squared errors of the old and the new estimate, the latter
+/// relative to its variance. The sum is that of the validation instead of a block. Return false iff the equation is the
+/// last one.
+EST_INLINE bool est_scale_validate(est_scale_t* const  self,
+                                   const float         old_square,
+                                   const float         new_square,
+                                   const uint_fast16_t edge_age_n) {
     self->phase++;
-    const uint32_t n = (uint32_t)self->phase - EST_PHASE_TRIAL;
-    if (n > EST_TRIAL_BEGIN_N) {
+    const uint32_t n = (uint32_t)self->phase - EST_PHASE_VALIDATION;
+    if (n > EST_VALIDATION_BEGIN_N) {
         self->sum += old_square - (EST_JUSTIFIED * new_square);
     }
-    return (n < EST_TRIAL_N) || ((edge_age_n >= n) && (n < EST_TRIAL_MAX_N));
+    return (n < EST_VALIDATION_N) || ((edge_age_n >= n) && (n < EST_VALIDATION_MAX_N));
 }
 
 #endif  // EST_SCALE_H_INCLUDED

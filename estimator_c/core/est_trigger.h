@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: MIT
-/// Change triggers. They see the innovation and its variance, under every reading of the edges in doubt, and nothing
-/// else of the estimator. A trigger of the user is a function in the configuration (est_trigger_fn). A new trigger of
-/// the library needs a new est_trigger_kind_t, a function here, and a value in device/, catalogue/ and harness/.
+/// Change triggers. They see the innovation and its variance, under every hypothesis of the ambiguous edges, and
+/// nothing else of the estimator. A trigger of the user is a function in the configuration (est_trigger_fn). A new
+/// trigger of the library needs a new est_trigger_kind_t, a function here, and a value in device/, catalogue/ and
+/// harness/.
 
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
@@ -26,7 +27,7 @@ typedef enum {
     EST_QUIET     = 0,
     EST_ALARM     = 1,
     EST_SLIP      = 2,  ///< the edges of u have moved by one sample; the plant has not changed
-    EST_UNDECIDED = 3,  ///< the statistic has reached the ceiling, that of another reading of the edges has not
+    EST_UNDECIDED = 3,  ///< the statistic has reached the ceiling, that of another hypothesis of the edges has not
 } est_finding_t;
 
 /// Prepare for the first innovation. The statistic is held at zero for the next quiet_n innovations.
@@ -39,29 +40,29 @@ static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t
     }
 }
 
-/// Begin a doubt: all readings of the edges start from the present statistic.
-static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
+/// Begin an ambiguity window: all hypotheses of the edges start from the present statistic.
+static inline void est_trigger_begin_ambiguity(est_trigger_t* const self) {
     EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
+    for (uint_fast8_t i = 0U; i < EST_OTHER_HYPOTHESES; i++) {
         self->rival[i] = self->statistic;
     }
 }
 
-/// Smaller statistic of the two other readings: that of the better explanation.
+/// Smaller statistic of the two other hypotheses: that of the better explanation.
 static inline float est_trigger_best_rival(const est_trigger_t* const self) {
     return est_min(self->rival[0], self->rival[1]);
 }
 
-/// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
-static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
+/// True iff another hypothesis of the ambiguous edges explains the innovations better than the recorded one.
+static inline bool est_trigger_is_ambiguous(const est_trigger_t* const self) {
     return est_trigger_best_rival(self) < self->statistic;
 }
 
-/// End a doubt before its term, because a gap removes the samples that the other readings need. Return true iff it
-/// was a slip: the recorded reading has passed the ceiling, and another reading explained the innovations. Otherwise
-/// the statistic continues from the best reading. At its term, by contrast, a doubt has seen the whole effect of an
-/// edge, and the recorded reading continues.
-static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
+/// End an ambiguity window before its term, because a gap removes the samples that the other hypotheses need. Return
+/// true iff it was a slip: the recorded hypothesis has passed the ceiling, and another hypothesis explained the
+/// innovations. Otherwise the statistic continues from the best hypothesis. At its term, by contrast, an ambiguity
+/// window has seen the whole effect of an edge, and the recorded hypothesis continues.
+static inline bool est_trigger_end_ambiguity(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
         return true;
     }
@@ -69,7 +70,7 @@ static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_tr
     return false;
 }
 
-/// Make the better of the other readings the statistic. Return true iff it is the one with late edges.
+/// Make the better of the other hypotheses the statistic. Return true iff it is the one with late edges.
 static inline bool est_trigger_settle_late(est_trigger_t* const self) {
     const bool late = self->rival[1] < self->rival[0];
     self->statistic = est_trigger_best_rival(self);
@@ -90,7 +91,7 @@ static inline bool est_trigger_settle_late(est_trigger_t* const self) {
 #define EST_LONE_LEAST 6.0F
 #define EST_LONE_RATIO 30.0F
 
-/// Part of the ceiling below which the sum of another reading explains an outlier.
+/// Part of the ceiling below which the sum of another hypothesis explains an outlier.
 #define EST_LONE_EXPLAINED 0.5F
 
 /// Scale of the innovation before it is squared; a power of two, so that nothing is rounded. The scaled square
@@ -111,25 +112,27 @@ static inline float est_trigger_sum(const float before, const float term) {
     return est_max(0.0F, sum);
 }
 
-/// Enter the innovation under the other readings of the edges in doubt. `share`: as from est_edges_shares().
-static inline void est_trigger_enter_readings(est_trigger_t* const self,
-                                              const float          innovation,
-                                              const float* const   share,
-                                              const float          weight) {
+/// Enter the innovation under the other hypotheses of the ambiguous edges. `share`: as from est_edges_shares().
+static inline void est_trigger_enter_hypotheses(est_trigger_t* const self,
+                                                const float          innovation,
+                                                const float* const   share,
+                                                const float          weight) {
     self->rival[0] = est_trigger_sum(self->rival[0], est_trigger_term(innovation - share[0], weight));
     self->rival[1] = est_trigger_sum(self->rival[1], est_trigger_term(innovation + share[1], weight));
 }
 
-/// Judge all readings of the edges, after the innovation was entered into each. The plant has changed only if no reading
-/// explains the innovations, or if theta has overflowed. `doubt_n`: duration of the doubt so far, at most EST_DOUBT_N.
+/// Judge all hypotheses of the edges, after the innovation was entered into each. The plant has changed only if no
+/// hypothesis explains the innovations, or if theta has overflowed. `ambiguity_n`: duration of the ambiguity window so
+/// far, at most EST_AMBIGUITY_N.
 EST_INLINE est_finding_t est_trigger_find(const est_trigger_t* const self,
                                           const float                ceiling,
-                                          const uint_fast8_t         doubt_n) {
+                                          const uint_fast8_t         ambiguity_n) {
     if (self->statistic < ceiling) {
         return EST_QUIET;
     }
-    if (EST_WITH_EDGES && (doubt_n > 0U) && (est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
-        return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_UNDECIDED;
+    if (EST_WITH_EDGES && (ambiguity_n > 0U) && (est_trigger_best_rival(self) < ceiling) &&
+        (self->statistic < FLT_MAX)) {
+        return (ambiguity_n >= EST_AMBIGUITY_N) ? EST_SLIP : EST_UNDECIDED;
     }
     return EST_ALARM;
 }
@@ -178,8 +181,8 @@ EST_INLINE bool est_trigger_holds(est_trigger_t* const self) {
 /// Share of a term that counts. A theta that overflows raises an alarm although the statistic is held at zero.
 EST_INLINE float est_trigger_share(const bool held) { return held ? 0.0F : 1.0F; }
 
-/// Enter one innovation [codes] as recorded, with its variance [codes^2] and its term in the cumulative sum. The term is
-/// zero while the statistic is held.
+/// Enter one innovation [codes] as recorded, with its variance [codes^2] and its term in the cumulative sum. The term
+/// is zero while the statistic is held.
 EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
                                   const est_trigger_config_t* const config,
                                   const float                       innovation,

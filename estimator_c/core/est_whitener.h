@@ -42,8 +42,9 @@ static inline bool est_whitener_accepts(const float* const c, const uint_fast8_t
     return true;
 }
 
-/// Store the gains of the newest equation and determine the filter from them. With D = 1 - z^-1, its equation D^n w(k) = x(k) - sum of step[j] D^j
-/// w(k-1) is that of x(k) = w(k) + gain[0] w(k-1) + ..., without the rounding of products that cancel.
+/// Store the gains of the newest equation and determine the filter from them. With D = 1 - z^-1, its equation D^n w(k)
+/// = x(k) - sum of step[j] D^j w(k-1) is that of x(k) = w(k) + gain[0] w(k-1) + ..., without the rounding of products
+/// that cancel.
 static inline void store_gains(est_whitener_t* const self, const float* const gain) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_GAIN_COLUMNS; i++) {

@@ -310,7 +310,7 @@ static bool run_long(record_t* const self, const uint32_t run_number) {
             enter_number(self, estimator.correlation.partial[0]);
             enter_number(self, estimator.correlation.partial[1]);
         }
-        self->readings += est_correlation_reads(&estimator.correlation) ? 1U : 0U;
+        self->readings += est_correlation_coloured(&estimator.correlation) ? 1U : 0U;
     }
     enter_end(self, &estimator);
     return true;

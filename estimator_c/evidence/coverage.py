@@ -30,7 +30,7 @@ ELSEWHERE = {
         f"EST_WITH_{what} || ": "what is left out of a build is refused there: tests/estimator_c/test_est_builds.py"
         for what in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH")
     },
-    "judge_readings(self, shape": "inlined here: a build for speed reads the innovation of a first sample as it is",
+    "judge_hypotheses(self, shape": "inlined here: a build for speed reads the innovation of a first sample as it is",
     "config->kind != EST_TRIGGER_CUSUM": "the sum comes here in a build without robustness: test_est_builds.py",
     "(config->refresh_n == 0U))) &&": "the end of the line above, which begins with EST_WITH_ADAPTATION",
     "autocovariance(self->c, i)": "a function in line where the lag is never 0; the line above has the call with 0",

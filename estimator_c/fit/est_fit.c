@@ -12,7 +12,7 @@
 #define ENTERED_END (EST_FIT_LINES_N / ENTERED_N)
 #define DRAWS_FROM 8U
 #define DRAWS_PERIOD 4U
-#define DRAWS_TURN 2U
+#define DRAWS_SLOT 2U
 
 /// Samples of the evaluation: the lines, several each, and the regions one by one; the causes one by one; the
 /// conclusion.
@@ -85,11 +85,11 @@
 #define UNJUSTIFIED_N 2U
 
 /// A line is hum if its share of the power of the sums exceeds LINE_SHARE, and its share of the energy of the
-/// innovations that of the regions by REGIONS_HUM: the response of a plant that is not linear has peaks too. Between two
-/// lines, some of its power is in others; BETWEEN makes up for it. In the LOW_LINES_N lowest lines noise that jumps has
-/// peaks, and LOW_SHARE applies. A line is steady if neither block has more than STEADY times the other's power, and its
-/// frequency differs by no more than BESIDE [lines]. A mean is drift if its share exceeds MEAN_SHARE: noise of low
-/// frequency has means too.
+/// innovations that of the regions by REGIONS_HUM: the response of a plant that is not linear has peaks too. Between
+/// two lines, some of its power is in others; BETWEEN makes up for it. In the LOW_LINES_N lowest lines noise that jumps
+/// has peaks, and LOW_SHARE applies. A line is steady if neither block has more than STEADY times the other's power,
+/// and its frequency differs by no more than BESIDE [lines]. A mean is drift if its share exceeds MEAN_SHARE: noise of
+/// low frequency has means too.
 #define LINE_SHARE 0.66F
 #define LOW_SHARE 0.79F
 #define LOW_LINES_N 3U
@@ -175,13 +175,14 @@ static float predicted_difference(const est_t* const estimator, const float inno
     return estimator->whitener.past[0].x[0] - innovation;
 }
 
-/// Enter an innovation into the sums that are costly. After an edge in doubt it says nothing on the state of the plant.
+/// Enter an innovation into the sums that are costly. After an ambiguous edge it says nothing on the state of the
+/// plant.
 static void draw(est_fit_watch_t* const self, const est_t* const estimator, const float z, const float innovation) {
     est_fit_sums_t* const sums  = &self->sums;
     const float           moved = predicted_difference(estimator, innovation);
     sums->moved_n++;
     sums->moved += moved * moved;
-    if (estimator->doubt_n == 0U) {
+    if (estimator->ambiguity_n == 0U) {
         sums->drawn_n++;
         sums->drawn += z * z;
         self->regions[self->region] += z;
@@ -278,7 +279,9 @@ static float reference_variance(const est_fit_watch_t* const self) {
 }
 
 /// Number of innovations in the spectrum.
-static float clear_count_of(const est_fit_watch_t* const self) { return count_of(self) - (float)self->sums.doubted_n; }
+static float clear_count_of(const est_fit_watch_t* const self) {
+    return count_of(self) - (float)self->sums.ambiguous_n;
+}
 
 /// Energy in the spectrum at that variance.
 static float clear_energy_of(const est_fit_watch_t* const self) {
@@ -339,8 +342,8 @@ static float weigh_tails(const est_fit_watch_t* const self) {
     return beyond / (level * level * number(EST_FIT_BLOCK_N) * TAILS);
 }
 
-/// Weigh noise that grows with the steepness of y, in this block and the one before: energy where y is steep, beyond its
-/// share. Its variance is proportional to the squared deviations of the steepness.
+/// Weigh noise that grows with the steepness of y, in this block and the one before: energy where y is steep, beyond
+/// its share. Its variance is proportional to the squared deviations of the steepness.
 static float weigh_steepness(est_fit_watch_t* const self) {
     const est_fit_sums_t* const sums      = &self->sums;
     const float                 n         = (float)sums->energy_n;
@@ -366,8 +369,8 @@ static float find_noise(const est_fit_watch_t* const self) {
     return est_max(est_max(along, uneven), excess);
 }
 
-/// Weigh noise over this block and the one before. Correlation over EST_FIT_SUM_N samples may be in one block alone, and
-/// so may outliers without any alarm: a change of the plant has one. In the first block that states nothing yet.
+/// Weigh noise over this block and the one before. Correlation over EST_FIT_SUM_N samples may be in one block alone,
+/// and so may outliers without any alarm: a change of the plant has one. In the first block that states nothing yet.
 static float weigh_noise(est_fit_watch_t* const self, const est_t* const estimator) {
     if (scale_misfit(estimator) > (2.0F * self->inflation)) {
         self->alarms_n = (uint16_t)(self->alarms_n + UNJUSTIFIED_N);
@@ -550,12 +553,12 @@ static void evaluate_region(est_fit_watch_t* const self, const uint32_t region) 
 /// Do the share of the evaluation that falls to one of the samples after the block.
 static void evaluate(est_fit_watch_t* const self, const est_t* const estimator, const uint32_t slot) {
     if ((slot >= ENTERED_END) && (slot < EVALUATED_END)) {
-        const uint32_t turn = slot - ENTERED_END;
-        for (uint32_t line = EVALUATED_N * turn; (line < (EVALUATED_N * (turn + 1U))) && (line < EST_FIT_LINES_N);
+        const uint32_t part = slot - ENTERED_END;
+        for (uint32_t line = EVALUATED_N * part; (line < (EVALUATED_N * (part + 1U))) && (line < EST_FIT_LINES_N);
              line++) {
             evaluate_line(self, line);
         }
-        evaluate_region(self, turn);
+        evaluate_region(self, part);
     } else if ((slot < ENTERED_END) || (slot > CONCLUSION) || !is_enough(self)) {
         // the last sum is not in the lines yet, the evaluation is complete, or there is nothing to state
     } else if (slot < CONCLUSION) {
@@ -591,18 +594,18 @@ work_on_regions(est_fit_watch_t* const self, const est_t* const estimator, const
         draw(self, estimator, z, step.innovation);
     }
     // an edge of a generator that drifts leaves a response to it
-    count_energy(self, estimator->settled && (estimator->doubt_n == 0U));
+    count_energy(self, estimator->settled && (estimator->ambiguity_n == 0U));
     if ((step.status == EST_UPDATED) || (step.status == EST_GATHERING)) {
         find_region(self, estimator);
     }
 }
 
 /// Limit an innovation beyond its limit. It counts as an outlier if nothing else explains it: no innovation before it,
-/// no edge in doubt, no slip, and no gap of late.
+/// no ambiguous edge, no slip, and no gap of late.
 static float limit_innovation(est_fit_watch_t* const self, const est_t* const estimator, const est_step_t step) {
     const float limit   = self->limit * self->limit;
     const float square  = step.innovation * step.innovation;
-    const bool  judged  = (estimator->doubt_n == 0U) && estimator->settled && estimator->known;
+    const bool  judged  = (estimator->ambiguity_n == 0U) && estimator->settled && estimator->known;
     const bool  follows = (self->slot > 0U) && (self->slot == self->beyond_end);
     float       factor  = limit;
     if (follows) {
@@ -628,13 +631,13 @@ static float add_innovation(est_fit_watch_t* const self, const est_t* const esti
     const float square = z * z;
     sums->squares += square;
     sums->fourths += square * square;
-    if (estimator->doubt_n == 0U) {
+    if (estimator->ambiguity_n == 0U) {
         self->sum += z;
         sums->along += z * self->last;
         self->last = z;
     } else {
         sums->total += z;
-        sums->doubted_n++;
+        sums->ambiguous_n++;
     }
     return z;
 }
@@ -656,7 +659,7 @@ static void enter_sample(est_fit_watch_t* const self, const est_t* const estimat
     } else {
         self->sums.lost_n++;
     }
-    if ((self->slot % DRAWS_PERIOD) == DRAWS_TURN) {
+    if ((self->slot % DRAWS_PERIOD) == DRAWS_SLOT) {
         work_on_regions(self, estimator, step, z);
     }
 }

@@ -70,11 +70,11 @@ typedef struct {
     float total;    ///< of the innovations; of the clear ones up to the last sum
     float squares;  ///< of their squares
     float fourths;  ///< of their squares, less limited, times the squares
-    float along;    ///< of the products of a clear innovation and the clear one before; clear: no edge of u is in doubt
-    float power;    ///< of the squares of the sums of the clear ones over EST_FIT_SUM_N samples
-    float counted;  ///< part of `squares` that the regions contain
-    float moved;    ///< of the squares of the whitened second difference of y, as predicted
-    float drawn;    ///< of the squares of the innovations drawn for the regions
+    float along;  ///< of the products of a clear innovation and the clear one before; clear: no edge of u is ambiguous
+    float power;  ///< of the squares of the sums of the clear ones over EST_FIT_SUM_N samples
+    float counted;            ///< part of `squares` that the regions contain
+    float moved;              ///< of the squares of the whitened second difference of y, as predicted
+    float drawn;              ///< of the squares of the innovations drawn for the regions
     float explained;          ///< energy of these that the regions explain beyond chance
     float repeated;           ///< energy of these that the regions of the block before explain
     float uneven;             ///< squared deviations of the energies of the regions, over their numbers
@@ -83,7 +83,7 @@ typedef struct {
     float steepness;          ///< of y before each of these
     float steepness_squares;  ///< squares of these
     uint16_t lost_n;          ///< samples without an innovation, or whose innovation is excluded
-    uint16_t doubted_n;       ///< innovations that are not clear
+    uint16_t ambiguous_n;     ///< innovations that are not clear
     uint16_t counted_n;       ///< innovations in `counted`
     uint16_t moved_n;         ///< differences in `moved`
     uint16_t drawn_n;         ///< innovations in `drawn`

@@ -8,7 +8,7 @@
 
 #define EFFECTS EST_ISOLATION_EFFECTS_N
 #define JOINT EST_ISOLATION_JOINT_N
-#define PUSHES EST_ISOLATION_PUSHES_N
+#define IMPULSES EST_ISOLATION_IMPULSES_N
 #define TRIANGLE_N ((JOINT * (JOINT + 1U)) / 2U)
 #define SINGLES EST_ISOLATION_SINGLES_N
 #define CHANNELS EST_ISOLATION_CHANNELS_N
@@ -316,7 +316,8 @@ static void drive_displacement(const est_isolation_t* const self, const uint16_t
     }
 }
 
-/// Compute the inputs of all effects for an onset `age_n` samples ago. The second impulse is a past value of its effect.
+/// Compute the inputs of all effects for an onset `age_n` samples ago. The second impulse is a past value of its
+/// effect.
 static void drive(const est_isolation_t* const self, const uint16_t age_n, float* const out) {
     drive_plant(self, age_n, out);
     out[PARAMETERS]      = (age_n == 1U) ? 1.0F : 0.0F;
@@ -364,7 +365,7 @@ static void clear_onset(est_onset_t* const onset) {
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_FAULTS_N; i++) {
         onset->known[i] = 0.0F;
-        for (uint8_t j = 0U; j < PUSHES; j++) {
+        for (uint8_t j = 0U; j < IMPULSES; j++) {
             onset->shared[i][j] = 0.0F;
         }
     }
@@ -409,7 +410,7 @@ static void enter_onset(est_isolation_t* const self, est_onset_t* const onset) {
         const float weight = now[JOINT + i] * nats;
         onset->known[i] += weight * now[JOINT + i];
         EST_UNROLL
-        for (uint_fast8_t j = 0U; j < PUSHES; j++) {
+        for (uint_fast8_t j = 0U; j < IMPULSES; j++) {
             onset->shared[i][j] += weight * now[PARAMETERS + j];
         }
     }
@@ -490,15 +491,15 @@ EST_INLINE void enter_single(est_isolation_t* const self,
 /// The impulses of one onset, the second less its share of the first. Private.
 typedef struct {
     float share;
-    float variance[PUSHES];  ///< doubled
-    float change[PUSHES];
+    float variance[IMPULSES];  ///< doubled
+    float change[IMPULSES];
     float gain;
-} pushes_t;
+} impulses_t;
 
-static pushes_t free_pushes(const est_isolation_t* const self, const est_onset_t* const onset) {
+static impulses_t free_impulses(const est_isolation_t* const self, const est_onset_t* const onset) {
     const float* const first  = &onset->matrix[(PARAMETERS * (PARAMETERS + 1U)) / 2U];
     const float* const second = &first[PARAMETERS + 1U];
-    pushes_t           out;
+    impulses_t         out;
     out.variance[0]  = 1.0F / (first[PARAMETERS] + self->nats);
     out.share        = second[PARAMETERS] * out.variance[0];
     out.variance[1]  = 1.0F / (greater(second[PARAMETERS + 1U] - (out.share * second[PARAMETERS]), 0.0F) + self->nats);
@@ -511,25 +512,25 @@ static pushes_t free_pushes(const est_isolation_t* const self, const est_onset_t
 
 /// Weigh the parameters for one onset. The impulses are eliminated from the normal equations.
 static void weigh_plant(est_isolation_t* const self, const uint8_t number) {
-    est_fit_t* const         fit    = &self->fit;
-    const est_onset_t* const onset  = &self->onsets[number];
-    const pushes_t           pushes = free_pushes(self, onset);
-    const float* const       first  = &onset->matrix[(PARAMETERS * (PARAMETERS + 1U)) / 2U];
-    const float* const       second = &first[PARAMETERS + 1U];
-    const float*             row    = onset->matrix;
+    est_fit_t* const         fit      = &self->fit;
+    const est_onset_t* const onset    = &self->onsets[number];
+    const impulses_t         impulses = free_impulses(self, onset);
+    const float* const       first    = &onset->matrix[(PARAMETERS * (PARAMETERS + 1U)) / 2U];
+    const float* const       second   = &first[PARAMETERS + 1U];
+    const float*             row      = onset->matrix;
     float                    rest[PARAMETERS];
     one_t                    ones[PARAMETERS];
     for (uint8_t i = 0U; i < PARAMETERS; i++) {
         float       left[PARAMETERS];
-        const float share = first[i] * pushes.variance[0];
-        rest[i]           = second[i] - (pushes.share * first[i]);
+        const float share = first[i] * impulses.variance[0];
+        rest[i]           = second[i] - (impulses.share * first[i]);
         for (uint8_t j = 0U; j <= i; j++) {
-            left[j] = row[j] - (share * first[j]) - ((rest[i] * pushes.variance[1]) * rest[j]);
+            left[j] = row[j] - (share * first[j]) - ((rest[i] * impulses.variance[1]) * rest[j]);
         }
-        const float vector = onset->vector[i] - (first[i] * pushes.change[0]) - (rest[i] * pushes.change[1]);
+        const float vector = onset->vector[i] - (first[i] * impulses.change[0]) - (rest[i] * impulses.change[1]);
         const float known  = left[i] + PRIOR;
         const float change = vector / known;
-        const float gain   = pushes.gain + (vector * change);
+        const float gain   = impulses.gain + (vector * change);
         ones[i]            = (one_t){ .vector = vector, .known = known, .change = change, .gain = gain };
         enter_single(self, i, number, gain, change, known);
         for (uint8_t j = 0U; j < i; j++) {
@@ -548,17 +549,17 @@ typedef struct {
 
 /// Evidence of one onset for a fault whose effect is linear in its size. A delay has the size 1.
 EST_INLINE fault_t weigh_linear(const est_onset_t* const onset,
-                                const pushes_t* const    pushes,
+                                const impulses_t* const  impulses,
                                 const uint_fast8_t       i,
                                 const bool               delays) {
     const float* const shared = onset->shared[i];
-    const float        rest   = shared[1] - (pushes->share * shared[0]);
-    const float        vector = onset->vector[JOINT + i] - (shared[0] * pushes->change[0]) - (rest * pushes->change[1]);
-    const float        known =
-        onset->known[i] - ((shared[0] * pushes->variance[0]) * shared[0]) - ((rest * pushes->variance[1]) * rest);
+    const float        rest   = shared[1] - (impulses->share * shared[0]);
+    const float vector = onset->vector[JOINT + i] - (shared[0] * impulses->change[0]) - (rest * impulses->change[1]);
+    const float known =
+        onset->known[i] - ((shared[0] * impulses->variance[0]) * shared[0]) - ((rest * impulses->variance[1]) * rest);
     const float left   = greater(known, 1.0e-9F);  // smaller only by rounding
     const float change = delays ? 1.0F : (vector / left);
-    const float gain   = pushes->gain + (((2.0F * vector) - (left * change)) * change);
+    const float gain   = impulses->gain + (((2.0F * vector) - (left * change)) * change);
     return (fault_t){ .known = delays ? 0.0F : left, .change = change, .gain = gain };
 }
 
@@ -577,7 +578,7 @@ static uint8_t fault_of(const uint_fast8_t channel, const uint_fast8_t kind) {
 /// the force it shows in the force too.
 static void weigh_faults(est_isolation_t* const self, const uint8_t number) {
     const est_onset_t* const onset           = &self->onsets[number];
-    const pushes_t           pushes          = free_pushes(self, onset);
+    const impulses_t         impulses        = free_impulses(self, onset);
     const uint16_t           age_n           = age_of(self, onset);
     const float              n               = (float)age_n;
     const float              noise           = gain_of_variance(onset->energy, n);
@@ -586,7 +587,7 @@ static void weigh_faults(est_isolation_t* const self, const uint8_t number) {
     for (uint_fast8_t channel = 0U; channel < CHANNELS; channel++) {
         fault_t stuck = { .gain = onset->energy };
         for (uint_fast8_t kind = 0U; kind < LINEAR_N; kind++) {
-            fault_t found = weigh_linear(onset, &pushes, (uint_fast8_t)((channel * LINEAR_N) + kind), kind == DELAY);
+            fault_t found = weigh_linear(onset, &impulses, (uint_fast8_t)((channel * LINEAR_N) + kind), kind == DELAY);
             if ((channel == FORCE) && (kind == OFFSET)) {
                 stuck = found;
             }
@@ -774,7 +775,7 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
         self->same_n[i]   = 0U;
     }
     self->active      = true;
-    self->turn        = 0U;
+    self->slot        = 0U;
     self->worked_n    = 0U;
     self->waiting_n   = self->onsets[0].before_n;
     self->nats        = 0.5F / est_scale(estimator);  // the misfit of the model is noise to isolation
@@ -878,13 +879,13 @@ bool est_isolation_work(est_isolation_t* const self) {
     if (!self->active || (self->waiting_n == 0U)) {
         return false;
     }
-    if (self->turn == 0U) {
+    if (self->slot == 0U) {
         begin_sample(self);
-    } else if (self->turn <= ENTERED) {
-        enter_onsets(self, (uint8_t)(AT_ONCE * (self->turn - 1U)));
-    } else if (self->turn <= WEIGHED) {
-        const uint8_t number = (uint8_t)((self->turn - (ENTERED + 1U)) / 2U);
-        if (((self->turn - ENTERED) % 2U) == 1U) {
+    } else if (self->slot <= ENTERED) {
+        enter_onsets(self, (uint8_t)(AT_ONCE * (self->slot - 1U)));
+    } else if (self->slot <= WEIGHED) {
+        const uint8_t number = (uint8_t)((self->slot - (ENTERED + 1U)) / 2U);
+        if (((self->slot - ENTERED) % 2U) == 1U) {
             weigh_plant(self, number);
         } else {
             weigh_faults(self, number);
@@ -892,9 +893,9 @@ bool est_isolation_work(est_isolation_t* const self) {
     } else {
         diagnose(self);
     }
-    self->turn++;
-    if (self->turn >= self->slices_n) {
-        self->turn = 0U;
+    self->slot++;
+    if (self->slot >= self->slices_n) {
+        self->slot = 0U;
         self->waiting_n--;
     }
     return self->waiting_n > 0U;

@@ -41,10 +41,10 @@ extern "C" {
 #define EST_ISOLATION_LAGS_N 3U
 
 /// Number of impulses at the onset. They stand for the deviation of the filter's two states if the onset was earlier.
-#define EST_ISOLATION_PUSHES_N 2U
+#define EST_ISOLATION_IMPULSES_N 2U
 
 /// Number of effects that are weighed together: those of M, B, K, and of the impulses.
-#define EST_ISOLATION_JOINT_N (3U + EST_ISOLATION_PUSHES_N)
+#define EST_ISOLATION_JOINT_N (3U + EST_ISOLATION_IMPULSES_N)
 
 /// Number of channels, the force and the displacement.
 #define EST_ISOLATION_CHANNELS_N 2U
@@ -114,8 +114,8 @@ typedef struct {
     /// Normal equations of the joint effects: lower triangle by rows. Right-hand side of all effects.
     float   matrix[EST_ISOLATION_JOINT_N * (EST_ISOLATION_JOINT_N + 1U) / 2U];
     float   vector[EST_ISOLATION_EFFECTS_N];
-    float   known[EST_ISOLATION_FAULTS_N];                           ///< normal equations of each fault
-    float   shared[EST_ISOLATION_FAULTS_N][EST_ISOLATION_PUSHES_N];  ///< their elements with the impulses
+    float   known[EST_ISOLATION_FAULTS_N];                             ///< normal equations of each fault
+    float   shared[EST_ISOLATION_FAULTS_N][EST_ISOLATION_IMPULSES_N];  ///< their elements with the impulses
     float   energy;    ///< log-likelihood of the residual since the onset, negated [nats]
     float   unrest;    ///< log-likelihood ratio of a noisy force since the onset [nats]
     uint8_t before_n;  ///< samples from this onset to the alarm
@@ -171,7 +171,7 @@ typedef struct {
     uint8_t             since_n;     ///< samples since the last alarm, or since whitening began anew
     uint8_t             repeated_n;  ///< samples from the alarm that is being diagnosed to the last alarm
     uint8_t             waiting_n;   ///< samples waiting for work
-    uint8_t             turn;        ///< next slice of the present sample
+    uint8_t             slot;        ///< next slice of the present sample
     uint8_t             slices_n;    ///< number of slices of the present sample
     uint8_t             begun_n;     ///< onsets before the present sample
     uint16_t            worked_n;    ///< samples from the first onset to the present one
@@ -204,8 +204,8 @@ void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_samp
 
 /// Do one slice of the work after an alarm. Return true iff more work is waiting. A sample needs five calls, and
 /// EST_ISOLATION_SLICES_N if none comes after it: the more slices per sample, the more samples are weighed. If more
-/// than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided. Cost: some 710 instructions on a Cortex-M4F, at most 1,720; none before an alarm. May be
-/// called from an interrupt.
+/// than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided. Cost: some 710 instructions on a
+/// Cortex-M4F, at most 1,720; none before an alarm. May be called from an interrupt.
 bool est_isolation_work(est_isolation_t* self);
 
 /// Diagnosis of the last alarm. The change is stated once it is 95 % certain, and is then final. The extent is refined

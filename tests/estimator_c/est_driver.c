@@ -26,10 +26,10 @@ static void set_theta(const double* theta) {
     }
     if (est_delta_applies(&self)) {
         float a[] = { 1.0F, self.theta[0], self.theta[1] };
-        est_delta_from_plain(a, 2U);
+        est_delta_from_coefficients(a, 2U);
         self.theta[0] = a[1];
         self.theta[1] = a[2];
-        est_delta_from_plain(&self.theta[2], (uint_fast8_t)(config.nb - 1U));
+        est_delta_from_coefficients(&self.theta[2], (uint_fast8_t)(config.nb - 1U));
     }
 }
 
@@ -183,7 +183,7 @@ void driver_inflate(double inflation) { self.scale.inflation = (float)inflation;
 int driver_correlation(double* partial) {
     partial[0] = self.correlation.partial[0];
     partial[1] = self.correlation.partial[1];
-    return est_correlation_reads(&self.correlation) ? 1 : 0;
+    return est_correlation_coloured(&self.correlation) ? 1 : 0;
 }
 
 /* Damages the state in one way, asks for the invariants, and mends it. */

@@ -44,8 +44,8 @@ def test_a_fused_multiplication_would_be_noticed(expected: str) -> None:
         ("est_correlation.h", "EST_PARTIAL_MAX", "0.97F"),
         ("est_scale.h", "EST_DISPERSION_MAX", "11.0F"),
         ("est_scale.h", "EST_INFLATION_DECAY", "0.9999F"),
-        ("est_scale.h", "EST_TRIAL_MAX_N", "121U"),
-        ("est_scale.h", "EST_CREDIT_N", "150U"),
+        ("est_scale.h", "EST_VALIDATION_MAX_N", "121U"),
+        ("est_scale.h", "EST_BUDGET_N", "150U"),
     ],
 )
 def test_an_altered_constant_of_the_scale_or_the_second_reading_changes_the_bits(

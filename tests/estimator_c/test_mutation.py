@@ -19,7 +19,7 @@ def test_explanations_are_of_mutants_that_there_are() -> None:
 
 def test_functions_whose_type_stands_on_a_line_of_its_own_are_altered() -> None:
     named = {mutant.function for mutant in mutate.mutants()}
-    assert {"judge_readings", "est_equation_update_theta", "est_scale_try"} <= named
+    assert {"judge_hypotheses", "est_equation_update_theta", "est_scale_validate"} <= named
 
 
 @pytest.mark.parametrize(
