@@ -401,7 +401,7 @@ typedef struct {
 /// Effect of the recent edges of u under the other hypotheses. Private to est_edges.h.
 typedef struct {
     est_past_t past[EST_OTHER_HYPOTHESES];  ///< their share in the whitened equations
-    float      theta[EST_THETA_MAX];  ///< theta before the first of these edges, or before an alarm under validation
+    float      theta[EST_THETA_MAX];        ///< theta before the first of these edges
 #if EST_WITH_ROBUSTNESS
     float along;   ///< sum of innovation times the effect of a displaced edge, since the edge
     float span;    ///< sum of that effect squared
@@ -414,21 +414,25 @@ typedef struct {
 typedef struct {
     uint16_t quiet_n;  ///< remaining innovations during which the statistic is held at zero
     uint16_t mean_n;   ///< innovations in the mean between faults; 0: the next one is the first
+    float    mean;     ///< mean between faults [codes]
     float    statistic;
-    float    rival[EST_OTHER_HYPOTHESES];  ///< cumulative sum under each other hypothesis; rival[0] also holds the mean
+    float    rival[EST_OTHER_HYPOTHESES];  ///< cumulative sum under each other hypothesis
 } est_trigger_t;
 
 /// Scale of the innovations and the validation of the last alarm. Private to est_scale.h.
 typedef struct {
-    uint8_t  phase;   ///< equations in this block; then the stage of the update, or that of the validation of an alarm
-    uint8_t  high_n;  ///< steps of high blocks
-    uint16_t budget_n;  ///< blocks that justify alarms which are not evident
-    float    weight;    ///< of a squared innovation in the cumulative sum
-    float    sum;  ///< terms of this block; in a validation, squared errors of the old estimate less those of the new
-    float    product;     ///< sum of this block's products of innovations at one lag: see est_correlation.h
-    float    share;       ///< share of this block in the noise variance
-    float    inflation;   ///< factor for what the model does not explain
-    float    dispersion;  ///< mean of the squared mean squares of the blocks [noise variances^2]
+    uint8_t  stage;         ///< see est_scale.h
+    uint8_t  block_n;       ///< equations in this block
+    uint8_t  validation_n;  ///< equations in the validation of the last alarm
+    uint8_t  high_n;        ///< steps of high blocks
+    uint16_t budget_n;      ///< blocks that justify alarms which are not evident
+    float    weight;        ///< of a squared innovation in the cumulative sum
+    float    sum;           ///< terms of this block
+    float    gained;        ///< in a validation, squared errors of the old estimate less those of the new one
+    float    product;       ///< sum of this block's products of innovations at one lag: see est_correlation.h
+    float    share;         ///< share of this block in the noise variance
+    float    inflation;     ///< factor for what the model does not explain
+    float    dispersion;    ///< mean of the squared mean squares of the blocks [noise variances^2]
 } est_scale_t;
 
 /// Serial correlation of the innovations. Private to est_correlation.h.
@@ -464,7 +468,8 @@ typedef struct {
     uint8_t             ambiguity_n;  ///< samples since the first ambiguous edge, inclusive; 0: none
 #if EST_WITH_ROBUSTNESS
     bool    edges_vary;  ///< edges come anywhere, against the configuration
-    uint8_t bridged_n;   ///< samples before the next one that were predicted
+    uint8_t bridged_n;   ///< missing samples before the next one that were predicted
+    bool    set_aside;   ///< the last sample was an outlier, and its y was predicted
 #endif
     uint16_t refresh_in;  ///< equations until C is compared with A; 0: never
 #if EST_WITH_ROBUSTNESS
@@ -482,6 +487,9 @@ typedef struct {
     est_factors_t  factors;
     est_whitener_t whitener;
     est_edges_t    edges;
+#if EST_WITH_ROBUSTNESS
+    float before_alarm[EST_THETA_MAX];  ///< theta before the alarm under validation
+#endif
 #if EST_NC_MAX > 0
     float residual[EST_NC_MAX];  ///< of the previous equations, newest first
 #endif

@@ -24,9 +24,6 @@
 #define BRIDGED_MAX 8U
 #define BRIDGE_PRECISION 0.6F
 
-/// Value of bridged_n after an outlier: its y was predicted, and its u is known.
-#define OUTLIER_BRIDGED UINT8_MAX
-
 /// Weight of the squared residual before an edge, beside those in the ambiguity window after it.
 #define EST_AMBIGUITY_BEFORE_N (2.0F * (float)EST_AMBIGUITY_N)
 
@@ -97,16 +94,17 @@ EST_INLINE est_edge_instants_t edge_instants_of(const est_t* const self) {
     return self->config->edge_instants;
 }
 
-/// True while the last alarm is under validation: theta before the alarm occupies the place of theta before an edge.
+/// True while the last alarm is under validation. No ambiguity window begins: the validation compares two estimates.
 EST_INLINE bool validates_alarm(const est_t* const self) { return est_scale_validates(&self->scale); }
 
 /// True iff the previous sample is missing, and was predicted.
-static inline bool in_gap(const est_t* const self) {
-    return (self->bridged_n > 0U) && (self->bridged_n <= BRIDGED_MAX);
-}
+static inline bool in_gap(const est_t* const self) { return self->bridged_n > 0U; }
 
 /// End a bridge: the y of the present sample is not predicted.
-EST_INLINE void end_bridge(est_t* const self) { self->bridged_n = 0U; }
+EST_INLINE void end_bridge(est_t* const self) {
+    self->bridged_n = 0U;
+    self->set_aside = false;
+}
 
 /// Count an edge, in which no outlier has come yet.
 static inline void count_edge(est_t* const self) {
@@ -117,7 +115,7 @@ static inline void count_edge(est_t* const self) {
 /// stuck: a prediction would end the count. The residuals of a missing sample are unknown.
 static inline bool can_bridge(const est_t* const self) {
     return (((uint32_t)self->pending_n | self->trigger.quiet_n | self->same_n) == 0U) &&
-           (self->bridged_n < BRIDGED_MAX) && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
+           (self->bridged_n < BRIDGED_MAX) && !self->set_aside && (self->whitener.precision[0] > BRIDGE_PRECISION) &&
            (est_shape_of(self->config).nc == 0U);
 }
 
@@ -163,7 +161,7 @@ static inline void begin_validation(est_t* const self, const bool overflown) {
     }
     if (!overflown && is_cusum(self->config)) {
         est_scale_begin_validation(&self->scale);
-        (void)append(self->edges.theta, self->theta, EST_THETA_MAX);
+        (void)append(self->before_alarm, self->theta, EST_THETA_MAX);
     }
 }
 
@@ -205,25 +203,25 @@ static inline void follow_shape(est_t* const self, const float mean) {
 /// discarded.
 static inline void renew_scale(est_t* const self) {
     est_scale_t* const scale = &self->scale;
-    if (scale->phase == EST_PHASE_END) {
+    if (scale->stage == EST_STAGE_END) {
         est_scale_relax(scale);
         est_scale_restart(self);
         return;
     }
     const float mean = est_scale_mean(scale);
-    if (scale->phase == EST_PHASE_CHANGE) {
+    if (scale->stage == EST_STAGE_CHANGE) {
         if (is_cusum(self->config)) {
             find_hidden_change(self, mean);
             est_correlation_restart(&self->correlation);
         }
-    } else if (scale->phase == EST_PHASE_NOISE) {
+    } else if (scale->stage == EST_STAGE_NOISE) {
         est_scale_follow(self, mean);
     } else if (self->config->noise_estimated && (self->trigger.statistic < (0.5F * self->config->trigger.ceiling))) {
         follow_shape(self, mean);
     } else {
-        scale->phase = EST_PHASE_NOISE;  // the block is discarded, and its noise variance with it
+        scale->stage = EST_STAGE_NOISE;  // the block is discarded, and its noise variance with it
     }
-    scale->phase++;
+    scale->stage++;
 }
 
 /// Continue the validation of the last alarm by one equation.
@@ -231,7 +229,7 @@ EST_INLINE void validate_alarm(est_t* const                self,
                                const est_shape_t           shape,
                                const est_equation_t* const equation,
                                const float                 precision) {
-    const float old = est_equation_residual(equation->x, self->edges.theta, est_shape_count(shape));
+    const float old = est_equation_residual(equation->x, self->before_alarm, est_shape_count(shape));
     const float e   = equation->innovation;
     if (!est_scale_validate(&self->scale, old * old, e * e * precision, self->edge_age_n)) {
         est_scale_conclude(self);
@@ -278,13 +276,13 @@ static inline bool is_lone_outlier(const est_t* const self, const float term) {
     const float before = (reached - term) + EST_CUSUM_DRIFT;
     const float least  = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
     return (term > est_max(before * EST_LONE_RATIO, least)) && (term < FLT_MAX) && (self->bridged_n == 0U) &&
-           is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
+           !self->set_aside && is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
 }
 
 /// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic. An ambiguity
 /// window about edges ends, since its hypotheses have lost their base. The next innovation decides.
 static inline void set_outlier_aside(est_t* const self, const float innovation, est_step_t* const step) {
-    self->bridged_n = OUTLIER_BRIDGED;
+    self->set_aside = true;
     predict(self, innovation);
     self->trigger.statistic = 0.0F;
     self->ambiguity_n       = 0U;

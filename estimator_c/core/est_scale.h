@@ -12,14 +12,15 @@
 /// that raises an alarm within its block leaves the scale as it was before the change.
 #define EST_BLOCK_N 32U
 
-/// Phases of the scale. During a block it is the number of equations. Then come the stages of the update, one a step,
-/// so that none is long: correlation and dispersion of the innovations follow the block in phase EST_BLOCK_N, the noise
-/// variance follows it, a hidden change is found, and the next block begins. During a validation the phase is
-/// EST_PHASE_VALIDATION and the number of equations.
-#define EST_PHASE_NOISE (EST_BLOCK_N + 1U)
-#define EST_PHASE_CHANGE (EST_BLOCK_N + 2U)
-#define EST_PHASE_END (EST_BLOCK_N + 3U)
-#define EST_PHASE_VALIDATION EST_PHASE_END
+/// Stages of the scale. A block is followed by the stages of the update, one a step, so that none is long: correlation
+/// and dispersion of the innovations follow the block, the noise variance follows it, a hidden change is found, and the
+/// next block begins. The validation of an alarm replaces all of these.
+#define EST_STAGE_BLOCK 0U
+#define EST_STAGE_SHAPE 1U
+#define EST_STAGE_NOISE 2U
+#define EST_STAGE_CHANGE 3U
+#define EST_STAGE_END 4U
+#define EST_STAGE_VALIDATION 5U
 
 /// Smallest share of a new block in the noise variance: a memory of 1,100 equations. Before the trigger is armed the
 /// share is larger, because C and theta still change.
@@ -94,7 +95,8 @@ static inline void est_scale_restart(est_t* const estimator) {
         EST_CUSUM_GAIN / (estimator->noise_variance * est_scale_factor(self) * (1.0F + (EST_MARGIN * self->share)));
     self->sum     = 0.0F;
     self->product = 0.0F;
-    self->phase   = 0U;
+    self->stage   = EST_STAGE_BLOCK;
+    self->block_n = 0U;
 }
 
 static inline void est_scale_init(est_t* const estimator) {
@@ -121,24 +123,27 @@ static inline void est_scale_forgive(est_t* const estimator) {
 
 /// Enter the term of one innovation in the cumulative sum. Return false iff the block is complete.
 EST_INLINE bool est_scale_enter(est_scale_t* const self, const float term) {
-    if (self->phase >= EST_BLOCK_N) {
+    if (self->stage != EST_STAGE_BLOCK) {
         return false;
     }
-    self->phase++;
+    self->block_n++;
     self->sum += term;
+    if (self->block_n >= EST_BLOCK_N) {
+        self->stage = EST_STAGE_SHAPE;
+    }
     return true;
 }
 
 /// Enter a product of innovations, unless the block is complete.
 static inline void est_scale_enter_product(est_scale_t* const self, const float product) {
-    if (self->phase < EST_BLOCK_N) {
+    if (self->stage == EST_STAGE_BLOCK) {
         self->product += product;
     }
 }
 
 /// Discard the products of an incomplete block.
 static inline void est_scale_discard_products(est_scale_t* const self) {
-    if (self->phase < EST_BLOCK_N) {
+    if (self->stage == EST_STAGE_BLOCK) {
         self->product = 0.0F;
     }
 }
@@ -186,18 +191,19 @@ static inline void est_scale_relax(est_scale_t* const self) {
 
 /// Begin the validation of an alarm. The block restarts after it.
 static inline void est_scale_begin_validation(est_scale_t* const self) {
-    self->sum   = 0.0F;
-    self->phase = (uint8_t)(EST_PHASE_VALIDATION + 1U);
+    self->stage        = EST_STAGE_VALIDATION;
+    self->validation_n = 1U;
+    self->gained       = 0.0F;
 }
 
 /// True while an alarm is under validation.
-static inline bool est_scale_validates(const est_scale_t* const self) { return self->phase > EST_PHASE_VALIDATION; }
+static inline bool est_scale_validates(const est_scale_t* const self) { return self->stage == EST_STAGE_VALIDATION; }
 
 /// Conclude the validation of an alarm: the alarm is justified, or the scale is inflated.
 static inline void est_scale_conclude(est_t* const estimator) {
-    est_scale_t* const self = &estimator->scale;
-    const bool justified    = (self->phase > (EST_PHASE_VALIDATION + EST_VALIDATION_LEAST_N)) && (self->sum > 0.0F);
-    if (justified && ((self->sum * self->weight) > EST_EVIDENT)) {
+    est_scale_t* const self      = &estimator->scale;
+    const bool         justified = (self->validation_n > EST_VALIDATION_LEAST_N) && (self->gained > 0.0F);
+    if (justified && ((self->gained * self->weight) > EST_EVIDENT)) {
         // an evident one costs no budget
     } else if (justified && (self->budget_n >= EST_BUDGET_N)) {
         self->budget_n = (uint16_t)(self->budget_n - EST_BUDGET_N);
@@ -210,16 +216,15 @@ static inline void est_scale_conclude(est_t* const estimator) {
 }
 
 /// Enter one equation into the validation of an alarm: the squared errors of the old and the new estimate, the latter
-/// relative to its variance. The sum is that of the validation instead of a block. Return false iff the equation is the
-/// last one.
+/// relative to its variance. Return false iff the equation is the last one.
 EST_INLINE bool est_scale_validate(est_scale_t* const  self,
                                    const float         old_square,
                                    const float         new_square,
                                    const uint_fast16_t edge_age_n) {
-    self->phase++;
-    const uint32_t n = (uint32_t)self->phase - EST_PHASE_VALIDATION;
+    self->validation_n++;
+    const uint32_t n = self->validation_n;
     if (n > EST_VALIDATION_BEGIN_N) {
-        self->sum += old_square - (EST_JUSTIFIED * new_square);
+        self->gained += old_square - (EST_JUSTIFIED * new_square);
     }
     return (n < EST_VALIDATION_N) || ((edge_age_n >= n) && (n < EST_VALIDATION_MAX_N));
 }

@@ -35,8 +35,8 @@ static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t
     self->statistic = 0.0F;
     self->quiet_n   = quiet_n;
     if (EST_WITH_TRIGGERS) {
-        self->mean_n   = 0U;
-        self->rival[0] = 0.0F;
+        self->mean_n = 0U;
+        self->mean   = 0.0F;
     }
 }
 
@@ -139,11 +139,10 @@ EST_INLINE est_finding_t est_trigger_find(const est_trigger_t* const self,
 
 /// Mean between faults, thesis 4.4.3. The recursive form of the mean cannot grow without bound.
 static inline float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
-    const float  term = absolute ? est_magnitude(innovation) : innovation;
-    float* const mean = &self->rival[0];
+    const float term = absolute ? est_magnitude(innovation) : innovation;
     increment(&self->mean_n);
-    *mean += (term - *mean) / (float)self->mean_n;
-    return est_magnitude(*mean);
+    self->mean += (term - self->mean) / (float)self->mean_n;
+    return est_magnitude(self->mean);
 }
 
 static inline float call_custom(est_trigger_t* const              self,

@@ -306,7 +306,7 @@ static bool run_long(record_t* const self, const uint32_t run_number) {
         if ((k % 16U) == 0U) {
             enter_theta(self, &estimator);
             enter_bits(self, estimator.scale.high_n);
-            enter_number(self, estimator.scale.sum);
+            enter_number(self, est_scale_validates(&estimator.scale) ? estimator.scale.gained : estimator.scale.sum);
             enter_number(self, estimator.correlation.partial[0]);
             enter_number(self, estimator.correlation.partial[1]);
         }

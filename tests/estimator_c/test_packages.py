@@ -148,7 +148,7 @@ def test_example_fits_an_atmega328p(tmp_path: Path) -> None:
     run("avr-gcc", *flags, EXAMPLE, ESTIMATOR / "core" / "est.c", "-o", tmp_path / "watch.elf")
     text, data, bss, *_ = run("avr-size", tmp_path / "watch.elf").splitlines()[1].split()
     assert int(text) + int(data) <= 20.2 * 1024, "of 32 kB of flash"
-    assert int(data) + int(bss) <= 544, "of 2 kB of RAM"
+    assert int(data) + int(bss) <= 580, "of 2 kB of RAM"
 
 
 # ---- warnings
