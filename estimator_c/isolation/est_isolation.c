@@ -420,13 +420,11 @@ static void enter_onset(est_isolation_t* const self, est_onset_t* const onset) {
 
 // ---------------------------------------------        VERDICT         ---------------------------------------------
 
-static float greater(const float a, const float b) { return (a > b) ? a : b; }
-
 /// ln(exp(a) + exp(b)), to 0.03.
 static float log_add(const float a, const float b) {
-    const float most  = greater(a, b);
+    const float most  = est_max(a, b);
     const float least = (a > b) ? b : a;
-    const float near  = greater(2.83F - (most - least), 0.0F);
+    const float near  = est_max(2.83F - (most - least), 0.0F);
     return most + ((0.0866F * near) * near);
 }
 
@@ -436,13 +434,13 @@ static float gain_of_variance(const float energy, const float n) {
     if (energy <= usual) {
         return 0.0F;
     }
-    return (energy - usual) + (usual * logarithm(greater(usual / energy, 1.0e-9F)));
+    return (energy - usual) + (usual * logarithm(est_max(usual / energy, 1.0e-9F)));
 }
 
 /// Discount a gain by what it costs to make the change x, known this well, a relevant one.
 static float discount(const float gain, const float x, const float known) {
     const float size = (x < 0.0F) ? -x : x;
-    const float lack = greater(WORTH_TELLING - size, 0.0F);
+    const float lack = est_max(WORTH_TELLING - size, 0.0F);
     return gain - ((known * lack) * lack);
 }
 
@@ -459,14 +457,14 @@ static void
 weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const uint8_t j, const float ij) {
     const uint8_t pair  = (uint8_t)(i + j - 1U);
     const float   share = ij / ones[j].known;
-    const float   left  = greater(ones[i].known - (ij * share), PRIOR);  // smaller only by rounding
+    const float   left  = est_max(ones[i].known - (ij * share), PRIOR);  // smaller only by rounding
     const float   rest  = ones[i].vector - (share * ones[j].vector);
     const float   x     = rest / left;
     const float   both  = ones[j].gain + (rest * x);
     fit->any_pair[pair] = log_add(fit->any_pair[pair], both);
-    fit->beside[j]      = greater(fit->beside[j], discount(both, x, left));
+    fit->beside[j]      = est_max(fit->beside[j], discount(both, x, left));
     fit->beside[i] =
-        greater(fit->beside[i], discount(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
+        est_max(fit->beside[i], discount(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
 }
 
 /// Enter the evidence of one onset for a single change.
@@ -479,7 +477,7 @@ EST_INLINE void enter_single(est_isolation_t* const self,
     est_single_t* const single = &self->fit.single[one];
     float* const        most   = &self->fit.onset[number];
     single->any                = log_add(single->any, gain);
-    *most                      = greater(*most, gain);
+    *most                      = est_max(*most, gain);
     if (gain > single->best) {
         single->best     = gain;
         single->change   = change;
@@ -502,7 +500,7 @@ static impulses_t free_impulses(const est_isolation_t* const self, const est_ons
     impulses_t         out;
     out.variance[0]  = 1.0F / (first[PARAMETERS] + self->nats);
     out.share        = second[PARAMETERS] * out.variance[0];
-    out.variance[1]  = 1.0F / (greater(second[PARAMETERS + 1U] - (out.share * second[PARAMETERS]), 0.0F) + self->nats);
+    out.variance[1]  = 1.0F / (est_max(second[PARAMETERS + 1U] - (out.share * second[PARAMETERS]), 0.0F) + self->nats);
     const float rest = onset->vector[PARAMETERS + 1U] - (out.share * onset->vector[PARAMETERS]);
     out.change[0]    = onset->vector[PARAMETERS] * out.variance[0];
     out.change[1]    = rest * out.variance[1];
@@ -557,7 +555,7 @@ EST_INLINE fault_t weigh_linear(const est_onset_t* const onset,
     const float vector = onset->vector[JOINT + i] - (shared[0] * impulses->change[0]) - (rest * impulses->change[1]);
     const float known =
         onset->known[i] - ((shared[0] * impulses->variance[0]) * shared[0]) - ((rest * impulses->variance[1]) * rest);
-    const float left   = greater(known, 1.0e-9F);  // smaller only by rounding
+    const float left   = est_max(known, 1.0e-9F);  // smaller only by rounding
     const float change = delays ? 1.0F : (vector / left);
     const float gain   = impulses->gain + (((2.0F * vector) - (left * change)) * change);
     return (fault_t){ .known = delays ? 0.0F : left, .change = change, .gain = gain };
@@ -565,7 +563,7 @@ EST_INLINE fault_t weigh_linear(const est_onset_t* const onset,
 
 /// Part of the gain by undoing a gain of the displacement that is no evidence: the noise is scaled as well.
 static float gain_of_scaling(const float change, const float samples_n) {
-    const float counted = greater((change < 1.0F) ? change : 1.0F, -0.5F);
+    const float counted = est_max((change < 1.0F) ? change : 1.0F, -0.5F);
     return samples_n * counted * (1.0F - (0.5F * counted));
 }
 
@@ -634,7 +632,7 @@ static bool is_gain(const est_change_t change) {
 /// Extent of a change: from 1 - old/new for M and gains, new/old - 1 for B and K. At least 0.01, or at most 100.
 static float extent_of(const est_change_t change, const float x) {
     const bool  inverted = (change == EST_CHANGE_MASS) || is_gain(change);
-    const float parts    = greater(1.0F + (inverted ? -x : x), 0.01F);
+    const float parts    = est_max(1.0F + (inverted ? -x : x), 0.01F);
     const float inverse  = 1.0F / parts;
     return inverted ? inverse : parts;
 }
@@ -647,7 +645,7 @@ static float penalty_of(const float extent) { return 0.5F * ((extent + (1.0F / e
 /// Cost of a size that is free [nats].
 static float cost_of_size(const est_single_t* const found) {
     const float explained = found->change * found->change * found->known;
-    return -0.5F * logarithm(greater(1.0F / (1.000001F + (SIZES * explained)), 1.0e-9F));
+    return -0.5F * logarithm(est_max(1.0F / (1.000001F + (SIZES * explained)), 1.0e-9F));
 }
 
 /// Most likely single change by these gains.
@@ -672,7 +670,7 @@ static float gain_of_pairs(const est_fit_t* const fit, const uint8_t one) {
     float out = 0.0F;
     for (uint8_t i = 0U; i < PARAMETERS; i++) {
         const bool without = (i + one) == 2U;
-        out                = without ? out : greater(out, fit->any_pair[i]);
+        out                = without ? out : est_max(out, fit->any_pair[i]);
     }
     return out;
 }
@@ -770,7 +768,7 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
         self->onsets[i].before_n = onset_before(i, earliest_n);
     }
     for (uint8_t i = 0U; i < CHANNELS; i++) {
-        const float same  = (self->habits.known_n < HABITS_N) ? 0.999F : greater(self->habits.same[i], 0.01F);
+        const float same  = (self->habits.known_n < HABITS_N) ? 0.999F : est_max(self->habits.same[i], 0.01F);
         self->surprise[i] = -logarithm((same < 0.999F) ? same : 0.999F);
         self->same_n[i]   = 0U;
     }
