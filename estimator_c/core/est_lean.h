@@ -2,7 +2,7 @@
 /// EST_WITH_ROBUSTNESS=0: the functions of est_robust.h for a model that is known to fit. Private to est.c.
 
 #ifndef EST_LEAN_H_INCLUDED
-#define EST_LEAN_H_INCLUDED
+#define EST_LEAN_H_INCLUDED  // MISRA D1
 
 #include "est_edges.h"
 #include "est_equation.h"
