@@ -442,8 +442,8 @@ static bool enter_gap(est_t* const self, const est_status_t status, float* const
     }
     if (EST_WITH_EDGES && (self->ambiguity_n > 0U)) {
         self->ambiguity_n++;
-        if (!self->known || (self->ambiguity_n >=
-                             EST_AMBIGUITY_N)) {  // the last sample of an ambiguity window decides and must be good
+        // the last sample of an ambiguity window decides and must be good
+        if (!self->known || (self->ambiguity_n >= EST_AMBIGUITY_N)) {
             self->ambiguity_n = 0U;
             if (est_trigger_end_ambiguity(&self->trigger, &self->config->trigger)) {
                 note_slip(self);
