@@ -276,7 +276,7 @@ static inline bool is_lone_outlier(const est_t* const self, const float term) {
     const float before = (reached - term) + EST_CUSUM_DRIFT;
     const float least  = (EST_LONE_LEAST * self->config->trigger.ceiling) / self->scale.inflation;
     return (term > est_max(before * EST_LONE_RATIO, least)) && (term < FLT_MAX) && (self->bridged_n == 0U) &&
-           !self->set_aside && is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
+           is_cusum(self->config) && can_bridge(self) && !returns_at_edge(self);
 }
 
 /// Set a lone outlier aside: replace its y by its prediction, keep theta, and restart the statistic. An ambiguity
