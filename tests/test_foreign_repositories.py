@@ -20,7 +20,8 @@ pytestmark = [
     pytest.mark.heavy,
 ]  # environments are made from the package index, maybe on a loaded machine
 
-VERSIONS = ("3.11", "3.12", "3.13")
+VERSIONS = ("3.11", "3.13")
+"""First and last that are supported."""
 THIS = f"{sys.version_info.major}.{sys.version_info.minor}"
 PLUGINS = ("pytest-embedded", "pytest-asyncio", "pytest-mock", "pytest-xdist", "pytest-timeout", "hypothesis")
 
