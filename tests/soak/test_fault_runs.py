@@ -47,7 +47,7 @@ def test_every_fault_is_documented() -> None:
 )
 def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchange: ExchangeKind) -> None:
     ends = 2 if (link, exchange) in TALKED_OVER else 0
-    stride = 50 if link == "serial" else 100
+    stride = 100 if link == "serial" else 200
     for kind in FAULTY[link].KINDS:
         assert outcomes_everywhere(link, kind, exchange, stride, ends).total() > 15
 
