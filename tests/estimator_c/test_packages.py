@@ -24,7 +24,6 @@ MAXIMA = dict(re.findall(r"^#define EST_(\w+)_MAX (\d+)U$", HEADER, re.MULTILINE
 WARNINGS = ("-Wall", "-Wextra", "-Werror")
 CORTEX = {
     "M0": ("-mcpu=cortex-m0",),
-    "M0+": ("-mcpu=cortex-m0plus",),
     "M3": ("-mcpu=cortex-m3",),
     "M4": ("-mcpu=cortex-m4",),
     "M4F": ("-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"),
@@ -33,7 +32,7 @@ CORTEX = {
     "M33": ("-mcpu=cortex-m33", "-mfloat-abi=hard", "-mfpu=fpv5-sp-d16"),
     "M55": ("-mcpu=cortex-m55", "-mfloat-abi=hard"),
 }
-LEVELS = ("-O0", "-Os", *(pytest.param(level, marks=pytest.mark.heavy) for level in ("-O2", "-O3")))
+LEVELS = ("-O0", "-Os", pytest.param("-O3", marks=pytest.mark.heavy))
 QUICK_CORES = ("M0", "M4F")
 """Cores that `make test` compiles for: neither hardware division nor floating point, and both."""
 
@@ -177,9 +176,7 @@ def test_no_warning_at_any_level_of_optimisation(level: str, tmp_path: Path) -> 
 
 
 @pytest.mark.tools("avr-gcc")
-@pytest.mark.parametrize(
-    "level", ["-Os", *(pytest.param(level, marks=pytest.mark.heavy) for level in ("-O0", "-O2", "-O3"))]
-)
+@pytest.mark.parametrize("level", LEVELS[1:])
 def test_no_warning_on_an_avr(level: str, tmp_path: Path) -> None:
     compiles("avr-gcc", ("-mmcu=atmega2560", level), tmp_path)
 
