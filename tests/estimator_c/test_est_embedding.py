@@ -63,15 +63,21 @@ int main() {
 """
 
 
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Core, isolation and fit, compiled as C."""
+    folder, made = tmp_path_factory.mktemp("objects"), []
+    for source in (ESTIMATOR / part for part in ("core/est.c", "isolation/est_isolation.c", "fit/est_fit.c")):
+        made.append(folder / f"{source.stem}.o")
+        assert run("gcc", "-std=c99", *INCLUDE, "-c", source, "-o", made[-1]).returncode == 0
+    return made
+
+
 @pytest.mark.tools("g++")
 @pytest.mark.parametrize("standard", ["c++11", "c++14", "c++17", "c++20"])
-def test_cpp_program_configures_and_steps_an_estimator(standard: str, tmp_path: Path) -> None:
+def test_cpp_program_configures_and_steps_an_estimator(standard: str, objects: list[Path], tmp_path: Path) -> None:
     (tmp_path / "program.cpp").write_text(CPP)
-    objects = []
-    for source in (ESTIMATOR / part for part in ("core/est.c", "isolation/est_isolation.c", "fit/est_fit.c")):
-        objects.append(tmp_path / f"{source.stem}.o")
-        assert run("gcc", "-std=c99", *INCLUDE, "-c", source, "-o", objects[-1]).returncode == 0
-    command = ["g++", f"-std={standard}", *WARNINGS, *INCLUDE, tmp_path / "program.cpp", *objects]
+    command: list[str | Path] = ["g++", f"-std={standard}", *WARNINGS, *INCLUDE, tmp_path / "program.cpp", *objects]
     done = run(*command, "-o", tmp_path / "program")
     assert done.returncode == 0, done.stderr
     assert run(tmp_path / "program").returncode == 0
