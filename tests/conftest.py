@@ -38,20 +38,25 @@ Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 NOTHING_MAY_SKIP = os.environ.get("ANALOGRIG_CI") == "1"
 LACKING = pytest.StashKey[tuple[str, ...]]()
 SLOWEST = (
-    "test_foreign_repositories",
-    "test_fault_runs",
-    "test_shipped_properties",
-    "test_readme_commands",
-    "test_guest",
-    "test_cost",
-    "test_planted_defects",
-    "test_kills",
-    "test_packaging",
-    "test_real_rig",
-    "test_detection",
-    "test_docs",
-    "test_mutation",
-    "test_coverage",
+    *(
+        "test_readme_commands",
+        "test_shipped_properties",
+        "test_accuracy",
+        "test_drawn_plays",
+        "test_claimed",
+        "test_qemu",
+    ),
+    *("test_pytest_plugin", "test_planted_defects", "test_bit_exact", "test_evidence", "test_compiler", "test_cost"),
+    *("test_foreign_repositories", "test_guest", "test_fault_runs", "test_end_to_end", "test_mutation", "test_spice"),
+    *(
+        "test_real_rig",
+        "test_reference_device",
+        "test_trust_plugin",
+        "test_tried_advice",
+        "test_coverage",
+        "test_dating",
+    ),
+    *("test_calibration", "test_conformance", "test_packaging", "test_docs", "test_kills", "test_detection"),
 )
 """Modules to start with, in order: one that is left for the end has a processor to itself while others are idle."""
 
