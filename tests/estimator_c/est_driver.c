@@ -240,6 +240,13 @@ void driver_counters(unsigned out[10]) {
     }
 }
 
+/* out, (2,): range of the codes of est_config_for_codes(). */
+void driver_for_codes(double low, double high, double* out) {
+    const est_config_t c = est_config_for_codes((float)low, (float)high);
+    out[0]               = (double)c.code_low;
+    out[1]               = (double)c.code_high;
+}
+
 /* out, (3,): M, B, K from the present theta, or unchanged. */
 int driver_parameters(double period, double force, double displacement, double* out) {
     const est_units_t units = { .period = (float)period, .force = (float)force, .displacement = (float)displacement };

@@ -174,6 +174,12 @@ class Estimator:
         c1, c2 = fields.pop("c")
         return fields | {"c1": c1, "c2": c2}
 
+    def for_codes(self, low: float, high: float) -> tuple[float, ...]:
+        """Range of the codes of est_config_for_codes()."""
+        out = np.zeros(2)
+        self._c.driver_for_codes(ctypes.c_double(low), ctypes.c_double(high), ctypes.c_void_p(out.ctypes.data))
+        return tuple(out.tolist())
+
     def init(self, **changes: float | tuple[float, float]) -> bool:
         """est_init() with the default configuration, a short warm-up, and these changes."""
         config = Config()

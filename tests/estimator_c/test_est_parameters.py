@@ -50,3 +50,7 @@ def test_alternating_poles_are_no_such_plant(estimator: Estimator) -> None:
     assert estimator.init(edge_instants=LOCKED)
     estimator.run(u, y)
     assert estimator.parameters(*UNITS) is None
+
+
+def test_configuration_for_codes_has_their_range(estimator: Estimator) -> None:
+    assert estimator.for_codes(-1.0, 4096.0) == (-1.0, 4096.0)
