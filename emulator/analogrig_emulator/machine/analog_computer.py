@@ -245,7 +245,8 @@ class AnalogComputer:
         Pots and initial voltages stay; a ramp stops at its present dial. ahead_ticks, drives: as for Engine.
         """
         self._ahead_ticks, self._drives = ahead_ticks, dict(drives)
-        self._setting = self._setting._replace(mode=mode, pots=self._setting.pots.stopped())
+        _, relays, pots, closed = self._setting
+        self._setting = _Setting(mode, relays, pots.stopped(), closed)
         self._levels_v = {source.name: 0.0 for source in self._patched.inputs}
         self._powered: Engine | None = None
         self._solved: PiecewiseLinear | None = None
@@ -316,12 +317,13 @@ class AnalogComputer:
         No pot may be turning. Equals alternating run() and turn(), at a fraction of the cost. Raises PotError,
         CircuitError for a circuit without a solution before anything is played, and EngineError.
         """
-        pots, changes = self._setting.pots, []
+        mode, relays, pots, closed = self._setting
+        nodal, changes = relays.nodal(mode), []
         for sample, goals in jumps:
             pots = pots.turned(self.resting(goals))
-            changes.append((sample, self._setting.nodal.at(pots.dials, self._setting.closed)))
+            changes.append((sample, nodal.at(pots.dials, closed)))
         volts = self._engine.run_changing(samples, changes, edges)
-        self._setting, self._solved = self._setting._replace(pots=pots), None
+        self._setting, self._solved = _Setting(mode, relays, pots, closed), None
         self._note_levels(edges)
         return volts
 

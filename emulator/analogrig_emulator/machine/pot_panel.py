@@ -92,8 +92,8 @@ class PotPanel(NamedTuple):
 
     def turned(self, goals: Mapping[str, float]) -> PotPanel:
         """Panel with pots turned to resting dials at once; their ramps end."""
-        ramps = {pot: ramp for pot, ramp in self.ramps.items() if pot not in goals}
-        return self._replace(dials=self.settled(goals), ramps=ramps)
+        ramps = {pot: ramp for pot, ramp in self.ramps.items() if pot not in goals} if self.ramps else {}
+        return PotPanel(self.wipers, self.settled(goals), ramps)
 
     def ramped(self, goals: Mapping[str, float], first: int, ramp_n: int) -> PotPanel:
         """Panel whose pots turn to resting dials from sample `first` on, for ramp_n samples."""
@@ -103,13 +103,13 @@ class PotPanel(NamedTuple):
             if dial != self.dials[pot]
         }
         others = {pot: ramp for pot, ramp in self.ramps.items() if pot not in goals}
-        return self._replace(dials={**self.dials, **self.wipers.contacts_at_rest(goals)}, ramps={**others, **ramps})
+        return PotPanel(self.wipers, {**self.dials, **self.wipers.contacts_at_rest(goals)}, {**others, **ramps})
 
     def stopped(self) -> PotPanel:
         """Panel with every ramp ended at its present dial."""
         if not self.ramps:
             return self
-        return self._replace(dials={**self.dials, **self.wipers.contacts_at_rest(self.ramps)}, ramps={})
+        return PotPanel(self.wipers, {**self.dials, **self.wipers.contacts_at_rest(self.ramps)}, {})
 
     def settled(self, dials: Mapping[str, float]) -> dict[str, float]:
         """Dials of the panel with some pots at rest at others."""
@@ -137,4 +137,4 @@ class PotPanel(NamedTuple):
     def at(self, sample: int) -> PotPanel:
         """Panel as the ramps leave it at a sample; those that have arrived end."""
         ramps = {pot: ramp for pot, ramp in self.ramps.items() if ramp.last > sample}
-        return self._replace(dials=self.during(sample), ramps=ramps)
+        return PotPanel(self.wipers, self.during(sample), ramps)
