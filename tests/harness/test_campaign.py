@@ -306,7 +306,10 @@ def command_of(spec: Path, out: Path, workers: int) -> list[str]:
     return [*command, "--workers", str(workers)]
 
 
-@pytest.mark.parametrize(("ended_by", "status"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("ended_by", "status"),
+    [(signal.SIGKILL, -signal.SIGKILL), pytest.param(signal.SIGINT, 130, marks=pytest.mark.heavy)],
+)
 def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
     tmp_path: Path, many: bytes, ended_by: signal.Signals, status: int
 ) -> None:
