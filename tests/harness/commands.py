@@ -30,3 +30,17 @@ def called(*arguments: str | Path, cwd: Path | None = None) -> Ended:
         except SystemExit as ended:
             status = ended.code
     return Ended(status, out.getvalue(), err.getvalue())
+
+
+def output_of(*arguments: str | Path, status: int = 0) -> str:
+    """Standard output of a command that ends with ``status``."""
+    ended = called(*arguments)
+    assert ended.status == status, ended.err
+    return ended.out
+
+
+def error_of(*arguments: str | Path, status: int = 2) -> str:
+    """Error message of a command that ends with ``status``."""
+    ended = called(*arguments)
+    assert ended.status == status, ended.out + ended.err
+    return ended.err

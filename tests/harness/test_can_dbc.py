@@ -30,6 +30,7 @@ from analogrig.run import LOST, UNARMED, UNREPORTED, Run
 from analogrig.scenario import Scenario
 from analogrig.testing.counterexample import Counterexample
 from analogrig_ecu.can_dbc import CanDbcDevice
+from tests.harness.commands import error_of
 from tests.harness.scripted_ecu import DBC, Answer, ScriptedEcu, write
 
 THESIS_HASH = "54f04f72e4f6d22a"
@@ -573,15 +574,12 @@ def test_damaged_dbc_is_refused_in_one_line(file: Path) -> None:
             describe(str(file))
 
 
-def test_real_time_implies_no_exchange_for_a_device_without_one(
-    file: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_real_time_implies_no_exchange_for_a_device_without_one(file: Path, tmp_path: Path) -> None:
     with open_dut(str(file), in_real_time=True) as dut, open_dut("inproc", in_real_time=True) as ours:
         assert "exchange" not in dut.description()
         assert ours.description()["exchange"] == "stream"
     run = ["run", "--dut", str(file), "--real-time", "--exchange", "stream", "--out", str(tmp_path / "out")]
-    assert main(run) == 2
-    assert "a device of the kind can-dbc has no exchange" in capsys.readouterr().err
+    assert "a device of the kind can-dbc has no exchange" in error_of(*run)
 
 
 def test_kind_needs_a_device_file() -> None:

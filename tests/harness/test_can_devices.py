@@ -16,7 +16,6 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.catalogue import Counter
-from analogrig.cli import main
 from analogrig.devices.can import CanDevice
 from analogrig.devices.device import Device
 from analogrig.devices.library import InprocDevice
@@ -26,6 +25,7 @@ from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from tests.harness.commands import error_of
 from tests.harness.fed import catalogue, fed
 from tests.soak.fault_runs import DISPLACEMENT, ESTIMATOR, FORCE, N, reference
 
@@ -103,9 +103,11 @@ def test_url_of_a_serial_port_keeps_its_question_mark() -> None:
     assert describe("serial:socket://bob:7?logging=debug").as_table()["url"] == "socket://bob:7?logging=debug"
 
 
-def test_option_that_a_device_has_not_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["run", "--dut", "can:virtual", "--baud", "9600", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == "analogrig: device can:virtual: a device of the kind can has no baud\n"
+def test_option_that_a_device_has_not_is_named(tmp_path: Path) -> None:
+    assert (
+        error_of("run", "--dut", "can:virtual", "--baud", "9600", "--out", str(tmp_path))
+        == "analogrig: device can:virtual: a device of the kind can has no baud\n"
+    )
 
 
 def test_device_on_a_bus_is_not_opened_again_on_the_word_of_a_recording() -> None:

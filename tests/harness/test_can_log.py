@@ -32,6 +32,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import LOST, Run
 from analogrig.scenario import Scenario
+from tests.harness.commands import error_of, output_of
 from tests.harness.processes import LONG_S
 
 DBC = Path(__file__).parents[2] / "estimator_c" / "catalogue" / "analogrig.dbc"
@@ -581,18 +582,15 @@ def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
     out = tmp_path / "out"
     (out / "x").parent.mkdir()
     (out / "can.blf").write_text("of an earlier run")
-    assert main(["run", "--dut", DEVICE, "--out", str(out)]) == 0
-    first = capsys.readouterr().out
+    first = output_of("run", "--dut", DEVICE, "--out", str(out))
     (digest,) = [line for line in first.splitlines() if "theta hash" in line]
     assert {path.name for path in out.iterdir()} == {"can.log", "run.npz", "report.html", "verdict.json"}
     log = str(out / "can.log")
     for words in (["judge", log], ["judge", str(out / "run.npz")], ["replay", log, "--dut", "inproc"]):
         assert main([*words, "--scenario", "thesis", "--out", str(tmp_path / "again")]) == 0
         assert digest in capsys.readouterr().out
-    assert main(["judge", log]) == 2
-    assert "name one with --scenario" in capsys.readouterr().err
-    assert main(["replay", log, "--scenario", "thesis"]) == 2
-    assert "name one with --dut" in capsys.readouterr().err
+    assert "name one with --scenario" in error_of("judge", log)
+    assert "name one with --dut" in error_of("replay", log, "--scenario", "thesis")
 
 
 def test_log_that_is_played_stays_and_one_of_an_earlier_run_moves_aside(
@@ -624,10 +622,9 @@ def test_number_of_samples_or_of_a_run_is_a_count(option: str, value: str, capsy
     assert f"argument {option}: must be a whole number from 0" in capsys.readouterr().err
 
 
-def test_serial_run_leaves_no_can_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_serial_run_leaves_no_can_log(tmp_path: Path) -> None:
     words = ["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]
-    assert main([*words, "--can-log", "blf"]) == 2
-    assert "--can-log blf: device inproc is not on a CAN bus" in capsys.readouterr().err
+    assert "--can-log blf: device inproc is not on a CAN bus" in error_of(*words, "--can-log", "blf")
     assert {path.name for path in tmp_path.iterdir()} == {"report.html", "verdict.json"}
     for more in ([], ["--can-log", "none"]):
         assert main([*words, *more]) == 0

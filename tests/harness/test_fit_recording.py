@@ -18,6 +18,7 @@ from analogrig.rigs.emulator import ComputerDescription
 from analogrig.run import Run
 from analogrig_emulator import Excitation, Multiplier, RecordedExcitation, SuspensionComputer, load_patch
 from analogrig_instruments.calibration.recorded_plant import SETTLING_N, RecordedPlant, _determined
+from tests.harness.commands import error_of, output_of
 
 RATES_HZ = {"silverbox": 10e6 / 2**14, "front": 100.0, "dc-motor": 2000.0, "rc-battery": 1.0}
 SAMPLES = 2000
@@ -65,19 +66,15 @@ def fit(recording: Path, program: str, capsys: pytest.CaptureFixture[str], *opti
     """Fit a program to a recording by the command, and return its JSON."""
     command = ["calibrate", "--recording", str(recording), "--program", program, "--json", *options]
     capsys.readouterr()
-    assert main([*command, "--out", str(recording.parent / "fitted.toml")]) == 0
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    told: dict[str, Any] = json.loads(output_of(*command, "--out", str(recording.parent / "fitted.toml")))
     return told
 
 
-def test_a_fit_finds_the_values_of_the_machine_and_keeps_them(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fit_finds_the_values_of_the_machine_and_keeps_them(recording: Path, tmp_path: Path) -> None:
     twin = tmp_path / "twin.toml"
     command = ["calibrate", "--recording", str(recording), "--program", "silverbox", "--settle", "400", "--json"]
     spans = ["--span", "0:1200", "--check", "1200:2000"]
-    assert main([*command, *spans, "--most-rms", "4e-5", "--out", str(twin)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(output_of(*command, *spans, "--most-rms", "4e-5", "--out", str(twin)))
     for parameter in told["parameters"]:
         error = abs(parameter["value"] - TRUE[parameter["name"]])
         assert error < 5.0 * parameter["standard_error"] < 0.05 * parameter["value"]
@@ -138,13 +135,10 @@ def test_parameters_that_act_alike_are_named_until_enough_are_fixed(
     assert load_patch(tmp_path / "fitted.toml").values["R"] == 1.3
 
 
-def test_a_parameter_that_the_excitation_does_not_show_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_parameter_that_the_excitation_does_not_show_is_named(tmp_path: Path) -> None:
     measured = record(tmp_path, "silverbox", TRUE, RecordedExcitation(0.5 * multisine()))
     command = ["calibrate", "--recording", str(measured), "--program", "silverbox"]
-    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 0
-    told = capsys.readouterr().out
+    told = output_of(*command, "--out", str(tmp_path / "twin.toml"))
     assert "square, cube: hardly act on the output here" in told
     assert "cube" in (line := next(line for line in told.splitlines() if "not determined" in line and "cube" in line))
     assert "+-" not in line
@@ -162,14 +156,12 @@ def test_a_twin_of_another_plant_is_kept_on_demand_alone(tmp_path: Path, capsys:
     assert main([*command, "--most-rms", "1", "--out", str(tmp_path / "twin.toml")]) == 0
 
 
-def test_a_beginning_that_does_not_fit_names_the_cure(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_beginning_that_does_not_fit_names_the_cure(recording: Path, tmp_path: Path) -> None:
     command = ["calibrate", "--recording", str(recording), "--program", "silverbox", "--span", "700:2000"]
-    assert main([*command, "--settle", "0", "--out", str(tmp_path / "twin.toml")]) == 0
-    assert "the recording did not begin at rest; pass a --settle above 0" in capsys.readouterr().out
-    assert main([*command, "--settle", "300", "--out", str(tmp_path / "twin.toml")]) == 0
-    assert "--settle" not in capsys.readouterr().out
+    assert "the recording did not begin at rest; pass a --settle above 0" in output_of(
+        *command, "--settle", "0", "--out", str(tmp_path / "twin.toml")
+    )
+    assert "--settle" not in output_of(*command, "--settle", "300", "--out", str(tmp_path / "twin.toml"))
 
 
 def test_a_plant_that_changes_unknown_to_the_recording_has_no_twin(
@@ -188,8 +180,7 @@ def test_a_plant_that_changes_unknown_to_the_recording_has_no_twin(
     capsys.readouterr()
     out = tmp_path / "fitted.toml"
     command = ["calibrate", "--recording", str(tmp_path / "r.npz"), "--program", "front", "--json", "--out", str(out)]
-    assert main([*command, "--fix", "B", "--fix", "M"]) == 1
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(output_of(*command, "--fix", "B", "--fix", "M", status=1))
     (caveat,) = told["caveats"]
     assert "times the noise of the output: the plant changed" in caveat
     assert told["file"] is None and not out.exists()
@@ -201,20 +192,20 @@ def test_a_perfect_fit_of_an_output_that_nothing_moves_has_finite_errors() -> No
     assert np.isfinite(_determined(np.zeros((9, 2)), 0.0).errors).all()
 
 
-def test_a_program_is_fitted_to_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_program_is_fitted_to_a_rig(tmp_path: Path) -> None:
     twin = tmp_path / "twin.toml"
-    assert main(["calibrate", "--rig", "emulator-real", "--program", "pendulum", "--json", "--out", str(twin)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(
+        output_of("calibrate", "--rig", "emulator-real", "--program", "pendulum", "--json", "--out", str(twin))
+    )
     assert told["reconstruction"] == "held" and told["check"]["rms"] < 2.0 * told["fit"]["rms"] < 0.04
     true = load_patch(fixtures() / "programs" / "pendulum.toml").values
     assert load_patch(twin).values == pytest.approx(true, rel=0.04)
 
 
-def test_twin_with_the_real_parts_of_the_rig_follows_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_twin_with_the_real_parts_of_the_rig_follows_it(tmp_path: Path) -> None:
     """Multipliers included: nominal parts leave 0.016."""
     command = ["calibrate", "--rig", "emulator-real", "--program", "pendulum", "--components", "polypropylene"]
-    assert main([*command, "--json", "--out", str(tmp_path / "twin.toml")]) == 0
-    assert json.loads(capsys.readouterr().out)["check"]["rms"] < 1e-3
+    assert json.loads(output_of(*command, "--json", "--out", str(tmp_path / "twin.toml")))["check"]["rms"] < 1e-3
 
 
 def test_multipliers_of_a_real_twin_have_the_pole_of_the_data_sheet(recording: Path) -> None:
@@ -235,26 +226,24 @@ def test_a_plant_that_changes_in_the_recording_is_refused(tmp_path: Path, capsys
     assert main([*command, "--span", "0:1000", "--out", str(tmp_path / "twin.toml")]) == 0
 
 
-def test_a_poor_twin_is_not_kept(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_poor_twin_is_not_kept(recording: Path, tmp_path: Path) -> None:
     linear = tmp_path / "linear.toml"
     text = (fixtures() / "programs" / "silverbox.toml").read_text()
     text = "\n".join(line for line in text.splitlines() if not line.startswith(("square =", "cube =")))
     linear.write_text(text.replace(" + square*x**2 - cube*x**3", ""))
     twin = tmp_path / "twin.toml"
     command = ["calibrate", "--recording", str(recording), "--program", str(linear), "--out", str(twin)]
-    assert main([*command, "--most-rms", "4e-5"]) == 1
-    assert "no twin: more than 4e-05 V; nothing kept" in capsys.readouterr().out
+    assert "no twin: more than 4e-05 V; nothing kept" in output_of(*command, "--most-rms", "4e-5", status=1)
     assert not twin.exists()
 
 
-def test_a_program_that_a_run_refuses_is_refused(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_program_that_a_run_refuses_is_refused(recording: Path, tmp_path: Path) -> None:
     program, text = tmp_path / "box.toml", (fixtures() / "programs" / "silverbox.toml").read_text()
     program.write_text(text.replace("gain = {", 'gain = { alias = "sample",'))
     command = ["calibrate", "--recording", str(recording), "--program", str(program)]
-    assert main([*command, "--out", str(tmp_path / "twin.toml")]) == 2
-    assert "box.toml: parameters.gain.alias: sample is a key of scenarios' changes" in capsys.readouterr().err
+    assert "box.toml: parameters.gain.alias: sample is a key of scenarios' changes" in error_of(
+        *command, "--out", str(tmp_path / "twin.toml")
+    )
 
 
 @pytest.mark.parametrize(
@@ -288,9 +277,8 @@ def test_wrong_options_are_one_line(
 
 
 @pytest.mark.parametrize("options", [["--span", "0:9"], ["--check", "0:9"], ["--most-rms", "1"], ["--fix", "M"]])
-def test_options_of_recordings_are_refused_for_rigs(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", *options]) == 2
-    assert f"{options[0]} is for --recording" in capsys.readouterr().err
+def test_options_of_recordings_are_refused_for_rigs(options: list[str]) -> None:
+    assert f"{options[0]} is for --recording" in error_of("calibrate", *options)
 
 
 def test_a_missing_input_cannot_be_played(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -328,14 +316,13 @@ def test_a_check_far_from_the_fit_is_a_caveat(
     )
 
 
-def test_a_fit_counts_its_plays_on_a_terminal(
-    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fit_counts_its_plays_on_a_terminal(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(terminal, "_is_terminal", lambda stream: True)  # noqa: ARG005
     monkeypatch.setattr(terminal, "_PROGRESS_S", 0.01)
     command = ["calibrate", "--recording", str(recording), "--program", "silverbox"]
-    assert main([*command, "--out", str(recording.parent / "fitted.toml")]) == 0
-    assert re.search(r"fitting: \d+ s, \d+ plays", capsys.readouterr().err)
+    assert re.search(
+        r"fitting: \d+ s, \d+ plays", error_of(*command, "--out", str(recording.parent / "fitted.toml"), status=0)
+    )
 
 
 def test_the_help_states_the_settling_time(capsys: pytest.CaptureFixture[str]) -> None:

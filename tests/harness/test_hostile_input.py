@@ -29,6 +29,7 @@ from analogrig.recordings.files import CapturedFrames
 from analogrig.reporting.campaign_page import as_json
 from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, counter_text, number_of, one_line
+from tests.harness.commands import error_of, output_of
 
 SCENARIO = """
 samples = 600
@@ -185,17 +186,16 @@ def test_diagnosis_of_a_non_finite_extent_is_judged_and_reported(
 
 
 @pytest.mark.filterwarnings("error")
-def test_estimates_beyond_any_plant_are_reported_without_warnings(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_estimates_beyond_any_plant_are_reported_without_warnings(recording: Path, tmp_path: Path) -> None:
     """A gain of nearly nothing is a stiffness that single precision does not hold."""
 
     def change(_: object, arrays: dict[str, Any]) -> None:
         arrays["theta"][:, 2:] = 1e-42
 
     path = rewritten(recording, tmp_path / "run.npz", change)
-    assert main(["judge", str(path), "--out", str(tmp_path / "judged")]) == 1  # no estimate is near the truth
-    assert "describes no plant of the program" in capsys.readouterr().out
+    assert "describes no plant of the program" in output_of(
+        "judge", str(path), "--out", str(tmp_path / "judged"), status=1
+    )
 
 
 def test_a_record_a_sample_takes_no_time(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,8 +242,7 @@ def test_control_characters_of_a_recording_do_not_reach_the_terminal(
 
     path = rewritten(recording, tmp_path / "run.npz", change)
     assert "\\x1b]0;owned\\x07\\x9b2J\\u202e" in judged(path, capsys)
-    assert main(["judge", str(path), "--out", str(tmp_path / "judged")]) == 3
-    shown = capsys.readouterr().out
+    shown = output_of("judge", str(path), "--out", str(tmp_path / "judged"), status=3)
     assert "\\x1b[2Jname" in shown
     assert shown.replace("\n", "").isprintable()
 
@@ -468,14 +467,13 @@ def test_message_of_any_length_is_one_printable_line() -> None:
     ids=" ".join,
 )
 def test_pipe_in_the_place_of_a_file_is_refused_and_not_waited_for(
-    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for suffix in ("toml", "so", "log", "dbc"):
         os.mkfifo(f"pipe.{suffix}")
     (tmp_path / "frames.log").write_text("(0.0) can0 010#0000000000000000\n")
-    assert main(arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = error_of(*arguments).splitlines()
     assert "pipe." in line
 
 
@@ -516,13 +514,10 @@ def test_working_directory_that_is_gone_is_named(tmp_path: Path, capsys: pytest.
     assert capsys.readouterr().err == "analogrig: the working directory is gone: change to one that exists\n"
 
 
-def test_rigs_file_of_another_program_is_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rigs_file_of_another_program_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rigs.toml").write_text("[drill]\nx = 1\n")
-    assert main(["list", "rigs", "--json"]) == 0
-    assert "drill" not in capsys.readouterr().out
+    assert "drill" not in output_of("list", "rigs", "--json")
 
 
 def test_zero_with_a_minus_is_zero(tmp_path: Path) -> None:

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from analogrig import Bench, Scenario, judge, open_rig
-from analogrig.cli import main
 from analogrig.config import locate
 from analogrig.devices.python import PythonDescription
 from analogrig.run import Run
+from tests.harness.commands import called
 from tests.harness.hostile_python import ACTS, AT
 from tests.harness.processes import LONG_S, descendants, ends
 
@@ -91,9 +91,9 @@ def command(act: str, out: Path, *options: str, query: str = "") -> list[str]:
     return ["run", "--scenario", str(scenario), "--dut", dut, "--out", str(out), *options]
 
 
-def test_time_limit_ends_a_step_that_sleeps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command("sleep", tmp_path / "out", "--time-limit", "2", "--json")) == 3
-    captured = capsys.readouterr()
+def test_time_limit_ends_a_step_that_sleeps(tmp_path: Path) -> None:
+    captured = called(*(command("sleep", tmp_path / "out", "--time-limit", "2", "--json")))
+    assert captured.status == 3, captured.out + captured.err
     assert f"time limit of 2 s reached after {AT} of" in captured.err
     json.loads(captured.out)
 

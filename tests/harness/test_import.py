@@ -35,6 +35,7 @@ from analogrig_imports import column_reader, columns, text_columns
 from analogrig_imports.column_names import ColumnError, unit_in_name
 from analogrig_imports.columns import read_columns
 from analogrig_imports.imported import ImportDescription, ImportedColumn, import_columns
+from tests.harness.commands import called, error_of, output_of
 
 RATE_HZ = 1000.0
 SAMPLES = 600
@@ -245,16 +246,13 @@ def test_the_truth_can_be_named_later(tmp_path: Path, capsys: pytest.CaptureFixt
     )
 
 
-def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(tmp_path: Path) -> None:
     write_csv(tmp_path / "a.csv", *made_signals(4000))
     recording, out = tmp_path / "a.npz", tmp_path / "out"
     named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(recording)]
-    assert main(["import", str(tmp_path / "a.csv"), *named]) == 0
-    assert "truth: unknown: UNJUDGED" in capsys.readouterr().out
-    assert main(["replay", str(recording), "--dut", "inproc", "--out", str(out), "--json"]) == 3
-    told = capsys.readouterr()
+    assert "truth: unknown: UNJUDGED" in output_of("import", str(tmp_path / "a.csv"), *named)
+    told = called("replay", str(recording), "--dut", "inproc", "--out", str(out), "--json")
+    assert told.status == 3, told.out + told.err
     verdict = json.loads(told.out)
     assert verdict["outcome"] == "unjudged" and not verdict["valid"] and not verdict["false_alarms"]
     assert told.err.startswith(
@@ -265,8 +263,7 @@ def test_an_unknown_plant_is_unjudged_with_its_estimates_and_spectrum(
     run = Run.load(out / "run.npz")
     played = Played(run)
     assert not played.passes() and not played.stays_quiet() and "UNJUDGED" in played.passes().why
-    assert main(["judge", str(out / "run.npz"), "--out", str(tmp_path / "judged")]) == 3
-    words = capsys.readouterr().out
+    words = output_of("judge", str(out / "run.npz"), "--out", str(tmp_path / "judged"), status=3)
     row = next(line for line in words.splitlines() if line.strip().startswith("0-3999")).split()
     assert float(row[1]) == pytest.approx(60.07, rel=0.01) and float(row[2]) == pytest.approx(0.05, rel=0.03)
     assert main(["report", str(tmp_path), "--out", str(tmp_path / "session.html")]) == 0
@@ -279,16 +276,17 @@ def test_measured_data_alone_is_refused_with_the_next_step(tmp_path: Path, capsy
     named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(recording)]
     assert main(["import", str(tmp_path / "a.npz"), *named]) == 0
     capsys.readouterr()
-    assert main(["judge", str(recording), "--out", str(tmp_path / "judged")]) == 2
-    told = capsys.readouterr()
+    told = called("judge", str(recording), "--out", str(tmp_path / "judged"))
+    assert told.status == 2, told.out + told.err
     assert told.err == (
         f"analogrig: {recording}: no device has answered these samples: judge the run of analogrig replay {recording}"
         " --dut NAME\n"
     )
     verdict = json.loads((tmp_path / "judged" / "verdict.json").read_text())
     assert verdict["outcome"] == "inconclusive" and not told.out
-    assert main(["replay", str(recording), "--out", str(tmp_path / "replayed")]) == 2
-    assert "measured data has no device: name one with --dut" in capsys.readouterr().err
+    assert "measured data has no device: name one with --dut" in error_of(
+        "replay", str(recording), "--out", str(tmp_path / "replayed")
+    )
 
 
 def write_thesis(path: Path) -> None:
@@ -344,15 +342,14 @@ def test_the_noise_of_a_column_makes_the_bounds_longer(tmp_path: Path, capsys: p
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_data_that_show_no_change_of_the_scenario_prove_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_that_show_no_change_of_the_scenario_prove_nothing(tmp_path: Path) -> None:
     write_thesis(tmp_path / "a.npz")
     tiny, recording = ImportedColumn("u", "N", scale=1e-6), tmp_path / "recording.npz"
     described = ImportDescription(tiny, METRE, rate_hz=100.0, clock="plant")
     import_columns(tmp_path / "a.npz", described, Scenario.load("thesis")).save(recording)
-    assert main(["replay", str(recording), "--dut", "inproc", "--out", str(tmp_path / "out")]) == 3
-    assert UNDETECTABLE in capsys.readouterr().err
+    assert UNDETECTABLE in error_of(
+        "replay", str(recording), "--dut", "inproc", "--out", str(tmp_path / "out"), status=3
+    )
 
 
 def check_refused(path: Path, described: ImportDescription, complaint: str) -> None:
@@ -416,12 +413,10 @@ def test_units_of_a_header_are_converted_to_those_of_the_program(
     write(tmp_path / name, u, y)
     command = ["import", str(tmp_path / name), "--input", input_column, "--output", output_column, *rate]
     blind, judged = str(tmp_path / "blind.npz"), str(tmp_path / "judged.npz")
-    assert main([*command, "--clock", "plant", "--scenario", "thesis", "--out", judged]) == 0
-    told = capsys.readouterr().out
+    told = output_of(*command, "--clock", "plant", "--scenario", "thesis", "--out", judged)
     small = "um" if name == "a.csv" else "mm"
     assert " N, converted from kN\n" in told and f" m, converted from {small}\n" in told and "imported in" not in told
-    assert main([*command, "--clock", "plant", "--out", blind]) == 0
-    assert f" {small}\n" in capsys.readouterr().out
+    assert f" {small}\n" in output_of(*command, "--clock", "plant", "--out", blind)
     for run in (Run.load(Path(judged)), replace_scenario(Run.load(Path(blind)), Scenario.load("thesis"))):
         assert run.conditions.sample_period_problem_s == pytest.approx(1.0 / RATE_HZ)
         for channel, unit, values in (("force", "N", u), ("displacement", "m", y)):
@@ -434,8 +429,9 @@ def test_units_of_a_header_are_converted_to_those_of_the_program(
     assert caveat in capsys.readouterr().out
     factor = 1e6 if name == "a.csv" else 1e3
     assert np.ptp(Run.load(Path(judged)).channel("displacement")) == pytest.approx(factor * np.ptp(y), rel=1e-3)
-    assert main([*command, "--input-unit", "m", *options]) == 2
-    assert "force of program front is in N, force of the recording in m: import it" in capsys.readouterr().err
+    assert "force of program front is in N, force of the recording in m: import it" in error_of(
+        *command, "--input-unit", "m", *options
+    )
 
 
 @pytest.mark.parametrize(
@@ -637,13 +633,12 @@ def _npy(values: NDArray[Any]) -> bytes:
 @pytest.mark.parametrize("defect", BAD_FILES)
 @pytest.mark.usefixtures("in_this_process")
 @pytest.mark.filterwarnings("ignore")  # of the libraries, about the damage
-def test_a_wrong_file_is_one_line(defect: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_file_is_one_line(defect: str, tmp_path: Path) -> None:
     name, content, complaint = BAD_FILES[defect]
     (tmp_path / name).write_bytes(content() if callable(content) else content)
     out = tmp_path / "out.npz"
     named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(out)]
-    assert main(["import", str(tmp_path / name), *named]) == 2
-    told = capsys.readouterr().err
+    told = error_of("import", str(tmp_path / name), *named)
     assert complaint in told and told.count("\n") == 1 and "Traceback" not in told
     assert not out.exists()
 
@@ -664,26 +659,25 @@ def test_too_many_lines_are_refused_before_they_are_read(tmp_path: Path, monkeyp
     ],
 )
 @pytest.mark.usefixtures("in_this_process")
-def test_doubtful_data_are_imported_with_a_caveat(
-    text: str, caveat: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_doubtful_data_are_imported_with_a_caveat(text: str, caveat: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(text)
     named = ["--input", "u", "--output", "y", "--rate", "1000", "--out", str(tmp_path / "out.npz")]
-    assert main(["import", str(tmp_path / "a.csv"), *named]) == 0
-    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")]
+    told = [
+        line for line in output_of("import", str(tmp_path / "a.csv"), *named).splitlines() if line.startswith("caveat")
+    ]
     assert len(told) == 1 and told[0].startswith(caveat)
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path: Path) -> None:
     assert [unit_in_name(each) for each in ("x", "x[2]", "x [m/s^2]", "x(mm) ")] == ["", "", "m/s^2", "mm"]
     (tmp_path / "a.csv").write_text("t [m];F (Nm);G (Nm)\n0;1;3\n1;2;4\n2;4;5\n")
     named = ["import", str(tmp_path / "a.csv"), "--input", "F (Nm)", "--output", "G (Nm)"]
     named += ["--input-unit", "N m", "--out", str(tmp_path / "out.npz")]
-    assert main([*named, "--time", "t [m]"]) == 2
-    assert "column t [m]: must be a time, not in m: pass --time-unit, or --rate HZ" in capsys.readouterr().err
-    assert main([*named, "--rate", "1000"]) == 0
-    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("caveat")] == [
+    assert "column t [m]: must be a time, not in m: pass --time-unit, or --rate HZ" in error_of(
+        *named, "--time", "t [m]"
+    )
+    assert [line for line in output_of(*named, "--rate", "1000").splitlines() if line.startswith("caveat")] == [
         "caveat: column F (Nm), in Nm, is imported in N m: pass --input-unit, and --input-scale to convert",
         "caveat: column G (Nm), in Nm, is imported in V: pass --output-unit, and --output-scale to convert",
     ]
@@ -765,11 +759,10 @@ def test_another_rate_than_that_of_the_file_is_told(tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_column_of_instants_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_column_of_instants_is_proposed(tmp_path: Path) -> None:
     write_mf4(tmp_path / "a.mf4", *made_signals())
     command = ["import", str(tmp_path / "a.mf4"), "--input", "u", "--output", "y", "--out", str(tmp_path / "out.npz")]
-    assert main(command) == 2
-    proposed = capsys.readouterr().err.rpartition("such as --time ")[2].strip()
+    proposed = error_of(*command).rpartition("such as --time ")[2].strip()
     assert main([*command, "--time", proposed]) == 0
 
 
@@ -811,21 +804,21 @@ BAD_SETTINGS = {
 
 @pytest.mark.parametrize("defect", BAD_SETTINGS)
 @pytest.mark.usefixtures("in_this_process")
-def test_a_wrong_setting_is_one_line(defect: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_setting_is_one_line(defect: str, tmp_path: Path) -> None:
     text, options, complaint = BAD_SETTINGS[defect]
     (tmp_path / "map.toml").write_text(text)
     write_npz(tmp_path / "a.npz", *made_signals())
     command = ["import", str(tmp_path / "a.npz"), "--map", str(tmp_path / "map.toml"), "--out", str(tmp_path / "o.npz")]
     sides = [] if "[input]" in text or "input =" in text else ["--input", "u"]
-    assert main([*command, *sides, "--output", "y", *options]) == 2
-    told = capsys.readouterr().err
+    told = error_of(*command, *sides, "--output", "y", *options)
     assert complaint in told and told.count("\n") == 1 and "Traceback" not in told
 
 
-def test_the_columns_are_named_to_a_user_who_named_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_columns_are_named_to_a_user_who_named_none(tmp_path: Path) -> None:
     write_csv(tmp_path / "a.csv", *made_signals())
-    assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
-    assert "name the columns with --input and --output: there are u, y" in capsys.readouterr().err
+    assert "name the columns with --input and --output: there are u, y" in error_of(
+        "import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")
+    )
 
 
 def test_the_reader_is_bounded_in_memory(tmp_path: Path) -> None:
@@ -896,11 +889,13 @@ def test_codes_that_the_rig_lacks_are_refused(tmp_path: Path, capsys: pytest.Cap
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_signals_without_a_sample_of_a_channel_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_signals_without_a_sample_of_a_channel_are_refused(tmp_path: Path) -> None:
     names = ",".join(f"{name}_{kind}" for kind in ("code", "clipped") for name in CHANNELS)
     (tmp_path / "a.csv").write_text(f"sample,{names}\n0,1,1,1,1,0,1,0,0\n1,2,2,2,2,0,1,0,0\n")
-    assert main(["import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz")]) == 2
-    assert capsys.readouterr().err == f"analogrig: {tmp_path}/a.csv: every sample of displacement is clipped\n"
+    assert (
+        error_of("import", str(tmp_path / "a.csv"), "--out", str(tmp_path / "a.npz"))
+        == f"analogrig: {tmp_path}/a.csv: every sample of displacement is clipped\n"
+    )
 
 
 @pytest.mark.parametrize("name", ["dc-motor", "pendulum", "two-tanks", "rc-battery"])

@@ -15,6 +15,7 @@ import pytest
 from analogrig.cli import main
 from analogrig.run import Run
 from analogrig_imports import column_reader, columns
+from tests.harness.commands import error_of
 
 SAMPLES, PERIOD_S = 60, 0.01
 U = np.where(np.arange(SAMPLES) // 7 % 2, 1.0, -1.0)
@@ -302,11 +303,8 @@ REFUSED: Mapping[str, tuple[str, File]] = {
 
 
 @pytest.mark.parametrize("habit", REFUSED)
-def test_file_is_refused_in_one_line_with_a_cure(
-    habit: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_file_is_refused_in_one_line_with_a_cure(habit: str, tmp_path: Path) -> None:
     says, file = REFUSED[habit]
     (tmp_path / file.name).write_bytes(file.content if isinstance(file.content, bytes) else file.content.encode())
-    assert main(["import", str(tmp_path / file.name), *file.arguments, "--out", str(tmp_path / "out.npz")]) == 2
-    told = capsys.readouterr().err
+    told = error_of("import", str(tmp_path / file.name), *file.arguments, "--out", str(tmp_path / "out.npz"))
     assert says in told and told.count("\n") == 1, told

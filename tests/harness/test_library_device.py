@@ -26,6 +26,7 @@ from analogrig.devices.device import Device
 from analogrig.devices.estimator_library import EstimatorLibrary, EstimatorLibraryDevice
 from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused, TimeLimitReached
 from analogrig.rigs.emulator import is_emulated
+from tests.harness.commands import error_of, output_of
 from tests.harness.library_builds import FAULTY, OWN, build, build_est
 from tests.harness.processes import children, ends
 
@@ -556,34 +557,29 @@ def test_name_without_a_library_is_refused(name: str) -> None:
         registry.describe(name)
 
 
-def test_library_that_a_file_names_is_loaded_only_if_allowed(
-    faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_library_that_a_file_names_is_loaded_only_if_allowed(faulty: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.so").write_bytes(faulty.read_bytes())
     file = tmp_path / "device.toml"
     file.write_text('kind = "library"\nlibrary = "mine.so"\n')
     command = ["run", "--dut", str(file), "--out", str(tmp_path / "out")]
-    assert main(command) == 2
-    assert "the device loads the library" in capsys.readouterr().err
+    assert "the device loads the library" in error_of(*command)
     assert main([*command, "--allow", str(tmp_path / "mine.so")]) == 1
 
 
 # ---- the commands
 
 
-def test_campaign_and_certificate_of_a_library(own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_campaign_and_certificate_of_a_library(own: Path, tmp_path: Path) -> None:
     plan = tmp_path / "plan.toml"
     plan.write_text(
         f'scenario = "healthy"\nrigs = ["emulator"]\ndevices = ["library:{own}"]\ntrials = 2\nsamples = 1600\n'
         "change_at = 1200\n[grid]\nstiffness_factor = [0.7]\n"
     )
     command = ["campaign", str(plan), "--allow", str(own), "--workers", "2", "--out", str(tmp_path / "campaign")]
-    assert main(command) == 1
-    assert "campaign plan: 1 cell, 2 trials, 3200 samples: FAILED" in capsys.readouterr().out
+    assert "campaign plan: 1 cell, 2 trials, 3200 samples: FAILED" in output_of(*command, status=1)
     allowed = ["--far", "1e-2", "--confidence", "0.9", "--bounds", "bursts", "--allowed", "10"]
     command = ["certify", *allowed, "--dut", f"library:{own}", "--workers", "2"]
-    assert main(command) == 0
-    assert "CERTIFIED\n  0 alarms in " in capsys.readouterr().out
+    assert "CERTIFIED\n  0 alarms in " in output_of(*command)
 
 
 REFUSING = """

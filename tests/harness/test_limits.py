@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.cli import main
 from analogrig.devices.registry import open_dut
 from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.judging.information import detectable, predicted_bounds
@@ -20,6 +19,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.scenario import PotChange, Scenario
 from analogrig.testing.one_play import Played, rate_below
 from analogrig.testing.statement import with_some_seed
+from tests.harness.commands import error_of
 from tests.harness.plants import front
 from tests.harness.runs import made_run
 
@@ -116,12 +116,9 @@ def test_wrong_seed_is_one_line(bench: Bench, seed: Any) -> None:
     ],
     ids=str,
 )
-def test_wrong_option_of_certify_is_one_line(
-    options: Mapping[str, str], why: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_option_of_certify_is_one_line(options: Mapping[str, str], why: str) -> None:
     words = [word for name, value in options.items() for word in (f"--{name}", value)]
-    assert main(["certify", "--dut", "inproc", "--workers", "1", "--far", "0.01", *words]) == 2
-    said = capsys.readouterr().err
+    said = error_of("certify", "--dut", "inproc", "--workers", "1", "--far", "0.01", *words)
     assert why in said and said.count("\n") == 1
 
 

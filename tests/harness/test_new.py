@@ -12,6 +12,7 @@ import pytest
 
 from analogrig.cli import main
 from analogrig_new.new_command import _FOLDERS, _TEMPLATES
+from tests.harness.commands import error_of
 from tests.wheels import run
 
 KINDS = sorted(_FOLDERS)
@@ -87,17 +88,15 @@ def test_missing_package_is_named_in_one_line(environment: Path, repository: Pat
     assert len(told) == 2  # the other one is make's own
 
 
-def test_folder_that_holds_something_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine").touch()
-    assert main(["new", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.endswith("holds mine: name a folder that is absent or empty\n")
+    assert error_of("new", str(tmp_path)).endswith("holds mine: name a folder that is absent or empty\n")
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "mine").touch()
-    assert main(["new", str(tmp_path / "mine")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert error_of("new", str(tmp_path / "mine")).count("\n") == 1
 
 
 def test_empty_git_repository_is_accepted(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from analogrig.judging.verdict import judge
 from analogrig.program import Program
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
+from tests.harness.commands import output_of
 
 TWO_MASS = Scenario.load("two-mass")
 SHORT = dataclasses.replace(TWO_MASS, samples=60, changes=())
@@ -168,14 +169,12 @@ def test_order_beyond_the_catalogue_is_refused() -> None:
         dut.suit([0.5] * 99)
 
 
-def test_run_states_the_chosen_orders_and_the_step_response(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_states_the_chosen_orders_and_the_step_response(tmp_path: Path) -> None:
     command = ["run", "--scenario", "two-mass", "--dut", "inproc", "--out", str(tmp_path)]
-    assert main(command) == 0
-    told = capsys.readouterr().out
+    told = output_of(*command)
     assert "the program two-mass, of order 4, chose the device's settings: na = 4, nb = 5, forgetting = 0.998" in told
     assert "step response of the estimate" in told
-    assert main([*command, "--json"]) == 0
-    assert [each["end"] for each in json.loads(capsys.readouterr().out)["step_responses"]] == [1000, 1500]
+    assert [each["end"] for each in json.loads(output_of(*command, "--json"))["step_responses"]] == [1000, 1500]
 
 
 def test_run_states_that_a_nonlinear_program_has_more_states_than_the_model(

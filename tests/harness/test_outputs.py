@@ -25,6 +25,7 @@ from analogrig.judging.verdict import judge
 from analogrig.output import NOT_ENDED, OutputFolder, previous_of
 from analogrig.run import Run
 from analogrig.signals import ENDING
+from tests.harness.commands import error_of, output_of
 from tests.harness.processes import descendants, ends, with_default_signals
 
 LONG_S = 300.0
@@ -140,18 +141,18 @@ def test_run_that_fails_later_keeps_what_it_has(out: Path, fault: Exception, mon
 
 @pytest.mark.parametrize("name", ["run.npz", "report.html", "verdict.json", "can.log"])
 def test_folder_in_the_place_of_a_result_is_refused_before_the_run(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "out" / name).mkdir(parents=True)
     monkeypatch.setattr(Bench, "play", None)
-    assert main(["run", "--dut", "inproc", "--out", str(tmp_path / "out")]) == 2
-    assert f"{name} is no file: remove it, or choose another folder" in capsys.readouterr().err
+    assert f"{name} is no file: remove it, or choose another folder" in error_of(
+        "run", "--dut", "inproc", "--out", str(tmp_path / "out")
+    )
     assert (tmp_path / "out" / name).is_dir()
 
 
-def test_verdict_file_is_what_json_prints(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "--dut", "inproc", "--seed", "4", "--out", str(out), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+def test_verdict_file_is_what_json_prints(out: Path) -> None:
+    printed = json.loads(output_of("run", "--dut", "inproc", "--seed", "4", "--out", str(out), "--json"))
     assert verdict(out) == {"format": "analogrig-verdict", "version": 1, **printed}
     assert printed["outcome"] == page_outcome(out) == judge(Run.load(out / "run.npz")).outcome == "passed"
     assert (out / "notes.txt").read_text() == "mine"
@@ -476,11 +477,10 @@ def test_older_picture_is_not_taken_for_the_new_one(tmp_path: Path, monkeypatch:
     assert contents(tmp_path) == {"effects.svg.previous": b"older"}
 
 
-def test_file_that_is_read_is_not_moved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_that_is_read_is_not_moved(tmp_path: Path) -> None:
     (tmp_path / "twin.toml").write_text("older")
     words = ["calibrate", "--rig", f"{tmp_path / 'twin.toml'}:mine", "--out", str(tmp_path / "twin.toml")]
-    assert main(words) == 2
-    assert "would overwrite a file that is read; choose another" in capsys.readouterr().err
+    assert "would overwrite a file that is read; choose another" in error_of(*words)
     assert contents(tmp_path) == {"twin.toml": b"older"}
 
 

@@ -16,7 +16,6 @@ import pytest
 from analogrig.answers import Answers, Samples
 from analogrig.bench import Bench
 from analogrig.catalogue import Cause, Change, SteppedFlag
-from analogrig.cli import main
 from analogrig.datasheet import Datasheet, ModelOrders
 from analogrig.devices.device import Device, DeviceDescription
 from analogrig.devices.python import PythonDescription
@@ -26,6 +25,7 @@ from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
 from analogrig.run import UNARMED, UNREPORTED
 from analogrig.scenario import Scenario
+from tests.harness.commands import error_of
 
 ESTIMATORS = "tests.harness.python_estimators"
 THESIS_HASH, HEALTHY_HASH = "54f04f72e4f6d22a", "50312902f3570e68"
@@ -174,17 +174,15 @@ def test_settings_come_from_file_and_command_line_and_are_recorded(folder: Path)
             assert len(answered(device, samples(1))[0].alarms) == 0, "all or none"
 
 
-def test_file_may_not_import_a_module_of_itself(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_may_not_import_a_module_of_itself(folder: Path) -> None:
     name = module(folder, "raise SystemExit('was imported')")
     (folder / "it.toml").write_text(f'kind = "python"\nfactory = "{name}:It"')
-    assert main(["run", "--dut", "it.toml"]) == 2
-    error = capsys.readouterr().err
+    error = error_of("run", "--dut", "it.toml")
     assert error == (
         f"analogrig: it.toml: the device imports python:{name}:It, which no file may order:"
         f" pass --allow python:{name}:It\n"
     )
-    assert main(["run", "--dut", "it.toml", "--allow", f"python:{name}:It"]) == 2
-    assert "was imported" in capsys.readouterr().err
+    assert "was imported" in error_of("run", "--dut", "it.toml", "--allow", f"python:{name}:It")
 
 
 WRONG_NAMES = {
@@ -202,9 +200,8 @@ WRONG_NAMES = {
 
 
 @pytest.mark.parametrize("name", WRONG_NAMES)
-def test_wrong_name_is_one_line(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "--dut", name]) == 2
-    error = capsys.readouterr().err
+def test_wrong_name_is_one_line(name: str, folder: Path) -> None:
+    error = error_of("run", "--dut", name)
     assert error.startswith("analogrig: ") and error.count("\n") == 1
     assert WRONG_NAMES[name].format(folder=folder) in error
 
@@ -263,13 +260,10 @@ def test_exception_names_sample_type_and_line_and_ends_the_run(way: str, folder:
     ],
     ids=["BaseException", "__str__", "KeyboardInterrupt", "in factory", "step", "datasheet"],
 )
-def test_odd_failure_of_the_object_is_one_line(
-    folder: Path, part: str, status: int, error: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_odd_failure_of_the_object_is_one_line(folder: Path, part: str, status: int, error: str) -> None:
     odd = "class Odd(BaseException): pass\nclass Mute(Exception):\n    def __str__(self): return 1 / 0\n"
     name = module(folder, f"{odd}class It:\n    def step(self, u, y, valid): return False\n\n    {part}\n")
-    assert main(["run", "--dut", f"python:{name}:It"]) == status
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = error_of("run", "--dut", f"python:{name}:It", status=status).splitlines()
     assert f"device python:{name}:It: {error.format(name=name, file=folder / f'{name}.py')}" in line
 
 

@@ -19,6 +19,7 @@ from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import CHANNELS
 from analogrig_instruments.rig_comparison import RigComparison, compare_rigs, signal_difference
+from tests.harness.commands import error_of, output_of
 from tests.harness.runs import made_run
 
 from .plants import front
@@ -141,28 +142,24 @@ def test_noise_beyond_the_setting_of_the_device_changes_the_verdicts() -> None:
     assert "false alarms is worse" in found.sentence
 
 
-def test_command_prints_the_sentence_and_fails_beyond_the_limits(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_the_sentence_and_fails_beyond_the_limits() -> None:
     command = ["compare-rigs", "emulator", "emulator-skewed", "--dut", "inproc", "--plays", "3"]
-    assert main(command) == 0
-    first = capsys.readouterr().out.splitlines()[0]
+    first = output_of(*command).splitlines()[0]
     assert first.startswith("emulator-skewed follows emulator within 15 LSB")
     assert "in 3 plays of thesis" in first
-    assert main([*command, "--most-lsb", "10", "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)["sentence"] == first
+    assert json.loads(output_of(*command, "--most-lsb", "10", "--json", status=1))["sentence"] == first
     assert main([*command, "--most-lsb", "20", "--most-samples", "0.001"]) == 1
 
 
-def test_invalid_plays_are_not_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_plays_are_not_compared(tmp_path: Path) -> None:
     """Clipped samples beyond the scenario's limit make every run of one rig inconclusive."""
     table = "[card]\n[card.range_v]\nforce = [-1.0, 5.0]\ndisplacement = [-1.0, 9.0]\nvelocity = [-10.0, 10.0]\n"
     clipping = tmp_path / "clipping.toml"
     clipping.write_text(f"{table}net_force = [-12.5, 12.5]\n")
-    assert main(["compare-rigs", "emulator", str(clipping), "--dut", "inproc", "--plays", "2"]) == 3
-    error = capsys.readouterr().err
+    error = error_of("compare-rigs", "emulator", str(clipping), "--dut", "inproc", "--plays", "2", status=3)
     assert error.startswith("analogrig: INCONCLUSIVE: nothing can be compared: clipping, seed 0: ")
 
 
 @pytest.mark.parametrize(("option", "value"), [("--plays", "1"), ("--confidence", "0.4"), ("--confidence", "1")])
-def test_invalid_options_are_usage_errors(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare-rigs", "emulator", "emulator", option, value]) == 2
-    assert option in capsys.readouterr().err
+def test_invalid_options_are_usage_errors(option: str, value: str) -> None:
+    assert option in error_of("compare-rigs", "emulator", "emulator", option, value)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter, step
 from scipy.stats import chi2
 
-from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RigError, SelfTestError
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
@@ -24,6 +23,7 @@ from analogrig.scenario import Scenario
 from analogrig_emulator import CHANNELS
 from analogrig_instruments.self_test import Check, Findings, self_test
 from analogrig_instruments.square_wave import EdgeTimes, Response, SquareWave, step_response
+from tests.harness.commands import error_of, output_of
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))
@@ -504,17 +504,15 @@ def rig_file(tmp_path: Path, faults: str) -> str:
     return str(path)
 
 
-def test_doctor_passes_a_healthy_rig(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--rig", "emulator", "--json"]) == 0
-    output = json.loads(capsys.readouterr().out)
+def test_doctor_passes_a_healthy_rig() -> None:
+    output = json.loads(output_of("doctor", "--rig", "emulator", "--json"))
     assert (output["rig"], output["well"], output["reasons"]) == ("emulator", True, [])
     assert {check["state"] for check in output["checks"]} == {"well"}
 
 
-def test_doctor_reports_value_limit_and_remedy_of_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_reports_value_limit_and_remedy_of_a_fault(tmp_path: Path) -> None:
     rig = rig_file(tmp_path, "clock_drift_ppm = 120.0, skew_s = [0.0, 10e-6, 0.0, 0.0]")
-    assert main(["doctor", "--rig", rig]) == 1
-    lines = capsys.readouterr().out.splitlines()
+    lines = output_of("doctor", "--rig", rig, status=1).splitlines()
     assert lines[0] == "self-test of bench, program front: 2 WRONG"
     skew = next(i for i, line in enumerate(lines) if line.split()[:2] == ["wrong", "skew"])
     assert lines[skew].split()[2] in ("0.19", "0.20", "0.21")
@@ -524,27 +522,24 @@ def test_doctor_reports_value_limit_and_remedy_of_a_fault(tmp_path: Path, capsys
     assert "-119.9" in clock or "-120.0" in clock
 
 
-def test_doctor_without_a_signal_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_without_a_signal_is_inconclusive(tmp_path: Path) -> None:
     rig = rig_file(tmp_path, "stuck_low = 4095")
-    assert main(["doctor", "--rig", rig]) == 3
-    assert capsys.readouterr().err.startswith("analogrig: INCONCLUSIVE: the self-test could not be made: no signal on")
+    assert error_of("doctor", "--rig", rig, status=3).startswith(
+        "analogrig: INCONCLUSIVE: the self-test could not be made: no signal on"
+    )
 
 
-def test_doctor_is_inconclusive_if_a_quantity_is_not_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_doctor_is_inconclusive_if_a_quantity_is_not_measured(tmp_path: Path) -> None:
     """Noise of 4 LSB of 12 bits is within its limit; the standard error of the shape is a ninth of its limit."""
     path = tmp_path / "noisy.toml"
     path.write_text(RIG_FILE.format(faults="").replace("noise_lsb = 1.0", "noise_lsb = 4.0"))
-    assert main(["doctor", "--rig", str(path)]) == 3
-    output = capsys.readouterr().out
+    output = output_of("doctor", "--rig", str(path), status=3)
     assert output.startswith("self-test of noisy, program front: 1 NOT MEASURED")
     assert "standard error would have to be at most 0.056" in output
 
 
-def test_doctor_of_an_unknown_rig_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--rig", "nowhere"]) == 2
-    assert "no rig is called" in capsys.readouterr().err
+def test_doctor_of_an_unknown_rig_is_a_usage_error() -> None:
+    assert "no rig is called" in error_of("doctor", "--rig", "nowhere")
 
 
 @pytest.mark.parametrize("late_us", [0.0, 4.0, -10.0, 10.0])

@@ -14,6 +14,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.output import NOT_ENDED, OutputFolder
 from analogrig_session import session_page
 from analogrig_session.session_page import find_session, render
+from tests.harness.commands import output_of
 from tests.harness.reported import Page
 
 CHANGE = {"latency": 3, "bound": 2, "result": "detected"}
@@ -128,12 +129,11 @@ def test_run_that_has_not_ended_is_inconclusive_and_earlier_results_are_left_out
     ids=lambda content: content[:20],
 )
 def test_file_that_is_no_verdict_is_one_line_beside_the_others(
-    add: Callable[..., Path], tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+    add: Callable[..., Path], tmp_path: Path, content: bytes
 ) -> None:
     add("good")
     (add("bad") / "verdict.json").write_bytes(content)
-    assert main(["report", str(tmp_path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = output_of("report", str(tmp_path)).splitlines()
     assert len(lines) == 3
     assert lines[0] == "passed       good: 0 of 2 missed, 2.00 bounds, 0 false alarms"
     assert lines[1].startswith(f"not read: {tmp_path}/bad/verdict.json: not a verdict")
@@ -141,12 +141,9 @@ def test_file_that_is_no_verdict_is_one_line_beside_the_others(
     assert "bad/verdict.json" in (tmp_path / "session.html").read_text()
 
 
-def test_line_of_a_file_that_is_no_verdict_names_a_cure_and_no_python(
-    add: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_line_of_a_file_that_is_no_verdict_names_a_cure_and_no_python(add: Callable[..., Path], tmp_path: Path) -> None:
     (add("bad") / "verdict.json").write_bytes(b"[")
-    assert main(["report", str(tmp_path)]) == 2
-    line, _ = capsys.readouterr().out.splitlines()
+    line, _ = output_of("report", str(tmp_path), status=2).splitlines()
     place = f"{tmp_path}/bad/verdict.json"
     assert line == f"not read: {place}: not a verdict of analogrig: run the command again, or remove it"
 
@@ -173,13 +170,10 @@ def test_folder_without_a_run_or_with_too_many_is_refused(
         found(tmp_path)
 
 
-def test_page_may_stand_elsewhere_and_links_to_the_runs(
-    add: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_page_may_stand_elsewhere_and_links_to_the_runs(add: Callable[..., Path], tmp_path: Path) -> None:
     add("runs/a")
     page = tmp_path / "site" / "index.html"
-    assert main(["report", str(tmp_path / "runs"), "--out", str(page), "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = json.loads(output_of("report", str(tmp_path / "runs"), "--out", str(page), "--json"))
     assert [run["folder"] for run in shown["runs"]] == ["a"]
     assert 'href="../runs/a/report.html"' in page.read_text()
     assert main(["report", str(tmp_path / "runs"), "--out", str(tmp_path)]) == 2

@@ -47,6 +47,7 @@ from analogrig.trust import FiledName, Thing, Trust, resolve_name
 from analogrig_instruments.instrument import DRIVERS
 from analogrig_instruments.pots import InstrumentPots, PotsDescription
 from analogrig_instruments.rig_wiring import Input, RealDescription
+from tests.harness.commands import error_of
 from tests.served.serving import serving
 
 pytestmark = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io:pytest.PytestUnraisableExceptionWarning")
@@ -491,10 +492,9 @@ def test_command_that_only_reads_a_rig_refuses_its_file_too(
 
 
 @pytest.mark.parametrize("kind", RIGS)
-def test_serve_serves_no_real_rig(kind: Callable[..., Bait], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_serve_serves_no_real_rig(kind: Callable[..., Bait], folder: Path) -> None:
     bait = kind(folder, lambda: "127.0.0.1:9")
-    assert main(["serve", "--port", "0", "--rig", rig_file(bait)]) == REFUSED
-    assert capsys.readouterr().err.count("\n") == 1
+    assert error_of("serve", "--port", "0", "--rig", rig_file(bait), status=REFUSED).count("\n") == 1
     assert not bait.witness.happened()
 
 
