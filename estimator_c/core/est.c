@@ -491,11 +491,11 @@ EST_INLINE void accept_equation(est_t* const self, const est_shape_t shape, cons
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
-    const est_config_t* const config = self->config;
-    float                     x[EST_THETA_MAX + 2U];  // the last one is spare: gcc warns of an access that never is
-    float                     gain[EST_THETA_MAX] = { 0.0F };  // MISRA D2
-    est_equation_t            equation            = { .x = x, .gain = gain };
-    float                     weight_min;
+    const est_config_t* const config     = self->config;
+    float          x[EST_THETA_MAX + 2U] = { 0.0F };  // one to spare: gcc warns of an access that never is; MISRA D2
+    float          gain[EST_THETA_MAX]   = { 0.0F };  // MISRA D2
+    est_equation_t equation              = { .x = x, .gain = gain };
+    float          weight_min;
     if (self->settled) {
         equation.variance = 1.0F;
         weight_min        = EST_WEIGHT_DUE;

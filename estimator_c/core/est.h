@@ -525,7 +525,7 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// the alarm if it passes the ceiling. This applies where a missing sample would be predicted.
 /// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.45 times a
 /// typical one if edges may slip, 1.33 times otherwise.
-/// RAM: the state, and stack: on a Cortex-M 240 to 320 bytes, at -O0 1,190; on an AVR 240, at -O0 760 (make
+/// RAM: the state, and stack: on a Cortex-M 240 to 320 bytes, at -O0 1,190; on an AVR 250, at -O0 760 (make
 /// cost). May be called from an interrupt.
 est_step_t est_step(est_t* self, est_sample_t sample);
 

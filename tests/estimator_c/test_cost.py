@@ -60,18 +60,18 @@ SIZES = [f"M4F, code of the core at -Os, {what}" for what in ("everything", "tri
 LIMITED = [*STEPS, *(f"{name}, worst" for name in STEPS), *SIZES]
 
 BEYOND = {
-    "M4F, n = 4, edges locked": 598,
-    "M4F, n = 4, edges locked, worst": 792,
-    "M4F, n = 4, edges locked, trigger alone": 422,
+    "M4F, n = 4, edges locked": 600,
+    "M4F, n = 4, edges locked, worst": 795,
+    "M4F, n = 4, edges locked, trigger alone": 424,
     "M4F, n = 4, edges locked, fixed": 346,
     "M4F, n = 4, edges locked, fixed, worst": 435,
-    "M4F, n = 6, edges locked": 780,
-    "M4F, n = 6, edges locked, worst": 984,
-    "M4F, n = 6, edges may slip": 811,
-    "M4F, n = 6, edges may slip, worst": 1173,
+    "M4F, n = 6, edges locked": 782,
+    "M4F, n = 6, edges locked, worst": 987,
+    "M4F, n = 6, edges may slip": 813,
+    "M4F, n = 6, edges may slip, worst": 1175,
     "M4F, n = 6, edges may slip, fixed, worst": 684,
-    "M4F, code of the core at -Os, everything": 7168,
-    "M4F, code of the core at -Os, trigger alone": 1612,
+    "M4F, code of the core at -Os, everything": 7172,
+    "M4F, code of the core at -Os, trigger alone": 1624,
 }
 """Limits that the core still misses, with values not to exceed; one that it keeps must leave this list.
 

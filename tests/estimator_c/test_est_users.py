@@ -162,7 +162,7 @@ def test_every_field_of_a_configuration_has_a_comment_with_its_unit_or_range() -
     [
         *(
             pytest.param(processor, level, most, marks=() if level == "-Os" else pytest.mark.heavy)
-            for processor, most in ((stack.CORTEX_M4F, 320), (stack.CORTEX_M0, 320), (stack.AVR, 240))
+            for processor, most in ((stack.CORTEX_M4F, 320), (stack.CORTEX_M0, 320), (stack.AVR, 250))
             for level in ("-Os", "-O2", "-O3")
         ),
         (stack.CORTEX_M4F, "-O0", 1190),
