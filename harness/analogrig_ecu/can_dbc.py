@@ -79,6 +79,6 @@ class CanDbcDevice(CanPort, DbcDescription):
 
     def open(self) -> Device:
         from analogrig.links.can_bus import PythonCanBus
-        from analogrig_ecu.ecu import EcuDevice
+        from analogrig_ecu.ecu_device import EcuDevice
 
         return EcuDevice(self, PythonCanBus(self.bus_config()))

@@ -12,7 +12,7 @@ from analogrig.answers import AlarmLevel
 from analogrig.devices import LOST, Answers, CapturedRun
 from analogrig.links.link import Identifier
 from analogrig.run import Channel
-from analogrig_ecu.ecu import MISSING, EcuAnswers
+from analogrig_ecu.ecu_device import MISSING, EcuAnswers
 from analogrig_ecu.ecu_messages import EcuMessages, SamplePart
 
 if TYPE_CHECKING:
@@ -101,14 +101,9 @@ class EcuDecoder:
                 try:
                     self.runs[-1].collected.add(answer)
                 except DeviceError as error:
-                    self._add_fault(str(error))
+                    self.runs[-1].faults = self.runs[-1].faults or [str(error)]  # the first of a run
         elif self._messages.is_of_sample(frame) or self._messages.is_of_answer(frame):
             self._traffic["frames_dropped"] += 1
-
-    def _add_fault(self, fault: str) -> None:
-        """Record the first fault of a run."""
-        if not self.runs[-1].faults:
-            self.runs[-1].faults.append(fault)
 
     def _begin_run(self) -> EcuRun:
         if self.runs and not self.runs[-1].samples:

@@ -303,9 +303,13 @@ class CatalogueDevice(Device):
             wanted = float(np.float32(value))  # as the device holds it
             answer = self._talk.ask(Configure(self._talk.next_seq(), key, wanted), Configured)
             if answer.key != key or answer.result != Result.APPLIED or answer.value != wanted:
+                cure = ""
+                if estimator.is_wide:
+                    cause = "the program's order needs it: " if estimator.orders == "program" else ""
+                    cure = f"; {cause}compile the device with {estimator.room}, or give it a lower order in [estimator]"
                 raise DeviceRefused(
                     f"device {self.name}: {key.name.lower()} = {value:g} was not applied:"
-                    f" {_word(Result, answer.result)}, it has {answer.value:g}{self._lack_of_room()}"
+                    f" {_word(Result, answer.result)}, it has {answer.value:g}{cure}"
                 )
 
     def _describe(self, estimator: EstimatorConfig) -> None:
@@ -320,13 +324,6 @@ class CatalogueDevice(Device):
             if self._listener is not None:
                 self._talk.link.listen(self._listener)
             self.recover()
-
-    def _lack_of_room(self) -> str:
-        """Cure of a refusal that may be for want of room; empty where the usual build has it."""
-        if not self.estimator.is_wide:
-            return ""
-        cause = "the program's order needs it: " if self.estimator.orders == "program" else ""
-        return f"; {cause}compile the device with {self.estimator.room}, or give it a lower order in [estimator]"
 
     def pace(self, period_s: float) -> Pace:
         """Pace of a run in real time, with a sample every ``period_s`` on the link's clock.

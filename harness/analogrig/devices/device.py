@@ -121,10 +121,13 @@ class DeviceDescription:
             )
         place, query = cls._split_query(name, place.removeprefix(":"), query)
         table = {"name": name, **cls._place(name, place)}
-        for key, text in _pairs(name, query):
-            if key in table:
+        for word in filter(None, query.split("&")):
+            key, equals, text = word.partition("=")
+            if not (key and equals):
+                raise ConfigurationError(f"{name}: {word!r} is not KEY=VALUE")
+            if (key := unquote(key)) in table:
                 raise ConfigurationError(f"{name}: {key} is given twice")
-            table[key] = _value(cls, key, text)
+            table[key] = _value(cls, key, unquote(text))
         if cls.collects:
             names = {field.name for field in dataclasses.fields(cls)}
             others = {key: table.pop(key) for key in list(table) if key not in names}
@@ -365,16 +368,12 @@ class Causes:
         return self._sentences(loses=False)
 
     def _sentences(self, *, loses: bool) -> tuple[str, ...]:
-        facts = [text for text, it_loses in self._facts.values() if it_loses == loses]
-        found = [_sentence(text, cause) for text, cause in self._found.items() if cause.loses == loses]
-        return (*facts, *found)
-
-
-def _sentence(text: str, cause: _Cause) -> str:
-    detail = f": {cause.detail}" if cause.detail else ""
-    if cause.n == 1:
-        return f"{text} ({cause.place}{detail})"
-    return f"{text} ({number_of(cause.n, cause.noun)} from {cause.place} on{detail})"
+        sentences = [text for text, it_loses in self._facts.values() if it_loses == loses]
+        for text, cause in self._found.items():
+            if cause.loses == loses:
+                place = cause.place if cause.n == 1 else f"{number_of(cause.n, cause.noun)} from {cause.place} on"
+                sentences.append(f"{text} ({place}{': ' if cause.detail else ''}{cause.detail})")
+        return tuple(sentences)
 
 
 class Device(ABC):
@@ -540,18 +539,6 @@ class Device(ABC):
 
     def listen(self, listener: CanListener) -> None:  # noqa: B027 - few lines carry CAN frames
         """Report all CAN frames to the listener from now on; a line without any ignores it."""
-
-
-def _pairs(name: str, query: str) -> list[tuple[str, str]]:
-    """KEY=VALUE pairs separated by ampersands, with percent escapes decoded.
-
-    :raises ConfigurationError: a word is not KEY=VALUE.
-    """
-    words = [word.partition("=") for word in query.split("&") if word]
-    for key, equals, value in words:
-        if not (key and equals):
-            raise ConfigurationError(f"{name}: {key + equals + value!r} is not KEY=VALUE")
-    return [(unquote(key), unquote(value)) for key, _, value in words]
 
 
 def _value(cls: type[DeviceDescription], key: str, text: str) -> Any:

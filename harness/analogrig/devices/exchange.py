@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
+from analogrig.answers import AnswerRows, Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit, Samples
 from analogrig.catalogue import (
     BLOCK_SAMPLES,
     INDICES,
@@ -49,7 +49,6 @@ from analogrig.catalogue import (
 )
 from analogrig.devices.device import MOST_TIMEOUTS
 from analogrig.devices.pace import Pace
-from analogrig.devices.rows import AnswerRows
 from analogrig.errors import DeviceError, LinkClosed, LinkError, LinkTimeout, TimeLimitReached
 from analogrig.links.link import Link
 from analogrig.run import LOST, UNREPORTED

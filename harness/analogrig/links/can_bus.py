@@ -150,7 +150,9 @@ class PythonCanBus:
             number = _errno(error)
             if number is not None:
                 raise LinkClosed(f"{self.name}: {self._reason(error, number)}") from error
-            self._discard_damage(error)
+            self.damaged += 1
+            if any(isinstance(each, UnicodeDecodeError) for each in _causes(error)) and isinstance(self._bus, slcanBus):
+                self._bus.flush()  # python-can's slcan would fail on this input again at every later line
             return None
         if frame is not None and not _is_valid(frame):
             self.damaged += 1
@@ -158,12 +160,6 @@ class PythonCanBus:
         if frame is not None and self._never_echoes:
             frame.is_rx = True  # SocketCAN marks frames of other programs on this machine as sent
         return frame
-
-    def _discard_damage(self, error: Exception) -> None:
-        """Count damaged input, and flush it: python-can's slcan would fail on it again at every later line."""
-        self.damaged += 1
-        if any(isinstance(each, UnicodeDecodeError) for each in _causes(error)) and isinstance(self._bus, slcanBus):
-            self._bus.flush()
 
     def close(self) -> None:
         with contextlib.suppress(Exception):  # the bus may be gone

@@ -62,7 +62,8 @@ class CanLink:
     def receive(self, timeout_s: float) -> Message | None:
         deadline_s = self.clock() + timeout_s
         while (frame := self._station.receive(max(0.0, deadline_s - self.clock()))) is not None:
-            message = unpack_any(bytes((frame.arbitration_id,)) + frame.data) if self._can_hold(frame) else None
+            is_of_bus = self.carries_blocks or not frame.is_fd  # a bus of classic CAN carries no frame of CAN FD
+            message = unpack_any(bytes((frame.arbitration_id,)) + frame.data) if is_of_bus else None
             if message is not None:
                 return message
             self._station.counted["frames_dropped"] += 1
@@ -70,10 +71,6 @@ class CanLink:
 
     def close(self) -> None:
         self._station.close()
-
-    def _can_hold(self, frame: can.Message) -> bool:
-        """True unless the frame is of CAN FD, and the bus is not."""
-        return self.carries_blocks or not frame.is_fd
 
     def _frame(self, message: Message) -> can.Message:
         """Frame of a message: classic, unless it is too long for that."""

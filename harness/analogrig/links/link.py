@@ -114,17 +114,13 @@ class DescriptorWire:
     def write(self, sent: bytes) -> None:
         try:
             sent = sent[self._take(sent) :]
-            if sent:
-                self._write_rest(sent, self.clock() + WRITE_TIMEOUT_S)
+            deadline_s = self.clock() + WRITE_TIMEOUT_S if sent else 0.0
+            while sent:  # in pieces, each when the other end has room for it
+                if not self._writable.poll(math.ceil(max(0.0, deadline_s - self.clock()) * 1000.0)):
+                    raise LinkError(f"{self.name}: nothing can be sent: the other end does not read")
+                sent = sent[self._take(sent) :]
         except OSError as error:
             raise LinkClosed(f"{self.name}: {_reason(error)}") from error
-
-    def _write_rest(self, sent: bytes, deadline_s: float) -> None:
-        """Write in pieces, each when the other end has room for it."""
-        while sent:
-            if not self._writable.poll(math.ceil(max(0.0, deadline_s - self.clock()) * 1000.0)):
-                raise LinkError(f"{self.name}: nothing can be sent: the other end does not read")
-            sent = sent[self._take(sent) :]
 
     def _take(self, sent: bytes) -> int:
         """Number of bytes that the line accepts without waiting."""
@@ -177,7 +173,9 @@ class PortWire:
         has_descriptor = handler in (serial.Serial, protocol_socket.Serial)
         self._descriptor = DescriptorWire(self._port.fileno(), self.name) if has_descriptor else None
         if handler is protocol_socket.Serial:
-            _send_at_once(self._port.fileno())
+            # Send small messages without waiting for the acknowledgement of earlier ones, which takes up to 40 ms.
+            with socket.socket(fileno=os.dup(self._port.fileno())) as line:
+                line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, sent: bytes) -> None:
         if self._descriptor is not None:
@@ -203,12 +201,6 @@ class PortWire:
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._port.close()
-
-
-def _send_at_once(fd: int) -> None:
-    """Send small messages without waiting for the acknowledgement of earlier ones, which takes up to 40 ms."""
-    with socket.socket(fileno=os.dup(fd)) as line:
-        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def _reason(error: OSError) -> str:

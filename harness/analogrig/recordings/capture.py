@@ -86,7 +86,7 @@ def import_run(
             dut=dut,
             link=str(path),
             counters=_plausible_counters(captured, answers),
-            link_counters=_line_counts(decoder, frames),
+            link_counters={name: n for name, n in (*decoder.line.items(), ("lines_damaged", len(frames.damaged))) if n},
             faults=faults,
             losses=decoder.causes.losses,
             remarks=(*decoder.causes.remarks, *_scale_remarks(decoder, captured, rig, performance)),
@@ -166,12 +166,6 @@ def replace_scenario(run: Run, scenario: Scenario) -> Run:
         samples_asked=scenario.samples,
     )
     return dataclasses.replace(run, conditions=scaled_to_program(conditions))
-
-
-def _line_counts(decoder: CaptureDecoding, frames: CapturedFrames) -> dict[str, int]:
-    """Traffic other than intact messages of harness and device: counts by name."""
-    counts = {**decoder.line, "lines_damaged": len(frames.damaged)}
-    return {name: n for name, n in counts.items() if n}
 
 
 def _select_run(decoder: CaptureDecoding, frames: CapturedFrames, number: int | None) -> CapturedRun:

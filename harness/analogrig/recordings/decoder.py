@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig import catalogue
-from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit
+from analogrig.answers import AnswerRows, Answers, RaisedAlarm, ReportedDiagnosis, ReportedMisfit
 from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
 from analogrig.devices.captured import CapturedRun
 from analogrig.devices.device import Causes
 from analogrig.devices.exchange import misfit_of
-from analogrig.devices.rows import AnswerRows
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.links.dbc import check_layout, load_dbc
@@ -80,7 +79,9 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
             check_layout(message)
         except ValueError as error:
             raise ConfigurationError(f"--dbc {dbc}: {error}") from error
-        lacking = set(_signals(message.name)) - {signal.name for signal in message.signals}
+        layout = LAYOUTS[message.name]
+        wanted = {_signal(each) for each in (*layout.fields, *layout.bits) if each != "flags"}
+        lacking = wanted - {signal.name for signal in message.signals}
         if lacking:
             raise ConfigurationError(f"--dbc {dbc}: message {message.name} lacks {', '.join(sorted(lacking))}")
         if message.is_multiplexed():
@@ -88,13 +89,8 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     return {(message.frame_id, message.is_extended_frame): message for message in known}
 
 
-def _signals(name: str) -> list[str]:
-    """Names in the DBC of the fields and bits of a message."""
-    layout = LAYOUTS[name]
-    return [_signal(each) for each in (*layout.fields, *layout.bits) if each != "flags"]
-
-
 def _signal(name: str) -> str:
+    """Name in the DBC of a field or bit."""
     return "".join(word.capitalize() for word in name.split("_"))
 
 
@@ -378,13 +374,6 @@ class CaptureDecoder:
     def _diagnosis(self, message: catalogue.Diagnosis) -> None:
         self._undated = message
 
-    def _date_diagnosis(self, index: int) -> None:
-        """Add the pending diagnosis, whose sample is that of the Stepped that follows it."""
-        diagnosis, self._undated = self._undated, None
-        if diagnosis is not None and diagnosis.change in set(catalogue.Change) - {catalogue.Change.UNDECIDED}:
-            onset = index_up_to(index, diagnosis.onset_index)
-            self.runs[-1].diagnoses.append((index, diagnosis.change, onset, diagnosis.extent))
-
     def _stepped(self, message: catalogue.Stepped) -> None:
         if not self._belongs_to_run(message.flags):
             return
@@ -392,7 +381,10 @@ class CaptureDecoder:
         if self._has_gap:
             run.incomplete.add(index)
             self._has_gap = False
-        self._date_diagnosis(index)
+        diagnosis, self._undated = self._undated, None  # its sample is that of the Stepped that follows it
+        if diagnosis is not None and diagnosis.change in set(catalogue.Change) - {catalogue.Change.UNDECIDED}:
+            onset = index_up_to(index, diagnosis.onset_index)
+            run.diagnoses.append((index, diagnosis.change, onset, diagnosis.extent))
         step = (message.flags & catalogue.STEPPED_FLAGS, message.statistic)
         if run.steps.setdefault(index, step) != step:
             self._add_fault(f"the step of sample {index} was sent twice with different values")

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import can
 
 from analogrig import ConfigurationError, DeviceError, LinkError, LinkTimeout
-from analogrig.answers import LARGEST_FLOAT32
+from analogrig.answers import LARGEST_FLOAT32, AnswerRows
 from analogrig.devices import (
     LOST,
     UNARMED,
@@ -24,7 +24,6 @@ from analogrig.devices import (
 )
 from analogrig.devices.device import MOST_TIMEOUTS
 from analogrig.devices.pace import Pace
-from analogrig.devices.rows import AnswerRows
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_station import CanStation
 from analogrig.links.link import CanListener
