@@ -20,7 +20,7 @@ FOLDER = tools.ROOT / "build" / "bare"
 KEPT = ("HOME", "TMPDIR", "PIP_", "UV_", "SSL_", "REQUESTS_", "http", "HTTP", "no_proxy", "NO_PROXY")
 """Beginnings of the variables that the clone sees: those that say where packages come from."""
 
-COMPILER = "cc gcc gcov as ld ar nm ranlib strip"
+COMPILER = "cc gcc gcov as ld ar nm objcopy objdump ranlib strip"
 COREUTILS = """
     [ arch b2sum base32 base64 basename cat chgrp chmod chown chroot cksum comm cp csplit cut date dd df dir dirname du
     echo env expand expr factor false fmt fold groups head hostid id install join link ln logname ls md5sum mkdir mkfifo
