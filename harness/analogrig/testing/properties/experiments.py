@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,9 @@ _AFTER_N = 100
 
 _MOST_UNARMED = 2
 """Largest ratio of samples to samples with the trigger armed. Beyond it, zero alarms prove nothing."""
+
+Trials = Sequence[tuple[Scenario, int]]
+"""Scenarios with their seeds."""
 
 _EVER = 1e9
 """Multiple of the information bound that allows any latency: an alarm before the next change suffices."""
@@ -107,13 +110,11 @@ def false_alarms_at_most(
     Each trial takes ``samples_each`` samples.
     """
     most = _MOST_UNARMED * samples // samples_each
-    trials = ((dataclasses.replace(scenario, samples=samples_each), seed + number) for number in range(most))
-    found = _count_alarms(play, f"takes {samples} samples: analogrig certify", trials, enough=samples)
-    if found.armed < samples:
-        raise Inconclusive(found.why_not)
-    count = found.alarms_n
-    why = f"{count} false alarms in {found.armed} samples, allowed {allowed}"
-    return Finding(holds=True, why=why) if count <= allowed else found.witness(play, why)
+    trials = [(dataclasses.replace(scenario, samples=samples_each), seed + number) for number in range(most)]
+    alarms, armed = _count_alarms(play, f"takes {samples} samples: analogrig certify", trials, samples, may_stop=True)
+    count = sum(map(len, alarms))
+    why = f"{count} false alarms in {armed} samples, allowed {allowed}"
+    return Finding(holds=True, why=why) if count <= allowed else _witness(play, trials, alarms, why)
 
 
 @experiment
@@ -126,66 +127,52 @@ def false_alarms_of_plants_rarer(
     """
     from analogrig.testing.strategies import random_suspensions
 
-    scenario = dataclasses.replace(scenario, samples=samples_each)
-    trials = ((scenario.with_plant(plant), seed) for plant in random_suspensions(plants, seed))
-    found = _count_alarms(play, f"takes {plants * samples_each} samples: analogrig campaign", trials)
-    if _MOST_UNARMED * found.armed < plants * samples_each:
-        raise Inconclusive(found.why_not)
-    count = found.alarms_n
-    low = lower_count(count, confidence, BURST) / found.armed
-    why = f"{count} false alarms in {found.armed} samples: the rate is at least {low:.2g} per sample, allowed {rate:g}"
-    return Finding(holds=True, why=why) if low <= rate else found.witness(play, why)
-
-
-@dataclasses.dataclass
-class _Alarms:
-    """Alarms in many trials, and their exposure."""
-
-    trials: list[tuple[Scenario, int, NDArray[np.int64]]]
-    """Scenario, seed, and samples with an alarm."""
-    armed: int = 0
-
-    @property
-    def alarms_n(self) -> int:
-        return sum(len(alarms) for _, _, alarms in self.trials)
-
-    @property
-    def why_not(self) -> str:
-        """Reason why zero alarms prove nothing."""
-        samples = sum(scenario.samples for scenario, _, _ in self.trials)
-        return f"the trigger was armed in {self.armed} of {samples} samples"
-
-    def witness(self, play: Play, why: str) -> Finding:
-        """Failed finding with the play of most alarms, which leaves a recording."""
-        scenario, seed, alarms = max(self.trials, key=lambda each: len(each[2]))
-        samples = max(_WITNESS_N, int(alarms[0]) + _AFTER_N if len(alarms) else 0)
-        short = dataclasses.replace(scenario, samples=min(samples, scenario.samples))
-        return Finding(holds=False, why=why, run=play(short, seed, allow_inconclusive=True).run)
+    scenario, samples = dataclasses.replace(scenario, samples=samples_each), plants * samples_each
+    trials = [(scenario.with_plant(plant), seed) for plant in random_suspensions(plants, seed)]
+    least = samples // _MOST_UNARMED
+    alarms, armed = _count_alarms(play, f"takes {samples} samples: analogrig campaign", trials, least)
+    count = sum(map(len, alarms))
+    low = lower_count(count, confidence, BURST) / armed
+    why = f"{count} false alarms in {armed} samples: the rate is at least {low:.2g} per sample, allowed {rate:g}"
+    return Finding(holds=True, why=why) if low <= rate else _witness(play, trials, alarms, why)
 
 
 def _count_alarms(
-    play: Play, otherwise: str, trials: Iterable[tuple[Scenario, int]], enough: float = math.inf
-) -> _Alarms:
-    """Alarms of trials without a line, until the trigger was armed in ``enough`` samples.
+    play: Play, otherwise: str, trials: Trials, least: int, *, may_stop: bool = False
+) -> tuple[list[NDArray[np.int64]], int]:
+    """Samples with an alarm of each trial, without a line, and number of samples with the trigger armed.
 
-    The test is skipped unless such trials equal those on the bench.
+    The test is skipped with the advice ``otherwise`` unless such trials equal those on the bench.
 
-    :raises Inconclusive: a trial could raise no alarm.
+    :param least: least number of samples with the trigger armed; with ``may_stop`` it ends the trials.
+    :raises Inconclusive: they are fewer, or a trial could raise no alarm.
     """
     rig, device = play.bench.rig, device_description(play.bench.dut)
     if not can_be_direct(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --hil-dut inproc, not {play.bench.dut.name}")
-    bench, found = direct_bench(rig, device, alarms_only=True), _Alarms([])
+    bench, armed, samples = direct_bench(rig, device, alarms_only=True), 0, 0
+    alarms: list[NDArray[np.int64]] = []
     for scenario, seed in trials:
         run = raise_if_interrupted(bench.play(scenario, seed))
         shown = exposure(run)
         if shown.lack_of_evidence:
             raise Inconclusive(shown.lack_of_evidence)
-        found.trials.append((scenario, seed, until_latched(run).alarm_index))
-        found.armed += shown.armed
-        if found.armed >= enough:
+        alarms.append(until_latched(run).alarm_index)
+        armed, samples = armed + shown.armed, samples + run.samples
+        if may_stop and armed >= least:
             break
-    return found
+    if armed < least:
+        raise Inconclusive(f"the trigger was armed in {armed} of {samples} samples")
+    return alarms, armed
+
+
+def _witness(play: Play, trials: Trials, alarms: Sequence[NDArray[np.int64]], why: str) -> Finding:
+    """Failed finding with the play of most alarms, which leaves a recording."""
+    most = int(np.argmax([len(each) for each in alarms]))
+    (scenario, seed), first = trials[most], alarms[most][:1].tolist()
+    samples = min(max([_WITNESS_N, *(each + _AFTER_N for each in first)]), scenario.samples)
+    short = dataclasses.replace(scenario, samples=samples)
+    return Finding(holds=False, why=why, run=play(short, seed, allow_inconclusive=True).run)
 
 
 # ------------------------------------------------------------------------------------------------ latency and diagnoses
