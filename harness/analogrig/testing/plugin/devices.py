@@ -170,11 +170,10 @@ def _single_equipment(rig: str, dut: str) -> str:
     from analogrig.rigs.description import describe as describe_rig
     from analogrig_emulator import EmulatorError
 
-    for what, name, only_one in (
-        ("device", dut, lambda: describe(dut).only_one),
-        ("rig", rig, lambda: describe_rig(rig).only_one),
-    ):
-        with contextlib.suppress(AnalogrigError, EmulatorError):
-            if name and only_one():
-                return f"{what} {name}: one worker owns it"
+    with contextlib.suppress(AnalogrigError, EmulatorError):
+        if dut and describe(dut).only_one:
+            return f"device {dut}: one worker owns it"
+    with contextlib.suppress(AnalogrigError, EmulatorError):
+        if rig and describe_rig(rig).only_one:
+            return f"rig {rig}: one worker owns it"
     return ""

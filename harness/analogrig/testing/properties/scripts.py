@@ -235,7 +235,9 @@ def order(numbers: Numbered, build: DeviceBuild) -> Script:  # noqa: ARG001
     yield from _sure(numbers)
     yield numbers.control(Command.START, RUN)
     first = numbers.block(0)
-    yield from (first, first, *map(numbers.sample, (14, 14, 3)), numbers.block(13, 3))
+    yield from (first, first)
+    yield from map(numbers.sample, (14, 14, 3))
+    yield numbers.block(13, 3)
     at = 16
     for interval, ahead in ((1, 1), (4, 3), (5, 11), (3, 1200)):
         yield numbers.control(Command.REPORT_INTERVAL, interval)
