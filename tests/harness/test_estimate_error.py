@@ -35,7 +35,7 @@ MASS_FALLS = dataclasses.replace(SHORT, samples=1500, changes=(PotChange(1150, {
 def play(scenario: Scenario = SHORT, rig_name: str = "emulator", seed: int = 1) -> Run:
     with open_rig(rig_name) as rig:
         assert isinstance(rig, EmulatorRig)
-        return direct_bench(rig, describe("host")).play(scenario, seed)
+        return direct_bench(rig, describe("inproc")).play(scenario, seed)
 
 
 @pytest.fixture(scope="module")
