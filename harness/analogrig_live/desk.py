@@ -25,6 +25,7 @@ from analogrig_emulator.machine.patch_panel import patches
 from analogrig_live.commands import Fault, Mode
 from analogrig_live.faults import ChannelFaults, labels
 from analogrig_live.knobs import Knob, knobs_of
+from analogrig_live.stepped_play import perform_in_steps
 from analogrig_live.take import MOST_KEPT_CHANGES
 
 RECORD_N = 4000
@@ -179,8 +180,8 @@ class SteppedDesk(Desk):
         self._faults = ChannelFaults(float(self._card.lsb_v[OUTPUT]), self._card.rate_hz, np.random.default_rng(seed))
         for fault in on:
             self._faults.switch(fault, on=True)
-        performance = self._emulated.perform_in_steps(
-            set_up, self.program, seed, iter(lambda: self._length, 0), self.nodes, self._faults.alter
+        performance = perform_in_steps(
+            self._emulated, set_up, self.program, seed, iter(lambda: self._length, 0), self.nodes, self._faults.alter
         )
         self._probed.clear()
         self.performance = dataclasses.replace(performance, blocks=self._play(performance.blocks))

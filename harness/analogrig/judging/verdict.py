@@ -552,7 +552,12 @@ def _decide_outcome(results: Sequence[_HypothesisResult], expect: Expectations) 
     unseen = [f"{change.what} at {change.sample} is not judged: {change.unseen}" for change in changes if change.unseen]
     if _fails_under_all_hypotheses(results, expect):
         return "failed", [*results[0].failures, *unseen]
-    undecided = [_undecided_reason(change) for change in changes if change.result == "undecided"]
+    undecided = []
+    for change in changes:
+        if change.result == "undecided":
+            results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in change.hypotheses))
+            instants = "between {} and {}".format(*change.between)
+            undecided.append(f"{change.what} {instants} was {results}, depending on its instant")
     counts = sorted(len(each.false_alarms) for each in results)
     if counts[0] <= expect.false_alarms < counts[-1]:
         undecided.append(
@@ -588,13 +593,6 @@ def _fails_under_all_hypotheses(results: Sequence[_HypothesisResult], expect: Ex
     missed = sum(all(change.missed and not change.unseen for change in each) for each in by_change)
     late = any(all(change.late and not change.unseen for change in each) for each in by_change)
     return late or missed > expect.missed or min(len(each.false_alarms) for each in results) > expect.false_alarms
-
-
-def _undecided_reason(change: ChangeVerdict) -> str:
-    """Message that the result of a change depends on its instant."""
-    low, high = change.between
-    results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in change.hypotheses))
-    return f"{change.what} between {low} and {high} was {results}, depending on its instant"
 
 
 def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[ChangeVerdict, ...]:

@@ -36,8 +36,11 @@ if TYPE_CHECKING:
         MeasuredValues,
         SetUp,
         Stream,
+        channels_of,
         emulator_errors,
         is_emulated,
+        lit_lamps,
+        sampled,
     )
     from analogrig.rigs.recording import WRONG_SAMPLES
     from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
@@ -54,7 +57,7 @@ else:
             "analogrig.plant": "Segment",
             "analogrig.rigs.emulator": (
                 "CardDescription ComputerDescription EmulatorDescription EmulatorRig MeasuredValues SetUp Stream "
-                "emulator_errors is_emulated"
+                "channels_of emulator_errors is_emulated lit_lamps sampled"
             ),
             "analogrig.rigs.recording": "WRONG_SAMPLES",
             "analogrig.rigs.rig": "BLOCK_SAMPLES Block Hindsight Performance Rig RigDescription",
@@ -86,6 +89,9 @@ __all__ = [
     "SetUp",
     "Stream",
     "Thing",
+    "channels_of",
     "emulator_errors",
     "is_emulated",
+    "lit_lamps",
+    "sampled",
 ]

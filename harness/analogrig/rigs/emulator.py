@@ -7,7 +7,7 @@ import dataclasses
 import enum
 import functools
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeGuard
 
@@ -386,40 +386,10 @@ class EmulatorRig(Rig):
             sample_period_s=1.0 / card.rate_hz,
             time_scale=computer.scales.time,
             channels=channels_of(card, computer, scenario.program),
-            blocks=_sample(volts, Sampler(card, NormalStream(seed, Stream.CARD))),
+            blocks=sampled(volts, Sampler(card, NormalStream(seed, Stream.CARD))),
             hindsight=lambda: Hindsight(
                 scenario.segments(), lit_lamps(computer.machine.lamps, probes_per_sample(card))
             ),
-        )
-
-    def perform_in_steps(
-        self,
-        set_up: SetUp,
-        program: Program,
-        seed: int,
-        lengths: Iterable[int],
-        probes: Sequence[str],
-        alter: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    ) -> Performance:
-        """Play a set-up without its changes, in blocks of these lengths, each drawn when its block is requested.
-
-        Between two blocks the caller operates ``set_up.computer``, whose ``probed`` has the volts of the nodes
-        ``probes``. ``alter`` changes the volts on their way to the card. The hindsight knows the lamps alone.
-
-        :raises ConfigurationError: the rig cannot be played in steps.
-        """
-        if self.described.computer.noise:
-            raise ConfigurationError(f"{self.described.name}: computer.noise: a play in steps has no such noise")
-        computer, card = set_up.computer, self.card(program)
-        with emulator_errors():
-            machine = _SteppedMachine(computer, lengths, probes_per_sample(card), probes)
-            volts = acquired(machine, card, set_up.excitation, 0, rng=Stream.APERTURE.generator(seed))
-        return Performance(
-            sample_period_s=1.0 / card.rate_hz,
-            time_scale=computer.scales.time,
-            channels=channels_of(card, computer, program),
-            blocks=_sample(map(alter, volts), Sampler(card, NormalStream(seed, Stream.CARD))),
-            hindsight=lambda: Hindsight((), lit_lamps(computer.machine.lamps, probes_per_sample(card))),
         )
 
     def pot_settings(self, plant: Plant, changed: Iterable[str]) -> dict[str, float]:
@@ -450,32 +420,6 @@ def channels_of(card: Card, computer: SuspensionComputer, program: Program) -> d
     }
 
 
-@dataclass(frozen=True)
-class _SteppedMachine:
-    """Computer that is played in steps, for ``acquired``."""
-
-    computer: SuspensionComputer
-    lengths: Iterable[int]
-    """Samples of the card in each block."""
-    probes_per_sample: int
-    nodes: Sequence[str]
-
-    @property
-    def sample_rate_hz(self) -> float:
-        return self.computer.sample_rate_hz
-
-    def play(
-        self,
-        excitation: Excitation,
-        samples: int,  # noqa: ARG002 - the lengths decide
-        changes: Sequence[PotTurn] = (),  # noqa: ARG002 - the caller makes them
-        block_samples: int = 0,  # noqa: ARG002
-        ahead_ticks: int = 0,
-    ) -> Iterator[NDArray[np.float64]]:
-        lengths = (length * self.probes_per_sample for length in self.lengths)
-        return self.computer.play_in_steps(excitation, lengths, self.nodes, ahead_ticks)
-
-
 def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
     """True for the emulated rig, the only one with a circuit, exact components and block sizes."""
     return rig.computes_circuit
@@ -486,7 +430,11 @@ def lit_lamps(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
     return {amplifier: -(-probe // probes) for amplifier, probe in lamps.items() if probe is not None}
 
 
-def _sample(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:
+def sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:
+    """Blocks of a card from the volts of a machine.
+
+    :raises RigError: the machine cannot play on.
+    """
     first = 0
     with emulator_errors(as_error=RigError):
         for block in volts:
