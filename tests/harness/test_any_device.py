@@ -23,7 +23,7 @@ from analogrig.errors import DeviceRefused, RecordingError
 from analogrig.judging.advice import advice
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, STATISTIC, as_json
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.run import UNARMED
 
 THESIS = Scenario.load("thesis")

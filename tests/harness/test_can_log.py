@@ -27,7 +27,7 @@ from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
 from analogrig.recordings import WRITTEN, CanLog, CapturedFrames, import_run, replace_scenario
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import LOST, Run

@@ -19,7 +19,7 @@ from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError
 from analogrig.judging.verdict import judge
 from analogrig.recordings import import_run
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run

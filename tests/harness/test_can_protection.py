@@ -19,7 +19,7 @@ from analogrig.bench import Bench
 from analogrig.devices.registry import describe, open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.rigs.rig import Rig
 from analogrig.run import UNARMED, Run
 from analogrig_ecu.can_dbc import CanDbcDevice

@@ -9,7 +9,7 @@ from analogrig.catalogue import Change
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import CHANNEL_FAULTS, FAULT_CURES, ChannelFault, as_json, diagnosis_text, judge
 from analogrig.reporting.page import render
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.run import Run
 from analogrig.testing.one_play import Played
 from analogrig.testing.plugin.junit import play_properties

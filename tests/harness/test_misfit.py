@@ -17,7 +17,7 @@ from analogrig.judging.advice import advice
 from analogrig.judging.verdict import CURES, NONLINEAR_CURE, MisfitPeriod, as_json, judge, misfit_periods
 from analogrig.recordings import CanLog, import_run
 from analogrig.reporting.page import render
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run

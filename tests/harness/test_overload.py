@@ -14,7 +14,7 @@ from analogrig.devices.registry import open_dut
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import as_json, judge
 from analogrig.reporting import render
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run

@@ -12,7 +12,7 @@ from analogrig.bench import Bench
 from analogrig.devices.registry import open_dut
 from analogrig.judging.response import StepResponse, step_responses
 from analogrig.judging.verdict import judge
-from analogrig.reporting import summary
+from analogrig.reporting import run_summary
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -87,6 +87,6 @@ def test_program_that_is_not_linear_has_no_response_to_judge() -> None:
 
 def test_rows_of_long_runs_keep_their_cells_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     run = play("dc-motor", "emulator-ideal")
-    monkeypatch.setattr(summary, "step_responses", lambda _: (StepResponse(0, 200_000, 0.0001),))
-    lines = summary.summary(run, judge(run)).splitlines()
+    monkeypatch.setattr(run_summary, "step_responses", lambda _: (StepResponse(0, 200_000, 0.0001),))
+    lines = run_summary.summary(run, judge(run)).splitlines()
     assert "      0-199999 0.01% of the static gain" in lines

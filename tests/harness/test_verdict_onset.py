@@ -16,7 +16,7 @@ from analogrig.errors import RecordingError
 from analogrig.judging.verdict import Verdict, as_json, judge
 from analogrig.plant import Segment
 from analogrig.reporting.page import render
-from analogrig.reporting.summary import summary
+from analogrig.reporting.run_summary import summary
 from analogrig.run import Run
 from analogrig.testing.one_play import Played
 from analogrig.testing.plugin.junit import latency_property

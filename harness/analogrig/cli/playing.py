@@ -259,7 +259,7 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
     from analogrig.judging.verdict import judge
     from analogrig.output import REPORT_FILE, RUN_FILE
     from analogrig.reporting import write_report
-    from analogrig.reporting.summary import summary
+    from analogrig.reporting.run_summary import summary
 
     def write(folder: Path) -> None:
         run.save(folder / RUN_FILE)

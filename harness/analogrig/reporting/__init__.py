@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from analogrig.pages import PLOTS, assemble_page
     from analogrig.reporting.page import provenance, render, write_report
     from analogrig.reporting.payload import as_script, deflate
-    from analogrig.reporting.summary import lamps_text
+    from analogrig.reporting.run_summary import lamps_text
 else:
     from analogrig.lazy import loader
 
@@ -21,7 +21,7 @@ else:
         {
             "analogrig.pages": "PLOTS assemble_page",
             "analogrig.reporting.payload": "as_script deflate",
-            "analogrig.reporting.summary": "lamps_text",
+            "analogrig.reporting.run_summary": "lamps_text",
             "analogrig.reporting.page": "provenance render write_report",
         },
     )

@@ -13,7 +13,7 @@ from analogrig.judging.verdict import Verdict, missing_text
 from analogrig.pages import FOLDER, PLOTS, render_page
 from analogrig.reporting.measured import measured
 from analogrig.reporting.payload import as_script, is_thinned, marked_alarms, payload
-from analogrig.reporting.summary import change_text, lamps_text, response_text
+from analogrig.reporting.run_summary import change_text, lamps_text, response_text
 from analogrig.run import Run
 from analogrig.storage import replace_file
 

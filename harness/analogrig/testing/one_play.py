@@ -23,7 +23,7 @@ from analogrig.judging.bursts import Design, bound_rate
 from analogrig.judging.exposure import exposure
 from analogrig.judging.response import step_responses
 from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChangeVerdict, Verdict, judge
-from analogrig.reporting.summary import bound_text, response_text
+from analogrig.reporting.run_summary import bound_text, response_text
 from analogrig.run import Run
 from analogrig.scenario import Statement
 from analogrig.testing.statement import Arguments, Finding, check_limits, check_share, register, statement_of

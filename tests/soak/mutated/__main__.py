@@ -24,7 +24,7 @@ from tests.soak.mutated.cases import Cases, Seeds
 from tests.soak.mutated.trial import MOST_CPU_S, MOST_MB, Case, Outcome, Running, begin
 
 _LOADED = (
-    *("analogrig.bench", "analogrig.judging.verdict", "analogrig.reporting", "analogrig.reporting.summary"),
+    *("analogrig.bench", "analogrig.judging.verdict", "analogrig.reporting", "analogrig.reporting.run_summary"),
     *("analogrig.campaigns.conduct", "analogrig.reporting.campaign_page", "analogrig.rigs.description"),
     *("analogrig_instruments.self_test", "analogrig.recordings"),
     *("cantools", "asammdf"),
