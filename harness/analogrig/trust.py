@@ -131,7 +131,7 @@ class Trust:
         :param where: file and table, for the message; by default the file.
         :raises ConfigurationError: names the file, what it orders, and the option that allows it.
         """
-        if not file or _is_shipped(file):
+        if not file or Path(file).resolve().is_relative_to(config.fixtures().resolve()):  # a shipped one
             return
         refused = [thing for thing in things if not self._allows(thing)]
         if not refused:
@@ -151,7 +151,3 @@ class Trust:
         if not self._option:
             return f"allow={names!r}"
         return " ".join(f"{self._option} {shlex.quote(name)}" for name in names)
-
-
-def _is_shipped(file: str) -> bool:
-    return Path(file).resolve().is_relative_to(config.fixtures().resolve())

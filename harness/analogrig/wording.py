@@ -52,10 +52,7 @@ def counter_text(n: int, name: str) -> str:
     """A counter with its value: ``12 frames foreign``, ``1 error frame`` of frames_foreign and error_frames."""
     words = name.split("_")
     if n == 1:
-        noun = next((i for i, word in enumerate(words) if word.endswith("s") and not word.endswith("ss")), None)
-        words = [_singular(word) if i == noun else word for i, word in enumerate(words)]
+        noun = next((i for i, word in enumerate(words) if word.endswith("s") and not word.endswith(("ss", "us"))), None)
+        if noun is not None:
+            words[noun] = words[noun].removesuffix("es" if words[noun].endswith(("shes", "sses")) else "s")
     return f"{n} {' '.join(words)}"
-
-
-def _singular(word: str) -> str:
-    return word.removesuffix("es") if word.endswith(("shes", "sses")) else word.removesuffix("s")

@@ -214,14 +214,13 @@ def bound_rate(events: Sequence[int], trials: Sequence[int], confidence: float, 
     found = dispersion(events, trials)
     covered = max(burst, found.burst)
     low, high = (bound(total, confidence, covered) / length for bound in (lower_count, upper_count))
-    return RateBounds(min(low, 1.0), min(high, 1.0), covered, _basis(burst, found))
-
-
-def _basis(burst: float, found: Dispersion) -> str:
     if found.burst > burst:
-        return f"bursts of {found.burst:.3g} alarms on average, observed ({found})"
-    assumed = f"bursts of {burst:g} alarms on average" if burst > 1.0 else "independent alarms"
-    return f"{assumed}, assumed ({found})"
+        basis = f"bursts of {found.burst:.3g} alarms on average, observed ({found})"
+    elif burst > 1.0:
+        basis = f"bursts of {burst:g} alarms on average, assumed ({found})"
+    else:
+        basis = f"independent alarms, assumed ({found})"
+    return RateBounds(min(low, 1.0), min(high, 1.0), covered, basis)
 
 
 def _check(events: int, confidence: float, burst: float) -> None:
