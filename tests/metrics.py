@@ -53,7 +53,6 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "catalogue",
         "_catalogue",
         "estimator_config",
-        "storage",
         "entry_points",
         "program",
         "plant",

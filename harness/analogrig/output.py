@@ -1,5 +1,7 @@
 """Output folders and files: a folder holds one run, complete or marked INCONCLUSIVE; older results are moved aside.
 
+A single file is either whole or not there (``replace_file``).
+
 While a command runs, ``verdict.json`` and the page in its folder say INCONCLUSIVE. A command that is killed therefore
 leaves no older verdict. The result replaces them at the end: recording, page, and last the verdict.
 """
@@ -12,17 +14,17 @@ import html
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 from analogrig.errors import AnalogrigError, ConfigurationError, RecordingError
 from analogrig.identity import Identity
 from analogrig.pages import FOLDER, assemble_page
 from analogrig.signals import hold_signals, interruption
 
-__all__ = ["FORMAT", "FORMAT_VERSION", "REPORT_FILE", "VERDICT_FILE", "OutputFolder", "move_aside"]
+__all__ = ["FORMAT", "FORMAT_VERSION", "REPORT_FILE", "VERDICT_FILE", "OutputFolder", "move_aside", "replace_file"]
 """Names for packages beside the core."""
 
 VERDICT_FILE, RUN_FILE, REPORT_FILE, CAN_LOG = "verdict.json", "run.npz", "report.html", "can"
@@ -282,3 +284,25 @@ def _lock_folder(folder: Path) -> int | None:
         os.close(descriptor)
         return None
     return descriptor
+
+
+@contextlib.contextmanager
+def replace_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write to that takes the place of ``path`` when the block ends well; folders are made as needed.
+
+    :raises RecordingError: it cannot be written; whatever stood at ``path`` before still does.
+    """
+    if not path.name or (path.exists() and not path.is_file()):  # replaced by a file, /dev/null would serve nobody
+        raise RecordingError(f"{path}: cannot be written: it is a folder, or no regular file")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with partial.open("wb") as file:
+                yield file
+            partial.replace(path)
+        finally:
+            with contextlib.suppress(OSError):
+                partial.unlink()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -29,10 +29,10 @@ from analogrig.datasheet import Datasheet
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.identity import Identity
+from analogrig.output import replace_file
 from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment
 from analogrig.program import Program
 from analogrig.scenario import DEFAULT_PROGRAM, Expectations, Statement, program_of
-from analogrig.storage import replace_file
 from analogrig_emulator import Excitation
 
 __all__ = ["IMPORTED", "INPUT", "LOST", "MAX_CODES", "OUTPUT", "Channel", "missing_samples"]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
-from analogrig.storage import replace_file
+from analogrig.output import replace_file
 from analogrig_emulator.machine.drawing import PALETTE
 from analogrig_emulator.nonidealities import SAMPLES, Effect, measure_effects
 

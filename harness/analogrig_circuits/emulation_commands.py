@@ -89,11 +89,10 @@ def _emulate(arguments: argparse.Namespace) -> int:
 
 
 def _netlist(arguments: argparse.Namespace) -> int:
-    from analogrig.output import move_aside
+    from analogrig.output import move_aside, replace_file
 
     if arguments.out is not None:
         move_aside(arguments.out, files_read(arguments))
-    from analogrig.storage import replace_file
     from analogrig_circuits.export import netlist
 
     with open_what_to_play(arguments) as (rig, scenario, seed):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from analogrig import ConfigurationError, Rig, Scenario
 from analogrig.bench import Progress
+from analogrig.output import replace_file
 from analogrig.rigs import Block, SetUp, is_emulated
-from analogrig.storage import replace_file
 from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, Excitation, PotTurn
 
 

@@ -67,9 +67,8 @@ def add(commands: Any) -> None:
 def _patch(arguments: argparse.Namespace) -> int:
     from analogrig import Program
     from analogrig.config import locate
-    from analogrig.output import move_aside
+    from analogrig.output import move_aside, replace_file
     from analogrig.rigs import emulator_errors
-    from analogrig.storage import replace_file
     from analogrig_emulator import SuspensionComputer, compile_program
     from analogrig_emulator.machine.drawing import patch_drawing
     from analogrig_emulator.machine.sheet import dials, scaling_sheet

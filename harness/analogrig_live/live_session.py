@@ -20,9 +20,9 @@ from analogrig import AnalogrigError, Bench, ConfigurationError, Device, PotChan
 from analogrig.config import to_toml
 from analogrig.devices import Answers
 from analogrig.identity import Identity
+from analogrig.output import replace_file
 from analogrig.plant import MAX_CHANGES
 from analogrig.rigs import WRONG_SAMPLES, Block, Performance, emulator_errors
-from analogrig.storage import replace_file
 from analogrig.wording import number_of
 from analogrig_emulator import EmulatorError, Excitation
 from analogrig_live import commands

@@ -13,9 +13,8 @@ from urllib.parse import quote
 
 from analogrig import ConfigurationError, RecordingError
 from analogrig.config import read_bounded
-from analogrig.output import FORMAT, FORMAT_VERSION, REPORT_FILE, VERDICT_FILE
+from analogrig.output import FORMAT, FORMAT_VERSION, REPORT_FILE, VERDICT_FILE, replace_file
 from analogrig.pages import SIGNS, TABLES, render_page
-from analogrig.storage import replace_file
 from analogrig.wording import number_of
 
 PAGE_FILE = "session.html"

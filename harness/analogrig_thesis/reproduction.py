@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from analogrig import judge
-from analogrig.storage import replace_file
+from analogrig.output import replace_file
 from analogrig_thesis import chapter3, chapter4, chapter5
 from analogrig_thesis.chapter4 import Simulation
 from analogrig_thesis.chapter5 import (

@@ -17,7 +17,7 @@ from analogrig.devices.device import DeviceDescription
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 from analogrig.identity import version
-from analogrig.storage import replace_file
+from analogrig.output import replace_file
 
 DIGITS = 16
 """Hex digits of a SHA-256 that identify a build."""

@@ -14,7 +14,7 @@ from analogrig.campaigns.plan import Cell, Part, Plan
 from analogrig.campaigns.store import Store
 from analogrig.campaigns.trials import EXISTS, LATE, MISSED, OUTCOMES, Trials
 from analogrig.errors import ConfigurationError
-from analogrig.storage import replace_file
+from analogrig.output import replace_file
 
 GROUP_ROWS = 50_000
 """Least number of rows in a group of the file, but for the last one."""

@@ -21,7 +21,7 @@ from analogrig.campaigns.plan import Part, Plan
 from analogrig.campaigns.trials import COLUMNS, MOST_TRIALS, Trials, decode, encode
 from analogrig.errors import AnalogrigError, ConfigurationError, RecordingError
 from analogrig.identity import Identity
-from analogrig.storage import replace_file
+from analogrig.output import replace_file
 
 APPLICATION, VERSION = 0x616E7267, 3
 """``application_id`` and ``user_version`` of the file."""

@@ -29,7 +29,7 @@ from analogrig.campaigns.tally import Results
 from analogrig.errors import ConfigurationError
 from analogrig.pages import TABLES, render_page
 from analogrig.reporting.page import provenance
-from analogrig.storage import replace_file
+from analogrig.output import replace_file
 from analogrig.wording import counter_text, number_of
 
 _MARK, _FORMAT = b'data-page="analogrig-campaign"', b'"format": "analogrig-campaign"'

@@ -10,12 +10,12 @@ from analogrig.identity import Identity
 from analogrig.judging.advice import advice
 from analogrig.judging.response import step_responses
 from analogrig.judging.verdict import Verdict, missing_text
+from analogrig.output import replace_file
 from analogrig.pages import FOLDER, PLOTS, render_page
 from analogrig.reporting.measured import measured
 from analogrig.reporting.payload import as_script, is_thinned, marked_alarms, payload
 from analogrig.reporting.run_summary import change_text, lamps_text, response_text
 from analogrig.run import Run
-from analogrig.storage import replace_file
 
 
 def write_report(run: Run, verdict: Verdict, path: str | Path) -> None:

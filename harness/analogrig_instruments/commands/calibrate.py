@@ -118,8 +118,7 @@ def _add_program_fit(command: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from analogrig import ConfigurationError, RigError, open_rig
-    from analogrig.output import move_aside
-    from analogrig.storage import replace_file
+    from analogrig.output import move_aside, replace_file
     from analogrig_instruments.calibration.averages import check_scenario, record, scenarios
     from analogrig_instruments.calibration.fit import POTS, STOCKS, calibrate, difference_lsb
 

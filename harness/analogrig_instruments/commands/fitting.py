@@ -101,7 +101,7 @@ def _fit(
 
     :param reconstruction: default course of the input between its samples; None: the one that fits better.
     """
-    from analogrig.storage import replace_file
+    from analogrig.output import replace_file
     from analogrig_instruments.calibration.recorded_plant import fit_program
 
     fixed = dict(_fixed(text, plant.program.values) for text in arguments.fix)
