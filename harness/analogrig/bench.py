@@ -98,12 +98,12 @@ class RunBuilder:
 
 
 def reports(events: Mapping[str, Events]) -> dict[str, Any]:
-    """Fields of a run that hold the alarms, diagnoses and misfits; those of nothing have a default."""
+    """Fields of a run that hold the alarms, diagnoses and misfits, each of which is empty by default."""
     prefixes = {"alarms": "alarm", "diagnoses": "diagnosis", "misfits": "misfit"}
     return {
         f"{prefixes[name]}_{key}": np.ascontiguousarray(found[key])
         for name, found in events.items()
-        if len(found) or name == "alarms"
+        if len(found)
         for key in found.dtype.names
     }
 

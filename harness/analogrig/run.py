@@ -345,10 +345,10 @@ class Run:
     """(n,): the trigger's statistic; zeros if it is not reported (``datasheet``)."""
     flags: NDArray[np.uint8]
     """(n,): SteppedFlag of the device, with LOST, UNREPORTED and UNARMED."""
-    alarm_index: NDArray[np.int64]
+    alarm_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """(a,): sample index of each alarm."""
-    alarm_kind: NDArray[np.uint8]
-    alarm_statistic: NDArray[np.float32]
+    alarm_kind: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    alarm_statistic: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     diagnosis_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """(d,): sample after which the device reported the diagnosis."""
     diagnosis_change: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))

@@ -155,9 +155,5 @@ def leave_to_parent() -> None:
     """
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _ignore)
+            signal.signal(number, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
-
-
-def _ignore(_: int, __: FrameType | None) -> None:
-    pass

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +98,9 @@ def predicted_bounds(
 
     Parameters and errors as ``detectable``.
     """
-    level = _level(arl0)
+    is_number = isinstance(arl0, int | float | np.number) and not isinstance(arl0, bool)
+    if not is_number or not 1.0 < arl0 < math.inf:
+        raise ConfigurationError(f"arl0 must be a finite number of samples above 1, not {str(arl0)[:40]!r}")
     scenario = Scenario.load(scenario) if isinstance(scenario, str) else scenario
     scenario = scenario if program is None else scenario.on_program(program)
     model, output = machine_model.predicted(scenario, rig)
@@ -108,16 +110,9 @@ def predicted_bounds(
     stretches = [(each.start, end, each.plant.parameters()) for each, end in zip(segments, ends, strict=True)]
     ramps_n = {segment.start: segment.ramp_n for segment in segments}
     return [
-        first_at_level(information_of(model, change, weight), level)
+        first_at_level(information_of(model, change, weight), math.log(arl0))
         for change in changes_between(model, stretches, ramps_n)
     ]
-
-
-def _level(arl0: Any) -> float:
-    """Ln ARL0."""
-    if isinstance(arl0, int | float | np.number) and not isinstance(arl0, bool) and 1.0 < arl0 < math.inf:
-        return math.log(arl0)
-    raise ConfigurationError(f"arl0 must be a finite number of samples above 1, not {str(arl0)[:40]!r}")
 
 
 def model_of(run: Run) -> Model | None:

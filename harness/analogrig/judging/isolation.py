@@ -92,18 +92,12 @@ class _Rivals:
         """Logarithms of the factors that the plant can have, and the courses with them, (f, n)."""
         found = []
         for factor in factors.tolist():
-            course = self._course(name, factor)
-            if course is not None:
-                found.append((factor, course))
+            values = {**self._change.before, name: self._change.before[name] * math.exp(factor)}
+            if not factor:
+                found.append((factor, self._unchanged))
+            elif (course := self._model.rival(self._change.moment, values)) is not None:
+                found.append((factor, course.advance(len(self._truth))))
         return np.array([factor for factor, _ in found]), np.array([course for _, course in found])
-
-    def _course(self, name: str, factor: float) -> NDArray[np.float64] | None:
-        """(n,) course with one parameter changed; None: the plant cannot have it."""
-        if not factor:
-            return self._unchanged
-        values = {**self._change.before, name: self._change.before[name] * math.exp(factor)}
-        course = self._model.rival(self._change.moment, values)
-        return None if course is None else course.advance(len(self._truth))
 
     def _information(self, courses: NDArray[np.float64]) -> NDArray[np.float64]:
         """I(n) between the truth and each of (f, n) courses: (f, n)."""

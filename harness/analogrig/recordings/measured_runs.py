@@ -111,7 +111,4 @@ def unanswered(
         innovation=np.zeros(samples, np.float32),
         statistic=np.zeros(samples, np.float32),
         flags=np.zeros(samples, np.uint8),
-        alarm_index=np.zeros(0, np.int64),
-        alarm_kind=np.zeros(0, np.uint8),
-        alarm_statistic=np.zeros(0, np.float32),
     )

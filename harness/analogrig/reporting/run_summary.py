@@ -58,7 +58,9 @@ def summary(run: Run, verdict: Verdict) -> str:
     if not verdict.knows_truth:
         lines += ["", *measured.lines(run)]
     elif ESTIMATES not in verdict.not_judged:
-        lines += ["", _estimates_head(conditions.program)]
+        units = {name: f"{name} [{conditions.program.unit(name)}]" for name in conditions.program.estimates}
+        columns = "  ".join(f"{unit:>12}  {f'true {name}':9}" for name, unit in units.items()).rstrip()
+        lines += ["", f"  {'samples':12}{columns}"]
         lines += [_segment_line(segment) for segment in verdict.estimates]
     if verdict.knows_truth and not conditions.program.estimates and (found := step_responses(run)):
         lines += ["", "  samples     step response of the estimate, against the circuit's"]
@@ -122,11 +124,6 @@ def response_text(found: StepResponse) -> str:
 def bound_text(change: ChangeVerdict) -> str:
     """Information bound of a change: ``3``, ``none`` if it is not detectable, ``?`` if it is unknown."""
     return "?" if not change.is_bounded else "none" if change.bound_n is None else str(change.bound_n)
-
-
-def _estimates_head(program: Program) -> str:
-    units = {name: f"{name} [{program.unit(name)}]" for name in program.estimates}
-    return f"  {'samples':12}" + "  ".join(f"{unit:>12}  {f'true {name}':9}" for name, unit in units.items()).rstrip()
 
 
 def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict, width: int) -> str:

@@ -14,13 +14,7 @@ from analogrig.rigs.recording import RecordingDescription
 from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.trust import Trust
 
-KINDS = Kinds(
-    RigDescription,
-    "analogrig.rigs",
-    {
-        "emulator": "analogrig.rigs.emulator:EmulatorDescription",
-    },
-)
+KINDS = Kinds(RigDescription, "analogrig.rigs", {"emulator": "analogrig.rigs.emulator:EmulatorDescription"})
 """Description of each kind of rig."""
 
 DEFAULT_RIG = "emulator"
