@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from analogrig.answers import Answers, Samples
 from analogrig.catalogue import Cause
 from analogrig.devices.device import Device
 from analogrig.devices.library import DirectDevice, InprocDevice
-from analogrig.judging.exposure import ObservedRecord, record_exposure
+from analogrig.judging.exposure import count_armed
 from analogrig.run import Channel
 
 from .played import CARD, FORCE, Played
@@ -89,5 +90,6 @@ def exposure_n(device: DirectDevice, played: Played, answers: Answers) -> int:
     """Samples of a run in which the trigger was armed."""
     are_finite = np.ones(len(played.u), np.bool_)
     alarms = np.array([alarm.index for alarm in answers.alarms], np.int64)
-    record = ObservedRecord(played.u, answers.flags, are_finite, alarms)  # type: ignore[arg-type]  # up to 18 bits
-    return record_exposure(record, device.datasheet, CARD.noise_lsb[FORCE]).armed
+    driven: Any = played.u[None]  # up to 18 bits
+    rows = driven, answers.flags[None], are_finite[None], [alarms]
+    return int(count_armed(*rows, device.datasheet, CARD.noise_lsb[FORCE])[0][0, 0])

@@ -105,20 +105,6 @@ class Exposure:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class ObservedRecord:
-    """Inputs and answers of one gap-free record of n samples."""
-
-    input: NDArray[np.uint16]
-    """(n,) codes."""
-    flags: NDArray[np.uint8]
-    """(n,) as ``Run.flags``."""
-    are_finite: NDArray[np.bool_]
-    """(n,): estimate, innovation and statistic are finite."""
-    alarms: NDArray[np.int64]
-    """(a,) sample indices of the alarms. The trigger was armed in each of them."""
-
-
 def exposure(run: Run) -> Exposure:
     """Exposure of a run: the sum over its records, each of which the device starts afresh."""
     return exposures([run])[0]
@@ -138,7 +124,7 @@ def exposures(runs: Sequence[Run]) -> list[Exposure]:
     for start, end in run.records:
         alarms = [each.alarm_index[(each.alarm_index >= start) & (each.alarm_index < end)] - start for each in runs]
         part = slice(start, end)
-        count, found = _count(driven[:, part], flags[:, part], are_finite[:, part], alarms, sheet, noise_lsb)
+        count, found = count_armed(driven[:, part], flags[:, part], are_finite[:, part], alarms, sheet, noise_lsb)
         counts += count
         for i, in_record in enumerate(found):
             unarmed[i] += (in_record + start).tolist()
@@ -181,16 +167,7 @@ def until_latched(run: Run) -> Run:
     )
 
 
-def record_exposure(record: ObservedRecord, sheet: Datasheet, noise_lsb: float) -> Exposure:
-    """Exposure of one record; ``noise_lsb`` is the noise of the input's channel, rms in LSB."""
-    driven, flags, are_finite = record.input[None], record.flags[None], record.are_finite[None]
-    counts, (unarmed,) = _count(driven, flags, are_finite, [record.alarms], sheet, noise_lsb)
-    armed, unexcited, non_finite = counts[:, 0].tolist()
-    n = len(record.input)
-    return Exposure(n, armed, unexcited, non_finite, sheet, max(0, n - sheet.warm_up_n), tuple(unarmed.tolist()))
-
-
-def _count(
+def count_armed(
     driven: NDArray[np.uint16],
     flags: NDArray[np.uint8],
     are_finite: NDArray[np.bool_],
@@ -200,7 +177,7 @@ def _count(
 ) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
     """Armed, unexcited and non-finite samples of each of r records, (3, r), and their alarms while unarmed.
 
-    driven, flags and are_finite are (r, n).
+    driven, flags and are_finite are (r, n). ``alarms`` are indices in each record, ``noise_lsb`` is that of the input.
     """
     known = (flags & _NOT_PROCESSED) == 0
     noises = EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB)
