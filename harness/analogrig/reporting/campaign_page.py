@@ -27,9 +27,9 @@ from analogrig.campaigns.aggregates import (
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.tally import Results
 from analogrig.errors import ConfigurationError
+from analogrig.output import replace_file
 from analogrig.pages import TABLES, render_page
 from analogrig.reporting.page import provenance
-from analogrig.output import replace_file
 from analogrig.wording import counter_text, number_of
 
 _MARK, _FORMAT = b'data-page="analogrig-campaign"', b'"format": "analogrig-campaign"'
