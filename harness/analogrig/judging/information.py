@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +98,8 @@ def predicted_bounds(
 
     Parameters and errors as ``detectable``.
     """
-    is_number = isinstance(arl0, int | float | np.number) and not isinstance(arl0, bool)
+    given: Any = arl0  # a user need not have a type checker
+    is_number = isinstance(given, int | float | np.number) and not isinstance(given, bool)
     if not is_number or not 1.0 < arl0 < math.inf:
         raise ConfigurationError(f"arl0 must be a finite number of samples above 1, not {str(arl0)[:40]!r}")
     scenario = Scenario.load(scenario) if isinstance(scenario, str) else scenario

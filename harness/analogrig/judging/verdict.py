@@ -555,9 +555,9 @@ def _decide_outcome(results: Sequence[_HypothesisResult], expect: Expectations) 
     undecided = []
     for change in changes:
         if change.result == "undecided":
-            results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in change.hypotheses))
-            instants = "between {} and {}".format(*change.between)
-            undecided.append(f"{change.what} {instants} was {results}, depending on its instant")
+            possible = " or ".join(dict.fromkeys(_result_at_instant(each) for each in change.hypotheses))
+            low, high = change.between
+            undecided.append(f"{change.what} between {low} and {high} was {possible}, depending on its instant")
     counts = sorted(len(each.false_alarms) for each in results)
     if counts[0] <= expect.false_alarms < counts[-1]:
         undecided.append(
