@@ -32,7 +32,7 @@ RIGS = """
     BLOCK_SAMPLES CAPABILITIES DEFAULT_RIG WRONG_SAMPLES Block CardDescription Channel
     ComputerDescription EmulatorDescription EmulatorRig Hindsight MeasuredValues Performance
     Rig RigClosed RigDescription RigRefused RigTimeout Segment
-    Stream Thing emulator_errors is_emulated
+    SetUp Stream Thing channels_of emulator_errors is_emulated lit_lamps sampled
 """.split()
 
 
