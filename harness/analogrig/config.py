@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import json
 import pkgutil
 import re
 import tomllib
@@ -177,10 +178,28 @@ def plain(value: Any) -> Any:
 
 
 def to_toml(table: Mapping[str, Any]) -> str:
-    """Plain values as TOML that ``read_toml`` gives back: the scalars first, then the tables. None is left out."""
+    """Plain values as TOML that ``read_toml`` gives back: the scalars first, then the tables. None is left out.
+
+    :raises ConfigurationError: a text that no file can hold, such as half a surrogate pair.
+    """
     import tomli_w
 
-    return tomli_w.dumps(plain(table), multiline_strings=True)
+    values = plain(table)
+    try:
+        json.dumps(values, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        found = error.object[error.start : error.end]
+        raise ConfigurationError(f"TOML holds no text with {found!a}, which stands for no character") from error
+    return tomli_w.dumps(values, multiline_strings=not _has_carriage_returns(values))
+
+
+def _has_carriage_returns(value: Any) -> bool:
+    """True if a text of ``value`` has one: a multi-line text of TOML would be read back without it."""
+    if isinstance(value, Mapping):
+        return any(map(_has_carriage_returns, value.values()))
+    return (
+        any(map(_has_carriage_returns, value)) if isinstance(value, list) else isinstance(value, str) and "\r" in value
+    )
 
 
 def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
@@ -189,7 +208,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     Field types may be bool, int, float, str, Literal, a dataclass, Mapping[str, X], tuple[X, ...], and unions of these.
     The value of a dataclass may be an instance of it.
 
-    :raises ConfigurationError: unknown or lacking key, wrong type, or a value that ``cls`` refuses by ValueError.
+    :raises ConfigurationError: unknown or missing key, wrong type, or a value that ``cls`` refuses by ValueError.
     """
     fields, hints = _fields(typing.cast(Any, cls))
     for key in table:
@@ -198,7 +217,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in table:
-            raise ConfigurationError(f"{where}: the key {name!r} is lacking")
+            raise ConfigurationError(f"{where}: missing key {name!r}")
     values = {key: convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
         return cls(**values)
@@ -246,7 +265,7 @@ def convert(hint: Any, value: Any, where: str) -> Any:
 def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
     if (kinds := _by_kind(arguments)) and isinstance(value, dict):
         if "kind" not in value:
-            raise ConfigurationError(f"{where}: the key 'kind' is lacking")
+            raise ConfigurationError(f"{where}: missing key 'kind'")
         kind = convert(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
         return convert(kinds[kind], value, where)
     some = [argument for argument in arguments if argument is not types.NoneType]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.answers import LOST as LOST  # noqa: PLC0414 - callers take it, like its neighbours, from here
-from analogrig.answers import MOST_FREQUENCY
+from analogrig.answers import MOST_FREQUENCY, AlarmIs
 from analogrig.catalogue import Cause, Change
 from analogrig.datasheet import Datasheet
 from analogrig.errors import ConfigurationError, RecordingError
@@ -169,7 +169,7 @@ class DeviceFacts:
     estimator: Mapping[str, Any] | None = None
     """Settings of an estimator of our catalogue; ``Conditions.estimator`` has them typed."""
     datasheet: Datasheet | None = None
-    alarm_is: str = "event"
+    alarm_is: AlarmIs = "event"
     report_interval_n: int = 1
     most_lost_n: int = 0
     assumed_n: int = 0
@@ -181,7 +181,7 @@ class DeviceFacts:
             if not least <= getattr(self, name) <= _MOST_COUNT:
                 raise ValueError(f"{name} must be {least} to {_MOST_COUNT}, not {getattr(self, name)}")
         if self.estimator is None and self.datasheet is None:
-            raise ValueError("the key 'estimator' or 'datasheet' is lacking")
+            raise ValueError("missing key 'estimator' or 'datasheet'")
 
     def settings(self, where: str) -> EstimatorConfig | None:
         """``estimator`` typed; ``where`` leads every error.
@@ -191,8 +191,8 @@ class DeviceFacts:
         if self.estimator is None:
             return None
         needed = (*_NEEDED_SETTINGS, *(() if self.estimator.get("trigger") == "none" else ("ceiling",)))
-        if lacking := [key for key in needed if key not in self.estimator]:
-            raise ConfigurationError(f"{where}: estimator: the key {lacking[0]!r} is lacking")
+        if missing := [key for key in needed if key not in self.estimator]:
+            raise ConfigurationError(f"{where}: estimator: missing key {missing[0]!r}")
         settings = config.build(EstimatorConfig, self.estimator, f"{where}: estimator")
         try:
             settings.check_ranges()
@@ -293,6 +293,8 @@ class Conditions:
 
     def again(self, **changes: Any) -> Conditions:
         """Conditions of another run with the same scenario, rig and device, whose facts are read once for all."""
+        if described := changes.keys() & {"scenario", "rig", "dut"}:
+            raise TypeError(f"another {min(described)} has facts of its own")
         out = dataclasses.replace(self, **changes)
         vars(out).update({name: getattr(self, name) for name in ("played", "source", "device", "datasheet")})
         return out

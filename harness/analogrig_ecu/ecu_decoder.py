@@ -137,12 +137,12 @@ class EcuDecoder:
         run.collected.end()
         place = f"sample {index}"
         codes = self._codes(parts, place) if is_agreed else None
-        self._skip_lacking(run, index)
+        self._skip_missing(run, index)
         run.next_index = index + 1
         if run.next_index > self._most_n:
             return
         if codes is None:
-            self._traffic["samples_lacking"] += 1
+            self._traffic["samples_missing"] += 1
             run.collected.skip(index, LOST | MISSING)
             return
         is_missing = any(part.is_missing for part in parts.values())
@@ -161,18 +161,18 @@ class EcuDecoder:
             return self._decode(values, "") or self._missing
         return self._decode(values, place)
 
-    def _skip_lacking(self, run: EcuRun, index: int) -> None:
+    def _skip_missing(self, run: EcuRun, index: int) -> None:
         """Enter the samples before ``index`` that the log lacks."""
-        lacking = range(run.next_index, min(index, self._most_n))
-        for k in lacking:
+        missing = range(run.next_index, min(index, self._most_n))
+        for k in missing:
             run.collected.skip(k, LOST | MISSING)
-        if lacking:
-            text, place = "by the counters, samples are not in the log", f"sample {lacking[0]}"
+        if missing:
+            text, place = "by the counters, samples are not in the log", f"sample {missing[0]}"
             if not run.next_index:
                 detail = f"the log begins with sample {index}"
             else:
                 detail = f"sample {run.next_index - 1} is followed by {index}; a second run? [start] tells them apart"
-            self.causes.add(text, noun="sample", place=place, detail=detail, loses=True, n=len(lacking))
+            self.causes.add(text, noun="sample", place=place, detail=detail, loses=True, n=len(missing))
 
     def _index(self, run: EcuRun, parts: Mapping[str, SamplePart]) -> tuple[int, bool]:
         """Index of the sample with the counters of these parts, and True if they agree.

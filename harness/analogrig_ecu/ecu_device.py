@@ -151,7 +151,7 @@ class EcuAnswers:
         if step == 0:
             self._note_repeated(answer.message)
             return None
-        self.counted["answers_lacking"] += step - 1
+        self.counted["answers_missing"] += step - 1
         return self._index
 
     def _note_repeated(self, message: str) -> None:
@@ -169,7 +169,7 @@ class EcuAnswers:
         # Lost if nothing shows that the device has taken the sample, or if its alarm is not known.
         decisive = [self._of_key[key] for key in ("alarm", "armed") if self._of_key.get(key) in self._needed]
         is_lost = not (self._seen and self._values.keys() >= set(decisive))
-        self._note_lacking(loses=is_lost)
+        self._note_missing(loses=is_lost)
         if is_lost:
             self.counted["samples_unanswered"] += 1
             self.rows.repeat(LOST | MISSING)
@@ -189,12 +189,12 @@ class EcuAnswers:
             self.counted["answers_incomplete"] += 1
             self.rows.repeat(flags | UNREPORTED, statistic)
 
-    def _note_lacking(self, *, loses: bool) -> None:
+    def _note_missing(self, *, loses: bool) -> None:
         """Name the messages and signals that an answer lacks."""
-        lacking = sorted(self._needed - self._values.keys())
+        missing = sorted(self._needed - self._values.keys())
         came = {message for message, *_ in self._seen}
-        for message in sorted({full.rpartition(".")[0] for full in lacking}):
-            gone = [full for full in lacking if full.rpartition(".")[0] == message]
+        for message in sorted({full.rpartition(".")[0] for full in missing}):
+            gone = [full for full in missing if full.rpartition(".")[0] == message]
             text = f"an answer without {', '.join(gone)}" if message in came else f"an answer without a frame {message}"
             self._causes.add(text, noun="sample", place=f"sample {self._index}", loses=loses)
 

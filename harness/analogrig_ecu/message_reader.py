@@ -147,14 +147,14 @@ class MessageReader:
         if n > frame_bytes(length):
             self._note_length(n, "the rest is ignored", loses=False)
         elif n < length:
-            lacking = []
+            missing = []
             for name in self._signals.keys() - raw.keys():  # unless its multiplexer does not select it
                 ids, selector = self._signals[name].multiplexer_ids, self._signals[name].multiplexer_signal
                 if ids is None or raw.get(selector) in ids:
-                    lacking.append(name)
-            lacking.sort(key=list(self._signals).index)
-            consequence = f"without {', '.join(lacking)}" if lacking else "the signals in use are complete"
-            self._note_length(n, consequence, loses=bool(lacking))
+                    missing.append(name)
+            missing.sort(key=list(self._signals).index)
+            consequence = f"without {', '.join(missing)}" if missing else "the signals in use are complete"
+            self._note_length(n, consequence, loses=bool(missing))
         if self._states_fd and frame.is_fd != self.message.is_fd:
             kinds = ("a classic frame", "a frame of CAN FD")
             self._causes.add(f"{self.title} is {kinds[frame.is_fd]}, the DBC says {kinds[self.message.is_fd]}")

@@ -172,11 +172,11 @@ class Instrument(ABC):
     def find_pots(self, names: Iterable[str]) -> PotBox:
         """Pots of the instrument, which are to have these names.
 
-        :raises RigError: some are lacking.
+        :raises RigError: some are missing.
         """
-        lacking = sorted(set(names) - set(self.pots.names if self.pots else ()))
-        if self.pots is None or lacking:
-            raise RigError(f"{self.name}: lacks the pots {', '.join(lacking)}")
+        missing = sorted(set(names) - set(self.pots.names if self.pots else ()))
+        if self.pots is None or missing:
+            raise RigError(f"{self.name}: lacks the pots {', '.join(missing)}")
         return self.pots
 
     @classmethod

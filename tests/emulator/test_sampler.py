@@ -279,7 +279,7 @@ def test_the_cards_clock_drifts_against_a_free_generator_and_not_against_its_own
 
 
 def test_acquisition_leaves_its_part_of_each_step() -> None:
-    """After ln 10 time constants a tenth of the step from the sample before is lacking."""
+    """After ln 10 time constants a tenth of the step from the sample before is missing."""
     card = replace(ONE, acquisition=math.log(10.0))
     assert codes(card, [100.0, 100.0, 200.0, 200.0]) == [100, 100, 190, 199]
     volts = np.random.default_rng(1).uniform(0, 255, (50, 1))

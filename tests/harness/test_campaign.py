@@ -662,8 +662,8 @@ def test_parquet_without_pyarrow_is_one_line_before_anything_is_played(
 
 
 def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    ports = ("/dev/absent", "/dev/lacking")
-    planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent', 'serial:/dev/lacking']\n", ports)
+    ports = ("/dev/absent", "/dev/missing")
+    planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent', 'serial:/dev/missing']\n", ports)
     assert command(tmp_path, "--allow", ports[0], "--allow", ports[1], workers=None) == 3
     complaint = capsys.readouterr().err
     assert "INCONCLUSIVE: no device can be had: device serial:/dev/absent: cannot open /dev/absent" in complaint

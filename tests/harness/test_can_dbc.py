@@ -447,8 +447,8 @@ def test_another_harness_on_the_bus_ends_the_run(file: Path) -> None:
 @pytest.mark.parametrize(
     ("lost", "flagged", "counted"),
     [
-        ({0x100}, {AT}, {"samples_lacking": 1}),
-        ({0x101}, {AT}, {"samples_lacking": 1}),
+        ({0x100}, {AT}, {"samples_missing": 1}),
+        ({0x101}, {AT}, {"samples_missing": 1}),
         ({0x100, 0x101}, {AT}, {}),
     ],
 )

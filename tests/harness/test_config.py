@@ -53,7 +53,7 @@ def test_values_become_the_declared_types() -> None:
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({}, "f: the key 'count' is lacking"),
+        ({}, "f: missing key 'count'"),
         ({"count": 1, "cuont": 2}, "f: unknown key 'cuont' (known: count, mode, inner, pairs)"),
         ({"count": True}, "f: count: must be a whole number below 2^63, not True"),
         ({"count": 1.0}, "f: count: must be a whole number, not 1.0"),
@@ -195,3 +195,14 @@ def test_page_has_every_key_of_a_scenario_file() -> None:
     tables = (Scenario, Excitation, PotChange, Expectations, Statement)
     keys = {(table.__name__, each.name) for table in tables for each in dataclasses.fields(table)}
     assert [key for key in sorted(keys) if not re.search(rf"\b{key[1]}\b", shown[1])] == []
+
+
+@pytest.mark.parametrize("text", ["a\nb", "a\r\nb", "a\rb", 'three """ quotes', "back\\slash", "\u2028 \x7f \x00"])
+def test_texts_come_back_from_toml_as_they_were(text: str) -> None:
+    table = {"name": text, "within": [{"text": text}], "plain": "two\nlines"}
+    assert tomllib.loads(config.to_toml(table)) == table
+
+
+def test_text_that_no_file_holds_is_one_clear_line() -> None:
+    with pytest.raises(ConfigurationError, match=r"TOML holds no text with '\\udc80'"):
+        config.to_toml({"name": "half \udc80"})

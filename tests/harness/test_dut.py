@@ -240,7 +240,7 @@ def test_own_file_may_say_everything(tmp_path: Path) -> None:
     ("text", "complaint"),
     [
         ('kind = "hots"', "'serial', 'can', "),
-        ('kind = "serial"', "the key 'url' is lacking"),
+        ('kind = "serial"', "missing key 'url'"),
         ('kind = "host"\nurl = "/dev/ttyS0"', "unknown key 'url' (known: name, description, most_lost_n, "),
         ("timeout_s = 1.0", "kind: must be one of 'host', 'inproc', "),
         ('kind = "inproc"\ntimeout_s = 0.0', "timeout_s must be more than 0 and at most 3600, not 0"),

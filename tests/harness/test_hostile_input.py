@@ -140,7 +140,7 @@ def test_setting_that_a_verdict_needs_is_not_assumed(
     recording: Path, tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = rewritten(recording, tmp_path / "run.npz", lambda conditions, _: conditions["dut"]["estimator"].pop(key))
-    assert f"dut: estimator: the key '{key}' is lacking" in judged(path, capsys)
+    assert f"dut: estimator: missing key '{key}'" in judged(path, capsys)
 
 
 def test_alarms_out_of_order_are_refused(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

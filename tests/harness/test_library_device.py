@@ -494,7 +494,7 @@ def of_another_machine(folder: Path) -> Path:
 
 
 def without_step(folder: Path) -> Path:
-    return build(folder / "lacking.so", FAULTY, flags=("-DNO_STEP", "-Wno-unused"))
+    return build(folder / "missing.so", FAULTY, flags=("-DNO_STEP", "-Wno-unused"))
 
 
 def of_another_abi(folder: Path) -> Path:
@@ -522,7 +522,7 @@ def absent(folder: Path) -> Path:
     [
         (not_a_library, "text.so: .*file too short"),
         (of_another_machine, "i386.so: .*wrong ELF class: ELFCLASS32"),
-        (without_step, "lacking.so: .*analogrig_step"),
+        (without_step, "missing.so: .*analogrig_step"),
         (of_another_abi, "abi.so: was built for ABI 7 of analogrig_estimator.h, and this analogrig has 1: compile it"),
         (with_too_much_theta, "theta.so: analogrig_about gives theta_n = 99, and the largest is 64"),
         (with_too_much_state, f"state.so: analogrig_about gives state_bytes = {1 << 40}, and the largest is {1 << 28}"),

@@ -46,10 +46,10 @@ def opened(**table: Any) -> Pots:
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({}, "the key 'kind' is lacking"),
+        ({}, "missing key 'kind'"),
         ({"kind": "comand"}, KINDS + "'comand'"),
         ({"kind": ["command"]}, KINDS + "['command']"),
-        ({"kind": "command"}, "the key 'arguments' is lacking"),
+        ({"kind": "command"}, "missing key 'arguments'"),
         ({"kind": "command", "arguments": []}, "arguments must begin with the program"),
         ({"kind": "command", "arguments": ["set", "{pot}"]}, "arguments must have {pot}, and {dial} or {step}, in it"),
         ({"kind": "command", "arguments": ["set", "{pot}", "{dail}"]}, "arguments: unknown placeholder {dail}"),
@@ -57,7 +57,7 @@ def opened(**table: Any) -> Pots:
         ({"kind": "command", "arguments": ["set {pot} {dial}"], "shell": True}, "unknown key 'shell'"),
         ({"kind": "command", "arguments": ["{pot} {dial}"], "timeout_s": 0}, "timeout_s must be more than 0"),
         ({"kind": "command", "arguments": ["{pot} {dial}"], "steps": 1}, "steps must be 2 to"),
-        ({"kind": "serial", "line": "{pot} {dial}"}, "the key 'url' is lacking"),
+        ({"kind": "serial", "line": "{pot} {dial}"}, "missing key 'url'"),
         ({"kind": "serial", "url": "/dev/null", "line": "{pot}"}, "line must have {pot}, and {dial} or {step}, in it"),
         (
             {"kind": "serial", "url": "/dev/null", "line": "{pot} {dial}", "reply": "{ok}"},

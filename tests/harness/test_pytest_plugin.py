@@ -604,7 +604,7 @@ def test_shipped_property_in_a_file_sets_the_device_itself_and_judges_by_the_lim
     [
         ({"name": "no_such"}, "name: there is none that is called 'no_such': there are .*detects"),
         ({"name": "detects", "limits": {"wihtin": 1.0}}, "limits: unknown key 'wihtin' .known: within."),
-        ({"name": "estimates"}, "limits: the key 'within' is lacking"),
+        ({"name": "estimates"}, "limits: missing key 'within'"),
         ({"name": "estimates", "limits": {"within": "x"}}, "limits: within: must be a number"),
     ],
 )

@@ -86,3 +86,15 @@ def test_paths_are_given_as_text_or_path(tmp_path: Path) -> None:
     assert judge(again) == judge(Run.load(tmp_path / "run.npz"))
     write_report(again, judge(again), str(tmp_path / "page.html"))
     assert (tmp_path / "page.html").stat().st_size
+
+
+def test_a_file_may_call_changes_tweaks(tmp_path: Path) -> None:
+    texts = [
+        f'samples = 100\nexcitation.shape = "square"\n[[{word}]]\nsample = 50\nset.K = 2e4\n'
+        for word in ("changes", "tweaks")
+    ]
+    files = [tmp_path / "new.toml", tmp_path / "old.toml"]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(text)
+    new, old = map(Scenario.load, files)
+    assert old.changes == new.changes == (PotChange(50, {"K": 2e4}),)

@@ -188,7 +188,7 @@ class Laws(NamedTuple):
     plus, minus, offset: by law; farads, rates (with a column), leak: by state, capacitors first; poles: rows of the
     op-amps; products: (row, column) of each product that drives a state; common: for each op-amp, None for none.
     law_of_kink: law of each kink; slewing: kinks and their laws; held: kinks and their states; loaded: kinks and nodes;
-    lacking: kinks and the columns of their excess. g: G without limiters and bends.
+    missing: kinks and the columns of their excess. g: G without limiters and bends.
     """
 
     plus: NDArray[np.intp]
@@ -204,7 +204,7 @@ class Laws(NamedTuple):
     slewing: _KinkPairs
     held: _KinkPairs
     loaded: _KinkPairs
-    lacking: _KinkPairs
+    missing: _KinkPairs
     g: Matrix
 
     @classmethod
@@ -214,7 +214,7 @@ class Laws(NamedTuple):
         poles = slice(first, first + len(parts.poles))
         common = [law.common for law in laws[poles]]
         g = np.zeros((states, len(kinks)))
-        slewing, held, loaded, lacking = [], [], [], []
+        slewing, held, loaded, missing = [], [], [], []
         for kink, each in enumerate(kinks):
             if each.slews:
                 g[each.law, kink] = 1.0
@@ -226,7 +226,7 @@ class Laws(NamedTuple):
             if each.loaded is not None:
                 loaded.append((kink, each.loaded))
             if each.excess is not None:
-                lacking.append((kink, each.excess))
+                missing.append((kink, each.excess))
         return cls(
             plus=np.array([law.plus for law in laws], np.intp),
             minus=np.array([law.minus for law in laws], np.intp),
@@ -241,7 +241,7 @@ class Laws(NamedTuple):
             slewing=_KinkPairs.of(slewing),
             held=_KinkPairs.of(held),
             loaded=_KinkPairs.of(loaded),
-            lacking=_KinkPairs.of(lacking),
+            missing=_KinkPairs.of(missing),
             g=g,
         )
 

@@ -370,7 +370,7 @@ class Nodal:
         w[laws.held.kinks, laws.held.others] = 1.0
         if laws.loaded.kinks.size:
             w[laws.loaded.kinks] -= solution[laws.loaded.others]
-            w[laws.lacking.kinks, laws.lacking.others] -= 1.0
+            w[laws.missing.kinks, laws.missing.others] -= 1.0
         slopes = drives[:states]
         slopes[laws.slewing.others] = 0.0
         g = laws.g.copy()

@@ -67,7 +67,7 @@ class Output(NamedTuple):
 class ThatSheet:
     """Patch of a program. slow: integrators whose output also leads to their jack SLOW.
 
-    Raises ProgramError that names what is lacking, with the count.
+    Raises ProgramError that names what is missing, with the count.
     """
 
     program: PatchedProgram

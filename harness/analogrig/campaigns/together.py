@@ -10,6 +10,7 @@ import ctypes
 import functools
 import itertools
 import operator
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeGuard
 
@@ -318,16 +319,22 @@ def models_of(runs: Sequence[Run]) -> Sequence[Model | None]:
     return [information.model_of(run) for run in runs]
 
 
-_last: tuple[Conditions, tuple[RecordedRig, RepeatedRig]] | None = None
-"""Rig of the last runs, with the one that plays them together: consecutive runs share their descriptions."""
+class _Last(threading.local):
+    """Rig of a thread's last runs, with the one that plays them together: consecutive runs share their descriptions."""
+
+    conditions: Conditions | None = None
+    rigs: tuple[RecordedRig, RepeatedRig]
+
+
+_last = _Last()
 
 
 def _recorded(conditions: Conditions) -> tuple[RecordedRig, RepeatedRig]:
-    global _last  # noqa: PLW0603 - a cache of one entry
-    if _last is None or _last[0].rig is not conditions.rig or _last[0].scenario is not conditions.scenario:
+    last = _last.conditions
+    if last is None or last.rig is not conditions.rig or last.scenario is not conditions.scenario:
         recorded = RecordedRig.of(conditions)
-        _last = conditions, (recorded, RepeatedRig(recorded.rig))
-    return _last[1]
+        _last.conditions, _last.rigs = conditions, (recorded, RepeatedRig(recorded.rig))
+    return _last.rigs
 
 
 class _Together:

@@ -92,10 +92,10 @@ def _run(arguments: argparse.Namespace) -> int:
         kept = f"what is done is kept in {out}, and the same command goes on from there"
         try:
             with workers(arguments, one_worker_only(plan.rigs, plan.devices), plan.size * plan.spec.trials) as pool:
-                lacking = {} if arguments.cluster else unreachable(plan)
-                if len(lacking) == len(plan.devices):
-                    return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
-                for name, why in lacking.items():
+                missing = {} if arguments.cluster else unreachable(plan)
+                if len(missing) == len(plan.devices):
+                    return complain(f"INCONCLUSIVE: no device can be had: {next(iter(missing.values()))}", INCONCLUSIVE)
+                for name, why in missing.items():
                     complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
                 files = [file for device in plan.devices for file in device_of(device).files()]
                 command = Identity.here(arguments.command_line, arguments.started, files)

@@ -218,7 +218,7 @@ class ForeignHost:
 
     def _request(self, n: int, slot: int = 0, settings: bytes = b"") -> None:
         self._unanswered += 1
-        with contextlib.suppress(OSError):  # the process has ended: its lacking reply names the sample
+        with contextlib.suppress(OSError):  # the process has ended: its missing reply names the sample
             self._socket.send(REQUEST.pack(n, slot, self._slots[0].records.itemsize if n else 0) + settings)
 
     def _reply(self, call: ForeignCall, timeout_s: float) -> bytes:

@@ -88,9 +88,9 @@ def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
             raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
         reason = str(error).removeprefix(f"{library}: ")
         raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
-    lacking = [function for function in functions if not hasattr(c, function)]
-    if lacking:
-        raise ConfigurationError(f"{library}: is no library of a device: it lacks {', '.join(lacking)} ({_HOW_TO})")
+    missing = [function for function in functions if not hasattr(c, function)]
+    if missing:
+        raise ConfigurationError(f"{library}: is no library of a device: it lacks {', '.join(missing)} ({_HOW_TO})")
     return c
 
 

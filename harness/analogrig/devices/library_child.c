@@ -167,12 +167,12 @@ static library_t load(const char* const path, const int fd) {
     if (handle == NULL) {
         refuse(fd, dlerror());
     }
-    const char* const lacking = !find(handle, "analogrig_about", &library.about) ? "analogrig_about"
+    const char* const missing = !find(handle, "analogrig_about", &library.about) ? "analogrig_about"
                                 : !find(handle, "analogrig_init", &library.init) ? "analogrig_init"
                                 : !find(handle, "analogrig_step", &library.step) ? "analogrig_step"
                                                                                  : NULL;
-    if (lacking != NULL) {
-        (void)snprintf(text, sizeof(text), "lacks the function %s of analogrig_estimator.h", lacking);
+    if (missing != NULL) {
+        (void)snprintf(text, sizeof(text), "lacks the function %s of analogrig_estimator.h", missing);
         refuse(fd, text);
     }
     return library;

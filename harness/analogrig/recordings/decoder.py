@@ -81,9 +81,9 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
             raise ConfigurationError(f"--dbc {dbc}: {error}") from error
         layout = LAYOUTS[message.name]
         wanted = {_signal(each) for each in (*layout.fields, *layout.bits) if each != "flags"}
-        lacking = wanted - {signal.name for signal in message.signals}
-        if lacking:
-            raise ConfigurationError(f"--dbc {dbc}: message {message.name} lacks {', '.join(sorted(lacking))}")
+        missing = wanted - {signal.name for signal in message.signals}
+        if missing:
+            raise ConfigurationError(f"--dbc {dbc}: message {message.name} lacks {', '.join(sorted(missing))}")
         if message.is_multiplexed():
             raise ConfigurationError(f"--dbc {dbc}: message {message.name} is multiplexed")
     return {(message.frame_id, message.is_extended_frame): message for message in known}
@@ -182,9 +182,9 @@ class CatalogueRun(CapturedRun):
         alarms = self.counters.get("alarms", len(self.alarms))
         if alarms != len(self.alarms):
             yield f"the device raised {number_of(alarms, 'alarm')}, {path} holds {len(self.alarms)}"
-        lacking = [name for name in _COUNTERS if name not in self.counters]
-        if lacking:
-            yield f"the device's counters {', '.join(lacking)} after the run are not in {path}"
+        missing = [name for name in _COUNTERS if name not in self.counters]
+        if missing:
+            yield f"the device's counters {', '.join(missing)} after the run are not in {path}"
 
 
 class CaptureDecoder:
@@ -249,7 +249,7 @@ class CaptureDecoder:
                 self._add_fault(f"{brief(last)} and {brief(message)} have the same number: more than one {sender}")
             self.line["messages_repeated"] += 1
             return False
-        self.line["messages_lacking"] += step - 1
+        self.line["messages_missing"] += step - 1
         self._has_gap |= step > 1 and not from_harness
         return True
 

@@ -12,7 +12,8 @@ describe       ``RigDescription`` (base class), ``Thing``
 perform        ``Rig`` (base class), ``Performance``, ``Hindsight``, ``CAPABILITIES``
 sample         ``Block``, ``Channel``, ``Segment``, ``BLOCK_SAMPLES``, ``WRONG_SAMPLES``, ``DEFAULT_RIG``
 emulator       ``EmulatorRig``, ``EmulatorDescription``, ``ComputerDescription``, ``CardDescription``,
-               ``MeasuredValues``, ``Stream``, ``emulator_errors``, ``is_emulated``
+               ``MeasuredValues``, ``Stream``, ``emulator_errors``, ``is_emulated``; for plays in steps
+               ``SetUp``, ``channels_of``, ``lit_lamps``, ``sampled``
 errors         ``RigTimeout``, ``RigClosed``, ``RigRefused``; ``RigError`` is in ``analogrig``
 =============  ==========================================================================================
 """

@@ -407,6 +407,7 @@ class EmulatorRig(Rig):
 
 
 def channels_of(card: Card, computer: SuspensionComputer, program: Program) -> dict[str, Channel]:
+    """Channels of the card by name, with their ranges, units and gains."""
     return {
         name: Channel(
             low_v=card.ranges_v[i][0],

@@ -239,8 +239,8 @@ class RecordedPlant:
             (self.run.channel(name)[rows], self.run.clipped[rows, every.index(name)]) for name in self._measured
         )
         if u_clipped.any():
-            lacking = first + int(u_clipped.argmax())
-            raise ConfigurationError(f"sample {lacking}: the input is missing or clipped, and cannot be played")
+            missing = first + int(u_clipped.argmax())
+            raise ConfigurationError(f"sample {missing}: the input is missing or clipped, and cannot be played")
         valid = ~y_clipped & (np.arange(end - first) >= settling_n)
         if (count := np.count_nonzero(valid)) < _LEAST_N:
             raise ConfigurationError(
@@ -254,8 +254,8 @@ class RecordedPlant:
         """First of the samples before ``first`` in which the input is known and the plant does not change."""
         changes = [start for start, _, _ in self.run.segments if start <= first]
         at = self.run.conditions.program.channels.index(self._measured[0])
-        lacking = np.flatnonzero(self.run.clipped[:first, at]) + 1
-        return max([0, *changes, *(int(each) for each in lacking[-1:])])
+        missing = np.flatnonzero(self.run.clipped[:first, at]) + 1
+        return max([0, *changes, *(int(each) for each in missing[-1:])])
 
     def simulate(
         self, values: Mapping[str, float], span: Span, reconstruction: Reconstruction = "band-limited"

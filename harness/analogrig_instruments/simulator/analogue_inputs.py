@@ -97,8 +97,8 @@ class Inputs:
         The later channel is interpolated between two points.
         """
         own = count * self._oversampling
-        lacking = own + math.ceil(self._delay_n) - len(self._ahead)
-        taken = np.concatenate((self._ahead, self._computer.run(lacking))) if count else self._ahead
+        missing = own + math.ceil(self._delay_n) - len(self._ahead)
+        taken = np.concatenate((self._ahead, self._computer.run(missing))) if count else self._ahead
         points, self._ahead = taken[:own].copy(), taken[own:]
         if self._delay_n and count:
             later = 1 if self._faults.skew_s > 0.0 else 0

@@ -724,7 +724,7 @@ def test_recording_with_an_injected_fault_says_that_it_cannot_be_judged(tmp_path
     [
         ("explode", {}, "no command is called 'explode'"),
         (7, {}, "no command is called 7"),
-        ("turn", {"name": "K"}, "the key 'value' is lacking"),
+        ("turn", {"name": "K"}, "missing key 'value'"),
         ("turn", {"name": "K", "value": "much"}, "must be a number"),
         ("turn", {"name": "K", "value": 1.0, "ramp_n": -1}, "ramp_n must be 0 to"),
         ("tempo", {"factor": 0.0}, "factor must be 0.001 to"),

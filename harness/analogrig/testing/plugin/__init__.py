@@ -106,10 +106,10 @@ def hil_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
         rig = open_rig(setting.value, allow=hil_options.trust_of(request.config))
     with rig:
         for mark in request.node.iter_markers("hil_needs"):
-            if lacking := sorted(set(mark.args) - rig.capabilities):
+            if missing := sorted(set(mark.args) - rig.capabilities):
                 able = ", ".join(sorted(rig.capabilities)) or "nothing but play"
                 pytest.skip(
-                    f"rig {setting.value} cannot {' and '.join(lacking)} (it can {able}): choose another with --hil-rig"
+                    f"rig {setting.value} cannot {' and '.join(missing)} (it can {able}): choose another with --hil-rig"
                 )
         yield rig
 
