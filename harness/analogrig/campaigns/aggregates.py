@@ -112,7 +112,7 @@ class Aggregate:
     """Number of valid trials by events and exposure, for each of RATES."""
     longest: dict[str, int] = field(default_factory=lambda: dict.fromkeys(RATES, 1))
     """Largest exposure that a trial can have, for each of RATES."""
-    doubt: str = ""
+    inconclusive_reason: str = ""
     """Seed of the first inconclusive trial, with the reason; empty if there is none."""
     not_passed: list[tuple[int, str, str]] = field(default_factory=list)
     """Seed, outcome and reason of the first trials that have not passed."""
@@ -127,7 +127,7 @@ class Aggregate:
         outcomes, reasons, mask = trials["outcome"], trials["why"], is_valid(trials)
         if not mask.all():
             i = int(np.argmin(mask))
-            self.doubt = self.doubt or f"seed {first_seed + i}: {reasons[i]}"
+            self.inconclusive_reason = self.inconclusive_reason or f"seed {first_seed + i}: {reasons[i]}"
         for i in np.flatnonzero(outcomes != PASSED)[: MOST_NOT_PASSED - len(self.not_passed)].tolist():
             self.not_passed.append((first_seed + i, OUTCOMES[outcomes[i]], reasons[i]))
         self.counts.update(dict(zip(OUTCOMES, np.bincount(outcomes, minlength=3).tolist(), strict=True)))
@@ -167,7 +167,7 @@ class Aggregate:
             for name in RATES:
                 whole.plays[name] += each.plays[name]
                 whole.longest[name] = max(whole.longest[name], each.longest[name])
-            whole.doubt = whole.doubt or each.doubt
+            whole.inconclusive_reason = whole.inconclusive_reason or each.inconclusive_reason
         return whole
 
     def sequence(self, name: str, confidence: float = CONFIDENCE) -> BettingSequence:
@@ -201,7 +201,7 @@ class Summary:
     """Mean information bound of the changes that were detected and detectable."""
     error: Mapping[str, float]
     """rms relative error of each estimate at the end."""
-    doubt: str
+    inconclusive_reason: str
     """Seed of the first inconclusive trial, with the reason; empty if there is none."""
 
     @classmethod
@@ -218,7 +218,7 @@ class Summary:
             latency_p95_n=found.latency_n.quantile(95),
             bound_n=found.counts["bound_n"] / found.counts["bounds"] if found.counts["bounds"] else None,
             error=dict(zip(estimates, rms, strict=False)) if estimated else {},
-            doubt=found.doubt,
+            inconclusive_reason=found.inconclusive_reason,
         )
 
 

@@ -109,7 +109,7 @@ def text(results: Results) -> str:
     lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
     notes = [f"{BOUNDS}; latency, p95 and bound in samples"]
     if total.inconclusive:
-        notes.append(f"{number_of(total.inconclusive, 'trial')} inconclusive, such as {total.doubt}")
+        notes.append(f"{number_of(total.inconclusive, 'trial')} inconclusive, such as {total.inconclusive_reason}")
     return "\n".join(
         [head + results.outcome.upper(), "", *(f"  {line}" for line in lines), "", *(f"  {note}" for note in notes)]
     )
