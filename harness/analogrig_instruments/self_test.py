@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import Plant, Program, Rig, Scenario
+from analogrig.devices import Change
 from analogrig.errors import SelfTestError
 from analogrig.judging import QUANTISATION_VARIANCE_LSB2
 from analogrig.run import Channel
@@ -58,8 +59,12 @@ MOST_CLOCK_PPM = 50.0
 MOST_MASS, MOST_DAMPING = 0.3, 0.15
 MOST_SHAPE, LEAST_SHAPE_LSB = 3e-4, 0.5
 
-_TERMS = {"mass": "second-order term", "damping": "first-order term", "stiffness": "the term of order zero"}
-"""Names of the terms of the output's equation where diagnoses name no parameter, by those that diagnoses have."""
+_TERMS = {
+    Change.MASS: "second-order term",
+    Change.DAMPING: "first-order term",
+    Change.STIFFNESS: "the term of order zero",
+}
+"""Names of the terms of the output's equation where diagnoses name no parameter, by their changes."""
 
 AMPLIFIERS_S = Uncertain(0.625e-6, 0.5e-6)
 """Delay of the output by the computer's amplifiers: 0.62 us with TL07x, 1.2 us with polyester capacitors too, 0
@@ -503,12 +508,12 @@ class _Analysis:
         if shape.state == "wrong":
             why = f"it is read from the shape of the {self.answer.name}, which is wrong"
             names = [(name, self.answer.name) for name in ("gain", "offset", "noise")]
-            names += [(name, "") for name in ("skew", self._name_of("mass"), self._name_of("damping"))]
+            names += [(name, "") for name in ("skew", self._name_of(Change.MASS), self._name_of(Change.DAMPING))]
             return (self._clock_ratio(), shape, *(_not_measured(name, channel, why) for name, channel in names))
         gain, offset = min(self._gains, key=abs), min(self._offsets, key=abs)
         gain_error = math.hypot(response.gain.error / abs(response.gain.value), self._input_gain.error)
         offset_error = math.hypot(response.offset.error, response.gain.value * self._input_offset.error)
-        hint = f": check the range and amplifier of its input, and set {self._pot_of('stiffness')} again"
+        hint = f": check the range and amplifier of its input, and set {self._pot_of(Change.STIFFNESS)} again"
         return (
             self.answer.gain(Uncertain(gain, gain_error), MOST_GAIN, hint),
             self.answer.offset(Uncertain(offset, offset_error), hint),
@@ -549,20 +554,20 @@ class _Analysis:
         error = 1e6 * self._response.period_error_n / period_n
         return Check("clock ratio", "", ppm, error, -MOST_CLOCK_PPM, MOST_CLOCK_PPM, "ppm", advice)
 
-    def _pot_of(self, diagnosis: str) -> str:
-        """Pot of the parameter that diagnoses give this name, or all pots."""
-        name = self.plant.program.diagnosed.get(diagnosis)
+    def _pot_of(self, change: Change) -> str:
+        """Pot of the parameter that this diagnosis names, or all pots."""
+        name = self.plant.program.diagnosed.get(change.name.lower())
         return f"the pot of {name}" if name else "the pots"
 
-    def _name_of(self, diagnosis: str) -> str:
-        """Parameter that diagnoses give this name, or its place in the equation of second order."""
-        return self.plant.program.diagnosed.get(diagnosis, _TERMS[diagnosis])
+    def _name_of(self, change: Change) -> str:
+        """Parameter that this diagnosis names, or its place in the equation of second order."""
+        return self.plant.program.diagnosed.get(change.name.lower(), _TERMS[change])
 
     def _machine(self) -> Iterator[Check]:
         """Checks of the terms of second and first order, relative to that of order zero."""
         fitted = (self._response.mass_n2, self._response.damping_n)
-        for name, found, nominal, most, parts in zip(
-            ("mass", "damping"),
+        for change, found, nominal, most, parts in zip(
+            (Change.MASS, Change.DAMPING),
             fitted,
             self._nominal,
             (MOST_MASS, MOST_DAMPING),
@@ -571,10 +576,10 @@ class _Analysis:
         ):
             off = found.value / nominal - 1.0
             advice = (
-                f"it is {off:+.0%} relative to {self._name_of('stiffness')}: set {self._pot_of(name)} again, and check"
-                f" {parts}"
+                f"it is {off:+.0%} relative to {self._name_of(Change.STIFFNESS)}: set {self._pot_of(change)} again,"
+                f" and check {parts}"
             )
-            yield Check(self._name_of(name), "", off, found.error / nominal, -most, most, "off nominal", advice)
+            yield Check(self._name_of(change), "", off, found.error / nominal, -most, most, "off nominal", advice)
 
 
 def _remove_quantisation(rms_lsb: float) -> float:
