@@ -87,7 +87,7 @@ class Program:
     def of(cls, value: Any, where: str) -> Program:
         """Program of a scenario's key ``program``: a name, a file, or the tables of one; a Program itself.
 
-        :raises ConfigurationError: it is none of them.
+        :raises ConfigurationError: it is not one of them.
         """
         if isinstance(value, Program):
             return value

@@ -131,7 +131,10 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> Plan:
-        """:raises ConfigurationError, ValueError: it is none."""
+        """Plan from JSON.
+
+        :raises ConfigurationError, ValueError: it is not a plan.
+        """
         return config.build(cls, json.loads(text), "the plan of the campaign")
 
     def as_table(self) -> dict[str, Any]:

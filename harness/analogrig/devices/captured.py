@@ -18,7 +18,7 @@ class CapturedRun(ABC):
     """Run in a CAN log."""
 
     samples: dict[int, tuple[int, int, bool]] = field(default_factory=dict)
-    """Force code, displacement code, and True if sent as missing; by sample index."""
+    """Code of the input, code of the output, and True if sent as missing; by sample index."""
     counters: dict[str, int] = field(default_factory=dict)
     """Counters of the device, as far as the log holds them."""
     faults: list[str] = field(default_factory=list)

@@ -294,7 +294,7 @@ class CatalogueDevice(Device):
         self._describe(self._description.suited(poles))
 
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
-        """Set the code of zero force; errors as ``configure``."""
+        """Set the code of zero input; errors as ``configure``."""
         self._apply(dataclasses.replace(self.estimator, force_zero=channels["u"].zero))
 
     def _apply(self, estimator: EstimatorConfig) -> None:

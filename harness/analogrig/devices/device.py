@@ -441,7 +441,7 @@ class Device(ABC):
     def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: B027 - few devices need it
         """Take the scales of the channels ``u`` and ``y``, and the machine time between samples, before ``start``.
 
-        Messages that carry physical units need them, and so does the code of zero force.
+        Messages that carry physical units need them, and so does the code of zero input.
         """
 
     def pace(self, period_s: float) -> Pace:  # noqa: ARG002

@@ -396,8 +396,8 @@ class Estimator:
     ) -> EstimatorOutput:
         """Estimator output for n samples.
 
-        :param u: (n,) codes of force.
-        :param y: (n,) codes of displacement.
+        :param u: (n,) codes of the input.
+        :param y: (n,) codes of the output.
         :param valid: (n,) false where the sample is missing.
         :param with_theta: False: omit theta, which takes a tenth of the time.
         :raises ValueError: u, y and valid differ in length.
@@ -422,7 +422,7 @@ class Estimator:
     ) -> Iterator[tuple[EstimatorOutput, Mapping[str, int]]]:
         """Output for each of r records of n samples, with the counters of the record. It restarts before each.
 
-        :param u: (r, n) contiguous codes of force; y and valid likewise, as of ``run``.
+        :param u: (r, n) contiguous codes of the input; y and valid likewise, as of ``run``.
         """
         arrays, out = self._room(u.shape, with_theta=with_theta)
         counters = np.empty(len(u), _COUNTERS_TYPE)

@@ -85,7 +85,7 @@ class Rows:
     def add(self, result: object) -> None:
         """Add the answer to the next sample.
 
-        :raises WrongAnswer: it is none.
+        :raises WrongAnswer: it is not a valid answer.
         """
         at, fields = self._at, self._fields
         if not (self._is_bare and (result is False or result is True)):
@@ -121,7 +121,7 @@ class Rows:
     def fill(self, result: object) -> None:
         """Add the answers to the whole block: an array of alarms, or an object with an array of each quantity.
 
-        :raises WrongAnswer: it is none.
+        :raises WrongAnswer: they are not valid answers.
         """
         n, fields = self._n, self._fields
         answer = self._quantities({"alarm": result} if isinstance(result, np.ndarray) else result)

@@ -117,7 +117,7 @@ def _rigs_file() -> Path | None:
 def _rig_tables(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
     """Rigs of a rigs file, by name.
 
-    :raises ConfigurationError: it is none.
+    :raises ConfigurationError: it is not a rigs file.
     """
     rigs = table.get("rig")
     if not isinstance(rigs, dict) or not rigs or not all(isinstance(each, dict) for each in rigs.values()):

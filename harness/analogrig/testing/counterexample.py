@@ -178,7 +178,7 @@ def _is_device(name: str, run: Run) -> bool:
 
 
 def _settings(dut: Mapping[str, Any]) -> dict[str, Any]:
-    """Device settings without its identity, and without the zero of the force: the bench sets that by the rig's
+    """Device settings without its identity, and without the zero of the input: the bench sets that by the rig's
     card."""
     table = {key: value for key, value in dut.items() if key != "identity"}
     if "estimator" in table:
