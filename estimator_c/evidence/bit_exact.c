@@ -28,7 +28,7 @@ typedef struct {
     uint32_t missing;
     uint32_t refreshes;
     uint32_t diagnoses;
-    uint32_t readings;    ///< steps with a second reading
+    uint32_t hypotheses;  ///< steps with a second hypothesis
     uint32_t violations;  ///< steps after which est_invariants_hold() failed
 } record_t;
 
@@ -310,7 +310,7 @@ static bool run_long(record_t* const self, const uint32_t run_number) {
             enter_number(self, estimator.correlation.partial[0]);
             enter_number(self, estimator.correlation.partial[1]);
         }
-        self->readings += est_correlation_coloured(&estimator.correlation) ? 1U : 0U;
+        self->hypotheses += est_correlation_coloured(&estimator.correlation) ? 1U : 0U;
     }
     enter_end(self, &estimator);
     return true;
@@ -385,11 +385,11 @@ int main(void) {
     }
     (void)printf(
         "steps %lu nan %lu violations %lu alarms %lu slips %lu refused %lu missing %lu refreshes %lu diagnoses %lu "
-        "readings %lu hash %08lx%08lx\n",
+        "hypotheses %lu hash %08lx%08lx\n",
         (unsigned long)record.steps, (unsigned long)record.nan_n, (unsigned long)record.violations,
         (unsigned long)record.alarms, (unsigned long)record.slips, (unsigned long)record.refused,
         (unsigned long)record.missing, (unsigned long)record.refreshes, (unsigned long)record.diagnoses,
-        (unsigned long)record.readings, (unsigned long)(record.hash >> 32U),
+        (unsigned long)record.hypotheses, (unsigned long)(record.hash >> 32U),
         (unsigned long)(record.hash & 0xFFFFFFFFU));
     return 0;
 }

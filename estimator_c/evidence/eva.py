@@ -46,7 +46,7 @@ OPTIONS = (
     f"-eva-split-return-function=orders_valid:0,est_config_valid:0,{INIT}:0",
     "-warn-special-float=none",
 )
-"""Within a function as many paths are told apart as it has (with an edge in doubt or not, each turn of a loop), but a
+"""Within a function as many paths are told apart as it has (with an ambiguous edge or not, each turn of a loop), but a
 call has one outcome, or there would be their product. Only of these three functions what they return is told apart:
 est_init() == true then means a valid configuration. The loop of main() is one of any samples. On 32 bits, as on the
 targets, est_t has no padding at its end that would hide a read beyond its last array."""

@@ -29,7 +29,7 @@ def test_the_run_is_long_enough_and_holds_what_may_happen(expected: str) -> None
     assert counts["nan"] == counts["violations"] == 0
     assert min(counts[name] for name in ("alarms", "slips", "refused", "missing", "refreshes")) > 0
     assert counts["diagnoses"] >= 24
-    assert counts["readings"] >= 50_000
+    assert counts["hypotheses"] >= 50_000
 
 
 def test_a_fused_multiplication_would_be_noticed(expected: str) -> None:
@@ -40,7 +40,7 @@ def test_a_fused_multiplication_would_be_noticed(expected: str) -> None:
 @pytest.mark.parametrize(
     ("header", "constant", "value"),
     [
-        ("est_correlation.h", "EST_SMOOTH", "0.0F"),  # no second reading
+        ("est_correlation.h", "EST_SMOOTH", "0.0F"),  # no second hypothesis
         ("est_correlation.h", "EST_PARTIAL_MAX", "0.97F"),
         ("est_scale.h", "EST_DISPERSION_MAX", "11.0F"),
         ("est_scale.h", "EST_INFLATION_DECAY", "0.9999F"),

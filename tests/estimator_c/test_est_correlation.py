@@ -150,8 +150,8 @@ def test_plant_with_autoregressive_noise_raises_no_alarm_where_the_first_reading
 
 
 @pytest.mark.parametrize("partial", [(0.7, 0.0), (0.5, -0.4)], ids=str)
-def test_readings_after_a_gap_begin_anew_and_are_as_stated(estimator: Estimator, partial: tuple[float, float]) -> None:
-    """The first innovation after a gap follows no other. Both readings begin from the same sum."""
+def test_hypotheses_after_a_gap_begin_anew_as_stated(estimator: Estimator, partial: tuple[float, float]) -> None:
+    """The first innovation after a gap follows no other. Both hypotheses begin from the same sum."""
     assert estimator.init(**GIVEN | {"ceiling": 1e6})
     enter(estimator, correlated(partial, 8000, 1))
     before = float(enter(estimator, [-12.0, 3.0]).statistic[-1])
@@ -190,7 +190,7 @@ def test_change_of_correlated_noise_is_seen_later_by_its_correlation(
     assert np.mean(delays) < mean_n
 
 
-@pytest.mark.parametrize("after_n", [3, 25], ids=["edge in doubt", "between edges"])
+@pytest.mark.parametrize("after_n", [3, 25], ids=["ambiguous edge", "between edges"])
 @pytest.mark.parametrize("edge_instants", [LOCKED, MAY_SLIP])
 def test_change_of_a_plant_with_autoregressive_noise_is_seen_by_the_next_edge(
     estimator: Estimator, edge_instants: int, after_n: int
@@ -219,7 +219,7 @@ def test_peak_where_theta_is_uncertain_raises_no_alarm_with_a_second_reading(est
     assert alarms[0.7] == 0
 
 
-def test_single_innovation_of_8_deviations_is_an_alarm_in_both_readings(estimator: Estimator) -> None:
+def test_single_innovation_of_8_deviations_is_an_alarm_under_both_hypotheses(estimator: Estimator) -> None:
     innovations = correlated((0.7, 0.0), 8100, 1)
     innovations[8050] = 8.0
     assert estimator.init(**GIVEN)
