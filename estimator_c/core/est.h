@@ -306,7 +306,7 @@ typedef struct {
             .absolute   = false,                                                                                       \
             .hold_off_n = 0U,                                                                                          \
             .warm_up_n  = EST_WITH_ROBUSTNESS ? 550U : 150U,                                                           \
-            .ceiling    = 11.512925F,                                                                                  \
+            .ceiling    = 11.512925F, /* ln 1e5: ARL0 of 100,000 */                                                    \
             .custom     = NULL,                                                                                        \
             .context    = NULL,                                                                                        \
         },                                                                                                             \

@@ -1,7 +1,7 @@
 """Interface of the bench instruments: a generator with one output, and inputs sampled at the same instant.
 
 A driver is a subclass of ``Instrument`` and an entry point of ``analogrig.instruments``, named like the scheme of its
-URLs. tests/harness/test_instruments.py tests all drivers.
+URLs. tests/harness/test_instruments.py tests the drivers of this repository.
 Volts are those at the instrument's connectors. ``analogrig_instruments.rig_wiring`` describes the stages to the
 computer.
 """

@@ -55,7 +55,6 @@ Capability = Literal["blocks", "configure", "faults", "identify", "in-process", 
 ``identify``    it can tell whether it was reset
 ``in-process``  it runs in this process: a time-out costs no time, a crash ends the process
 ``pace``        samples can be sent in real time
-``snapshot``    the state of its estimator can be saved and restored
 """
 
 
