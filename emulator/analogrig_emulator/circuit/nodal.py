@@ -243,13 +243,7 @@ class Nodal:
             left.join(row[resistor.a], row[resistor.b], 1.0 / resistor.ohm)
         for i, capacitor in enumerate(self._parts.capacitors):
             right[self._enter_branch(left, capacitor.name, capacitor.a, capacitor.b), i] = 1.0
-        for source in circuit.of(VoltageSource):
-            column, volts = self._drive(source)
-            right[self._enter_branch(left, source.name, source.plus, source.minus), column] = volts
-        for drive in circuit.of(CurrentSource):
-            column, amperes = self._drive(drive)
-            right[row[drive.plus], column] -= amperes
-            right[row[drive.minus], column] += amperes
+        self._enter_sources(left, circuit)
         for amp in circuit.of(OpAmp):
             self._enter_opamp(left, amp)
         for i, limiter in enumerate(self._parts.limiters, self._columns):
@@ -270,6 +264,16 @@ class Nodal:
             right[:, bend] = -right[:, self._state[amp.name]]
             bend += 1
         np.add.at(self._left.reshape(-1), np.array(left.places, np.intp), left.values)
+
+    def _enter_sources(self, left: _Stamps, circuit: Circuit) -> None:
+        row, right = self._row, self._right
+        for source in circuit.of(VoltageSource):
+            column, volts = self._drive(source)
+            right[self._enter_branch(left, source.name, source.plus, source.minus), column] = volts
+        for drive in circuit.of(CurrentSource):
+            column, amperes = self._drive(drive)
+            right[row[drive.plus], column] -= amperes
+            right[row[drive.minus], column] += amperes
 
     def _drive(self, source: VoltageSource | CurrentSource) -> tuple[int, float]:
         """Column of the right-hand side that drives a source, and its factor."""
