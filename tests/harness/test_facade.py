@@ -31,7 +31,7 @@ DEVICES = """
 RIGS = """
     BLOCK_SAMPLES CAPABILITIES DEFAULT_RIG WRONG_SAMPLES Block CardDescription Channel
     ComputerDescription EmulatorDescription EmulatorRig Hindsight MeasuredValues Performance
-    Rig RigClosed RigDescription RigRefused RigTimeout Segment
+    RecordIncomplete RecordStale Rig RigClosed RigDescription RigRefused RigTimeout Segment
     SetUp Stream Thing channels_of emulator_errors is_emulated lit_lamps sampled
 """.split()
 

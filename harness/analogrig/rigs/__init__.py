@@ -14,7 +14,8 @@ sample         ``Block``, ``Channel``, ``Segment``, ``BLOCK_SAMPLES``, ``WRONG_S
 emulator       ``EmulatorRig``, ``EmulatorDescription``, ``ComputerDescription``, ``CardDescription``,
                ``MeasuredValues``, ``Stream``, ``emulator_errors``, ``is_emulated``; for plays in steps
                ``SetUp``, ``channels_of``, ``lit_lamps``, ``sampled``
-errors         ``RigTimeout``, ``RigClosed``, ``RigRefused``; ``RigError`` is in ``analogrig``
+errors         ``RigTimeout``, ``RigClosed``, ``RigRefused``, ``RecordIncomplete``, ``RecordStale``; ``RigError``
+               is in ``analogrig``
 =============  ==========================================================================================
 """
 
@@ -26,7 +27,7 @@ CAPABILITIES = ("excite", "change")
 """Optional capabilities of a rig beyond sampling, for ``Rig.capabilities``."""
 
 if TYPE_CHECKING:
-    from analogrig.errors import RigClosed, RigRefused, RigTimeout
+    from analogrig.errors import RecordIncomplete, RecordStale, RigClosed, RigRefused, RigTimeout
     from analogrig.plant import Segment
     from analogrig.rigs.description import DEFAULT_RIG
     from analogrig.rigs.emulator import (
@@ -54,7 +55,7 @@ else:
         __name__,
         {
             "analogrig.rigs.description": "DEFAULT_RIG",
-            "analogrig.errors": "RigClosed RigRefused RigTimeout",
+            "analogrig.errors": "RecordIncomplete RecordStale RigClosed RigRefused RigTimeout",
             "analogrig.plant": "Segment",
             "analogrig.rigs.emulator": (
                 "CardDescription ComputerDescription EmulatorDescription EmulatorRig MeasuredValues SetUp Stream "
@@ -81,6 +82,8 @@ __all__ = [
     "Hindsight",
     "MeasuredValues",
     "Performance",
+    "RecordIncomplete",
+    "RecordStale",
     "Rig",
     "RigClosed",
     "RigDescription",
