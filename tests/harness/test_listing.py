@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import sys
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import pytest
 
 from analogrig.cli import main
 from analogrig.cli.listing import KINDS
+from analogrig.entry_points import EntryPoint
+from analogrig.rigs.description import KINDS as RIG_KINDS
+from analogrig.rigs.description import describe
+from analogrig.rigs.rig import RigDescription
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"
 FILES = sorted(FIXTURES.glob("*/*.toml"))
@@ -53,6 +60,36 @@ def test_kinds_of_devices_are_listed_as_they_are_spelt(capsys: pytest.CaptureFix
         "can:INTERFACE[/CHANNEL][?KEY=VALUE&...]",
     }
     assert all(row["description"] for row in rows)
+
+
+def test_kinds_of_rigs_that_need_keys_are_not_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "real" in RIG_KINDS.added
+    names = [row["name"] for row in listed(capsys, "rigs")["rigs"]]
+    assert "real" not in names
+    for name in names:
+        describe(name)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_descriptions_have_no_marks_of_docstrings(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert not [row for row in listed(capsys, kind)[kind] if "``" in row["description"] or ":`" in row["description"]]
+
+
+def test_kind_of_a_rig_that_needs_no_key_is_listed_without_marks(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Flat(RigDescription):
+        """A rig of ``zeros``, as :class:`Rig` is one."""
+
+        kind: Literal["flat"] = "flat"
+        name: str
+
+    module = SimpleNamespace(Flat=Flat)
+    monkeypatch.setitem(sys.modules, "flat_rigs", module)
+    monkeypatch.setitem(RIG_KINDS._added, "flat", EntryPoint("flat", "analogrig.rigs", "flat_rigs:Flat", "flat"))
+    rows = {row["name"]: row["description"] for row in listed(capsys, "rigs")["rigs"]}
+    assert rows["flat"] == "A rig of `zeros`, as `Rig` is one."
 
 
 def test_rigs_of_a_rigs_file_come_first_and_replace_shipped_ones(

@@ -25,6 +25,9 @@ _KIND_OF_METAVAR = {SCENARIO: "scenarios", RIG: "rigs", DUT: "devices", CAMPAIGN
 _PLACEHOLDER = re.compile(r"\[|[A-Z]+")
 """Beginning of what a user fills in, in the usage of a kind of device."""
 
+_RST_MARK = re.compile(r"(?::\w+:)?`{1,2}([^`]+)`{1,2}")
+"""Literal or role in a docstring."""
+
 
 def add_list(commands: Any) -> None:
     command = add_command(
@@ -97,7 +100,7 @@ def _entries(kind: str) -> list[dict[str, str]]:
 
 
 def _kinds(of: str) -> Iterator[dict[str, str]]:
-    """Kinds of devices, and those that installed packages add; a broken one with its error."""
+    """Kinds of devices, and added kinds of rigs that need no key; a broken one with its error."""
     from analogrig.devices.registry import KINDS as DEVICE_KINDS
     from analogrig.errors import ConfigurationError
     from analogrig.rigs.description import KINDS as RIG_KINDS
@@ -111,10 +114,24 @@ def _kinds(of: str) -> Iterator[dict[str, str]]:
         except ConfigurationError as error:
             yield _entry(name, error)
             continue
+        if of == "rigs" and not _opens_with_defaults(name):
+            continue
         summary = getattr(described, "summary", "") or (described.__doc__ or "").partition("\n")[0]
-        yield _entry(getattr(described, "usage", name), summary)
+        yield _entry(getattr(described, "usage", name), _RST_MARK.sub(r"`\1`", summary))
     for name, reason in kinds.ignored.items():
         yield _entry(name, reason)
+
+
+def _opens_with_defaults(kind: str) -> bool:
+    """True if the name of a kind of rig alone describes a rig: no key is required."""
+    from analogrig.errors import ConfigurationError
+    from analogrig.rigs.description import from_table
+
+    try:
+        from_table({"kind": kind, "name": kind}, kind)
+    except ConfigurationError:
+        return False
+    return True
 
 
 def _entry(name: str, description: Any, file: str = "") -> dict[str, str]:
