@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from analogrig.campaigns.certificate import ALLOWED
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.judging.betting import quiet_plays
 from analogrig.judging.bursts import BURST, Design, bound_rate
 from analogrig.judging.statistics import lower_rate, upper_rate
@@ -21,7 +22,7 @@ from .figure import Figure
 DEVICES, NAMED_DEVICES = 20_000, 1000
 """Simulated devices of each kind, for betting and for the named bounds."""
 
-FAR = 1e-5
+FAR = 1.0 / DEFAULT_ARL0
 """Limit of the certificates, in false alarms per sample."""
 
 CONFIDENCES = (0.95, 0.99, 0.999)

@@ -44,7 +44,7 @@ HEALTHY_SEED, CHANGE_SEED = 1_000, 500_000
 
 JOBS = 2
 
-MOST_RATE, LEAST_SHARE, MOST_MISSED = 1e-5, 0.95, 2
+MOST_RATE, LEAST_SHARE, MOST_MISSED = 1.0 / DEFAULT_ARL0, 0.95, 2
 """Largest rate of false alarms, least share of runs with the right misfit, largest number of missed changes."""
 
 NOTE = f"""\

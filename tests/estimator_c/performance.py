@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.datasheet import ModelOrders
+from analogrig.datasheet import DEFAULT_ARL0, ModelOrders
 from analogrig.judging.bursts import upper_count
 from analogrig.plant import estimated_parameters
 from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, SHORT_WARM_UP_N, Estimator
@@ -26,7 +26,7 @@ from tests.harness.plants import PROGRAM
 
 Settings = Mapping[str, float | tuple[float, float]]
 
-ARL0 = 1e5
+ARL0 = DEFAULT_ARL0
 LEARNT_N = 1000
 """Samples before the earliest change."""
 ONSET_SPAN_N = 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
 import json
@@ -33,6 +34,8 @@ from analogrig.campaigns.plays import Count
 from analogrig.campaigns.trials import Change, Trial
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
+from analogrig.cli.certify import add as add_certify
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.devices.registry import describe, open_dut
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.judging.bursts import upper_count
@@ -42,6 +45,13 @@ from analogrig.scenario import PotChange, Scenario
 from tests.harness.simulated_alarms import BEYOND, COVERED, SimulatedPlays
 
 # -------------------------------------------------------------------------------------------------------- certificates
+
+
+def test_rate_that_is_certified_by_default_is_that_of_the_default_arl0() -> None:
+    """The option has a literal: importing the data sheet would delay every command."""
+    parser = argparse.ArgumentParser()
+    add_certify(parser.add_subparsers())
+    assert parser.parse_args(["certify"]).far == 1.0 / DEFAULT_ARL0
 
 
 def asked(dut: str = "inproc", **settings: Any) -> Question:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analogrig.entry_points import INSTRUMENTS, OURS, of_group
 from analogrig.errors import ConfigurationError, RecordStale, RigRefused
 from analogrig_emulator import Excitation, SuspensionComputer, preset
-from analogrig_instruments.instrument import DRIVERS, DialChange, InputRecord, Instrument, find_driver
+from analogrig_instruments.instrument import DialChange, InputRecord, Instrument, find_driver
 from analogrig_instruments.ni_daqmx import NiDaqmx
 from analogrig_instruments.red_pitaya import RedPitaya
 from analogrig_instruments.scpi_connection import ScpiConnection
@@ -128,10 +129,19 @@ COMPUTERS = {"lucidac"}
 """Instruments that are the computer too: tests/served/test_lucidac_rig.py."""
 
 
-@pytest.fixture(params=[driver for driver in DRIVERS if driver not in COMPUTERS])
+def own_drivers() -> list[str]:
+    """Schemes of the drivers of this repository; other installed packages may add drivers."""
+    return [point.name for point in of_group(INSTRUMENTS) if point.distribution == OURS]
+
+
+@pytest.fixture(params=[driver for driver in own_drivers() if driver not in COMPUTERS])
 def bench(request: pytest.FixtureRequest) -> Bench:
-    """Bench of a driver; a driver without one fails."""
+    """Bench of a driver; a driver of ours without one fails."""
     return BENCHES[request.param]()
+
+
+def test_every_bench_belongs_to_a_driver() -> None:
+    assert {*BENCHES, *COMPUTERS} == {*own_drivers()}
 
 
 def exact(samples: int = SAMPLES) -> np.ndarray:

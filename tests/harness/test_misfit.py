@@ -13,6 +13,7 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.catalogue import Cause
 from analogrig.devices.registry import open_dut
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import CURES, NONLINEAR_CURE, MisfitPeriod, as_json, judge, misfit_periods
 from analogrig.recordings import CanLog, import_run
@@ -155,7 +156,7 @@ def test_a_nonlinear_plant_is_named_in_place_of_faults_of_the_rig() -> None:
 
 
 def test_a_failed_run_of_a_nonlinear_program_names_it() -> None:
-    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+    with open_rig("emulator") as rig, open_dut("inproc", estimator=EstimatorConfig(orders="program", arl0=1e5)) as dut:
         run = Bench(rig, dut).play(Scenario.load("van-der-pol"), 3)
     verdict = judge(run)
     assert verdict.outcome == "failed" and not verdict.fit

@@ -15,6 +15,7 @@ import pytest
 from analogrig import config
 from analogrig.bench import Bench
 from analogrig.devices.registry import open_dut
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
 from analogrig.scenario import PotChange as Asked
@@ -170,10 +171,13 @@ with socket.create_connection((host, int(port))) as connection:
 MOST_PLAYS = 10
 
 
+ARL0_1E5 = EstimatorConfig(orders="program", arl0=1e5)
+
+
 def played_in_time(file: Path, scenario: Scenario) -> Run:
     """Run whose pots were turned before its end. A loaded machine may start their program 0.2 s late."""
     for _ in range(MOST_PLAYS):
-        with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
+        with open_allowed(str(file)) as rig, open_dut("inproc", estimator=ARL0_1E5) as dut:
             run = Bench(rig, dut).play(scenario, 1)
         if all(change.start_low is not None for change in run.conditions.segments[1:]):
             break
@@ -183,7 +187,7 @@ def played_in_time(file: Path, scenario: Scenario) -> Run:
 def test_instants_of_a_users_command_are_dated_in_real_time(tmp_path: Path) -> None:
     asked = (Asked(4000, {"K": 18000.0}), Asked(11_000, {"B": 2200.0}))
     scenario = Scenario.load("thesis")
-    expect = dataclasses.replace(scenario.expect, false_alarms=1)  # at the ARL0 of the device one run of six has one
+    expect = dataclasses.replace(scenario.expect, false_alarms=1)  # at ARL0 1e5 one run of six has one
     scenario = dataclasses.replace(scenario, samples=16_000, changes=asked, expect=expect)
     script = tmp_path / "turn.py"
     script.write_text(PROGRAM)

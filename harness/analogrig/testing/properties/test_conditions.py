@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from analogrig.datasheet import DEFAULT_ARL0
 from analogrig.judging.bursts import Design
 from analogrig.scenario import Scenario
 from analogrig.testing.one_play import Played
@@ -25,7 +26,7 @@ from analogrig_emulator import Excitation
 
 SHORT = Scenario(samples=700, excitation=Excitation(low_v=0.1, high_v=9.9), name="short")
 FAULTS_EACH, LEAST_VALID_KINDS = 4, 4
-CERTIFIED = Design(rate=1e-5, confidence=0.999, allowed=50)
+CERTIFIED = Design(rate=1.0 / DEFAULT_ARL0, confidence=0.999, allowed=50)
 CERTIFIED_RUN_N = 100_000
 PLANTS_N, PLANTS_RUN_N = 40, 60_000
 HEAVY = {"M": 150.0, "B": 1668.5, "K": 29_000.0}
