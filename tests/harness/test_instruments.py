@@ -14,7 +14,7 @@ import pytest
 from analogrig.entry_points import INSTRUMENTS, OURS, of_group
 from analogrig.errors import ConfigurationError, RecordStale, RigRefused
 from analogrig_emulator import Excitation, SuspensionComputer, preset
-from analogrig_instruments.instrument import DialChange, InputRecord, Instrument, find_driver
+from analogrig_instruments.instrument import DRIVERS, DialChange, InputRecord, Instrument, find_driver
 from analogrig_instruments.ni_daqmx import NiDaqmx
 from analogrig_instruments.red_pitaya import RedPitaya
 from analogrig_instruments.scpi_connection import ScpiConnection
@@ -184,7 +184,9 @@ def test_address_is_passed_to_the_driver_of_the_scheme(url: str, address: str) -
         ("", "redpitaya://HOST[:PORT] or nidaqmx://CARD or lucidac://HOST[:PORT]"),
     ],
 )
-def test_malformed_address_is_refused_with_the_right_form(url: str, form: str) -> None:
+def test_malformed_address_is_refused_with_the_right_form(url: str, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours = {name: point for name, point in DRIVERS._added.items() if point.distribution == OURS}
+    monkeypatch.setattr(DRIVERS, "_added", ours)
     with pytest.raises(ConfigurationError) as caught:
         find_driver(url)
     assert str(caught.value) == f"instrument {url!r}: give it as {form}"
