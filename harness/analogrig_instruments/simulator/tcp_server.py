@@ -22,6 +22,7 @@ import logging
 import re
 import socket
 from dataclasses import dataclass
+from typing import Any
 
 from analogrig import ConfigurationError
 from analogrig_instruments.tcp_address import place_of
@@ -95,6 +96,7 @@ class TcpServer:
 
         :raises ConfigurationError: listening there failed, or the host is empty.
         """
+        asyncio.get_running_loop().set_exception_handler(_note_failure)
         if not host:
             raise ConfigurationError("cannot listen: the host is empty: use 0.0.0.0 for all networks of this machine")
         try:
@@ -193,6 +195,14 @@ def is_http(first: bytes) -> bool:
 def may_become_http(first: bytes) -> bool:
     """True if more bytes may make a request of HTTP of the first ones."""
     return any(method.startswith(first.upper()) for method in _METHODS)
+
+
+def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Note the failure of a connection that nobody waits for any more; any other failure is shown as usual."""
+    if isinstance(context.get("exception"), OSError):
+        _log.info("client disconnected: %r", context["exception"])
+    else:
+        loop.default_exception_handler(context)
 
 
 async def _linger(client: Client) -> None:
