@@ -40,9 +40,6 @@ _READ_BACK = frozenset(
 )
 """Items of a configuration that a client sets, and that a device leaves as they are until another client does."""
 
-_OF_A_RUN = frozenset({"run_data_message", "run_data_end_message", "run_state_change_message"})
-"""Kinds of messages that name their run."""
-
 _QUESTION_RATE_HZ = 1000
 _QUESTION_SAMPLES = (100, 1000, 10_000)
 """Lengths of runs during which a configuration is sent: the next one if the answer comes too late."""
@@ -172,11 +169,11 @@ class LucidacConnection:
         return change.new_ in (self._pb.RunState.DONE, self._pb.RunState.ERROR)
 
     def _next_of_run(self, what: str, run_id: str, deadline_s: float) -> Any:
-        """Next message without those of another run: an earlier one that outlived its stop, or another client's."""
+        """Next message without those of an earlier run that outlived its stop."""
         while True:
             message = self._next(what, deadline_s)
-            kind = message.WhichOneof("kind")
-            if kind not in _OF_A_RUN or getattr(message, kind).run.id == run_id:
+            of_run = (message.run_data_message, message.run_data_end_message, message.run_state_change_message)
+            if all(each.run.id in ("", run_id) for each in of_run):
                 return message
 
     def _stop_run(self, run_id: str) -> None:

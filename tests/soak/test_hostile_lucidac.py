@@ -6,6 +6,7 @@ import random
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,16 @@ def test_server_survives_with_bounded_memory_and_answers_other_clients(served: S
 
 def test_run_under_way_is_unharmed(served: ServedByProcess) -> None:
     """Its samples are those of the same machine in this process, to the bit."""
-    client = LucidacConnection("127.0.0.1", served.port, LONG_S)
+    under_way = threading.Event()
+
+    class Connection(LucidacConnection):
+        """Says when the run is accepted: from then on nobody else sets the machine."""
+
+        def _next_of_run(self, what: str, run_id: str, deadline_s: float) -> Any:
+            under_way.set()
+            return super()._next_of_run(what, run_id, deadline_s)
+
+    client = Connection("127.0.0.1", served.port, LONG_S)
     while True:  # a run of an attack may still end
         answer = client.ask_once("reset_command", circuit_reset=True)
         if answer.WhichOneof("kind") != "busy_response":
@@ -59,6 +69,7 @@ def test_run_under_way_is_unharmed(served: ServedByProcess) -> None:
     found: list[NDArray[np.float64]] = []
     runner = threading.Thread(target=lambda: found.append(client.run(SAMPLES, RATE_HZ, 8)[0]))
     runner.start()
+    assert under_way.wait(LONG_S)
     for attacker in attackers:
         attacker.start()
     runner.join()
