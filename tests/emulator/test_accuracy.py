@@ -70,9 +70,9 @@ def test_an_open_limiter_of_ideal_parts_leaks_nothing() -> None:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("seed", sorted({*range(0, 200, 5), *GRAZING}.difference(REFUSED)))
+@pytest.mark.parametrize("seed", sorted({*range(0, 200, 10), *GRAZING}.difference(REFUSED)))
 def test_ideal_parts_play_the_equations_of_random_programs(seed: int) -> None:
-    """A sample of 40 programs, and those whose contacts graze; `make programs ARGS=200` plays every one."""
+    """A sample of 20 programs, and those whose contacts graze; `make programs ARGS=200` plays every one."""
     assert off_equations_lsb(compiled_random(seed), rtol=TIGHT) < MOST_LSB
 
 
@@ -80,9 +80,9 @@ def test_ideal_parts_play_the_equations_of_random_programs(seed: int) -> None:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("seed", range(0, 40, 5))
+@pytest.mark.parametrize("seed", [5, 10, 15, 30])
 def test_real_parts_of_random_programs_agree_with_ngspice(seed: int) -> None:
-    """A sample of 8 programs; `make programs` plays 100. Those of the seeds 15 and 35 are driven into overload."""
+    """A sample of 4 programs; `make programs` plays 100. That of the seed 15 is driven into overload."""
     assert off_ngspice_lsb(compiled_random(seed), seed, 2.5 if seed % 4 == 3 else 1.0) < MOST_LSB
 
 

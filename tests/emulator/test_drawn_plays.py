@@ -55,9 +55,9 @@ def test_a_resonance_of_a_run_plays(force: str, damping: float) -> None:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("seed", [*range(19, 26, 2), 38, 73, *range(107, 120, 2), 130])
+@pytest.mark.parametrize("seed", [19, 23, 38, 73, 107, 113, 130])
 def test_drawn_programs_play_on_every_emulated_rig(seed: int) -> None:
-    """A sample of 14 programs; `make drawn-plays` plays 200.
+    """A sample of 7 programs; `make drawn-plays` plays 200.
 
     Among them are integrators that wind up (38, 73) and a flow that plays with smaller inputs (130).
     """
