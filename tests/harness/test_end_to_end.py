@@ -260,7 +260,7 @@ def test_dead_device_is_named_within_seconds(tmp_path: Path) -> None:
     """A line on which nobody answers."""
     ours, theirs = pty.openpty()
     try:
-        line = refusal("run", "--dut", f"serial:{os.ttyname(theirs)}", cwd=tmp_path)
+        line = refusal("run", "--dut", f"serial:{os.ttyname(theirs)}?timeout_s=0.5", cwd=tmp_path)
     finally:
         os.close(ours)
         os.close(theirs)

@@ -215,7 +215,7 @@ def test_interrupted_run_on_a_terminal_ends_its_progress_first(tmp_path: Path) -
         "analogrig.cli",
         "run",
         "--real-time",
-        "500",
+        "100",
         "--dut",
         "host",
         "--out",
